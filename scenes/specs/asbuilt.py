@@ -267,14 +267,20 @@ class SightReadingsSpec(ReadingsSpec):
 
     Attributes
     ----------
-    alpha, beta : float | None
-        Rotation of the line of sight about the camera's Y (alpha) or X (beta), in radians.
+    alpha : float | None
+        Rotation of the line of sight about the camera's Y, in radians.
+    beta : float | None
+        Rotation of the line of sight about the camera's X, in radians.
     gamma : float | None
         Rotation of the line CCD about the line of sight, in radians.
     principal_distance : float | None
         Change of the principal distance, in metres.
-    sigma_alpha, sigma_beta, sigma_gamma : float | None
-        Standard deviation of this angle, in radians; omitted for an angle that is not measured.
+    sigma_alpha : float | None
+        Standard deviation of `alpha`, in radians; omitted if it is not measured.
+    sigma_beta : float | None
+        Standard deviation of `beta`, in radians; omitted if it is not measured.
+    sigma_gamma : float | None
+        Standard deviation of `gamma`, in radians; omitted if it is not measured.
     sigma_principal_distance : float | None
         Standard deviation of the principal distance, in metres; omitted if it is not measured.
     correlation : tuple[tuple[float, ...], ...] | None

@@ -136,8 +136,12 @@ class StandSpec(Spec):
 
     Attributes
     ----------
-    X, Y, Z : float
-        Half of the angle between the mirrors for rotations of the turntable about this axis, in radians.
+    X : float
+        Half of the angle between the mirrors for rotations of the turntable about X, in radians.
+    Y : float
+        Half of the angle between the mirrors for rotations of the turntable about Y, in radians.
+    Z : float
+        Half of the angle between the mirrors for rotations of the turntable about Z, in radians.
     """
 
     X: HalfAngle
@@ -152,11 +156,16 @@ class ProgrammeSpec(Spec):
     ----------
     steps : int
         Number of steps after the first reading at zero.
-    small, table, large : float
-        Step of the turntable, in radians: a smaller one than in the main series, that of the main series (`table`), and
-        a larger one.
-    narrow, wide : float
-        Half of the angle between the mirrors, in radians, in the narrow or the wide arrangement of the mirrors.
+    small : float
+        Step of the turntable in a series with smaller steps than the main series, in radians.
+    table : float
+        Step of the turntable in the main series, in radians.
+    large : float
+        Step of the turntable in a series with larger steps than the main series, in radians.
+    narrow : float
+        Half of the angle between the mirrors in the narrow arrangement, in radians.
+    wide : float
+        Half of the angle between the mirrors in the wide arrangement, in radians.
     stands : StandSpec
         Half of the angle between the mirrors in the main series about each axis.
     """

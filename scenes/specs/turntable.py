@@ -27,8 +27,10 @@ class GraduationSpec(Spec):
     ----------
     rms : float
         Expected rms over the full circle, in radians.
-    first, last : int
-        First or last harmonic; the shortest wavelength of the curve is 360 deg / last.
+    first : int
+        Lowest harmonic of the curve; harmonic 1 has one period in the full circle.
+    last : int
+        Highest harmonic of the curve, whose period is 360 deg / last.
     slope : float
         Exponent of the spectrum: the amplitude of harmonic k falls as k^-slope.
     """
@@ -145,8 +147,12 @@ class CalibrationPlanSpec(Spec):
 
     Attributes
     ----------
-    first, last, step : float
-        First reading, last reading or step of the readings, in radians.
+    first : float
+        First reading that is calibrated, in radians.
+    last : float
+        Last reading that is calibrated, in radians.
+    step : float
+        Step between the readings that are calibrated, in radians.
     repeats : int
         Number of repeats of each comparison.
     folds : int

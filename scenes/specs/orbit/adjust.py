@@ -151,9 +151,11 @@ class BlockPassSpec(Spec):
     ----------
     epoch : str
         UTC at which the satellite is vertically above the place that `longitude` and `latitude` give.
-    longitude, latitude : float | None
-        Geodetic coordinate of the place over which the satellite is at the epoch, in radians; by default that of the
-        area's centre.
+    longitude : float | None
+        Longitude of the place over which the satellite is at the epoch, in radians; east is positive. By default that
+        of the area's centre.
+    latitude : float | None
+        Geodetic latitude of that place, in radians; north is positive. By default that of the area's centre.
     direction : {'descending', 'ascending'}
         Direction of flight: descending to the south, ascending to the north.
     roll : float
@@ -175,14 +177,18 @@ class AreaSpec(Spec):
 
     Attributes
     ----------
-    longitude, latitude : float
-        Geodetic coordinate of the area's centre, in radians.
+    longitude : float
+        Longitude of the area's centre, in radians; east is positive.
+    latitude : float
+        Geodetic latitude of the area's centre, in radians; north is positive.
     height : float
         Mean height of the ground above the ellipsoid, in metres.
     relief : float
         Half range of the heights, which are uniformly distributed about the mean, in metres.
-    east, north : float
-        Size in this direction, in metres.
+    east : float
+        Size of the area from west to east, in metres.
+    north : float
+        Size of the area from south to north, in metres.
     """
 
     longitude: Longitude

@@ -46,8 +46,10 @@ class JitterBandSpec(Spec):
 
     Attributes
     ----------
-    first, last : float
-        Lower (first) or upper (last) end of the band, in hertz.
+    first : float
+        Lower end of the band, in hertz.
+    last : float
+        Upper end of the band, in hertz.
     level : tuple[float, float, float]
         One-sided spectral density about body X, Y and Z, in rad^2/Hz; level x (last - first) is the variance.
     """
@@ -159,8 +161,10 @@ class PassingSpec(Spec):
 
     Attributes
     ----------
-    longitude, latitude : float
-        Geodetic coordinate of the place vertically below the satellite, in radians.
+    longitude : float
+        Longitude of the place vertically below the satellite, in radians; east is positive.
+    latitude : float
+        Geodetic latitude of the place vertically below the satellite, in radians; north is positive.
     altitude : float
         Altitude of the satellite above the ellipsoid there, in metres.
     direction : {'descending', 'ascending'}
@@ -237,8 +241,10 @@ class OrbitSpec(Spec):
     ----------
     epoch : str
         UTC epoch, from which all times of the orbit are counted.
-    before, after : float
-        Duration of the orbit data before or after the epoch, in seconds.
+    before : float
+        Duration of the orbit data before the epoch, in seconds.
+    after : float
+        Duration of the orbit data after the epoch, in seconds.
     passing : PassingSpec | None
         Place over which the orbit passes at the epoch.
     elements : ElementsSpec | None

@@ -57,8 +57,10 @@ class JitterSearchSpec(Spec):
 
     Attributes
     ----------
-    lowest, highest : float
-        Lowest or highest frequency of the search, in hertz.
+    lowest : float
+        Lowest frequency of the search, in hertz.
+    highest : float
+        Highest frequency of the search, in hertz.
     axes : tuple[{'roll', 'pitch', 'yaw'}, ...]
         Body axes about which jitter is searched.
     false_alarm : float

@@ -124,8 +124,12 @@ class AttitudeFileSpec(Spec):
         Directions of the file's body x, y and z in flight, as [forward, right, down].
     sequence : {'xyz', 'xzy', 'yxz', 'yzx', 'zxy', 'zyx'} | None
         Sequence of roll about x, pitch about y, yaw about z: `xyz` means v_frame = Rx(roll) Ry(pitch) Rz(yaw) v_body.
-    nadir, steering : {'geodetic', 'geocentric'} | None
-        Definition of the orbital frame, as in `attitude` of a simulated pass.
+    nadir : {'geodetic', 'geocentric'} | None
+        For the frame `orbital`, the direction of its Z: along the ellipsoid's normal (geodetic) or to the Earth's
+        centre (geocentric).
+    steering : {'none', 'yaw'} | None
+        For the frame `orbital`, the direction of its X: along the inertial velocity (none), or along the track on the
+        rotating Earth (yaw).
     """
 
     file: Reference
@@ -690,10 +694,14 @@ class ImageWindowSpec(Spec):
 
     Attributes
     ----------
-    row, column : int
-        Row or column in the file of the window's first pixel, counted from 0.
-    rows, columns : int
-        Size of the window in this direction, in pixels.
+    row : int
+        Row, in the file, of the window's first pixel, counted from 0.
+    column : int
+        Column, in the file, of the window's first pixel, counted from 0.
+    rows : int
+        Number of rows of the window.
+    columns : int
+        Number of columns of the window.
     """
 
     row: Annotated[Whole, Field(ge=0)]

@@ -109,8 +109,10 @@ class GroundSpec(Spec):
     ----------
     points : int
         Number of points at every time.
-    first, last : float
-        First or last pixel of the part of the second camera's line on which the points lie, counted from 0.
+    first : float
+        First pixel of the part of the second camera's line on which the points lie, counted from 0.
+    last : float
+        Last pixel of this part of the line, counted from 0.
     length : float
         Length of the area along the track, in metres.
     height : float

@@ -367,8 +367,10 @@ class PatchSpec(Spec):
         Pixel of this line that images the patch's centre.
     time : float
         Time at which this pixel images the patch's centre, from the orbit's epoch, in seconds.
-    lines, pixels : int
-        Size of every image in this direction, in pixels.
+    lines : int
+        Number of lines of every image.
+    pixels : int
+        Number of pixels in a line of every image.
     """
 
     line: Name = "nadir"
