@@ -38,9 +38,9 @@ class LensSpec(Spec):
     back_radius : float
         Radius of curvature of the surface toward the focal plane, in metres.
     thickness : float
-        Thickness on the axis, in metres.
+        Thickness of the lens on its axis, in metres.
     glass : str
-        Glass of the catalogue.
+        Name of the lens's glass in the catalogue.
     diameter : float
         Clear aperture of both surfaces, in metres.
     focal_distance : float
@@ -78,7 +78,7 @@ class AutocollimatorSpec(Spec):
     lens : LensSpec
         Lens of the collimator.
     reticle : ReticleSpec
-        Light source.
+        Light source: an illuminated pinhole in the focal plane.
     area_ccd : AreaCcdSpec
         Detector; its offset counts from the pinhole to the centre of the pixel grid along the system's Y (horizontal)
         and X (up), in metres.
@@ -87,7 +87,7 @@ class AutocollimatorSpec(Spec):
     distance : float
         Distance from the lens's front vertex to the turntable's centre, in metres.
     frames : int
-        Number of frames in a reading.
+        Number of frames averaged in a reading.
     """
 
     wavelength: Wavelength
@@ -214,7 +214,7 @@ class AutocollimatorTestSpec(TitledSpec):
     Attributes
     ----------
     autocollimator : AutocollimatorSpec
-        Both autocollimators.
+        Properties of the autocollimators; both are identical.
     mirrors : MirrorsSpec
         Mirrors on the turntable.
     programme : ProgrammeSpec

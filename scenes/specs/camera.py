@@ -335,11 +335,11 @@ class MonitorDesignSpec(Spec):
     frames : int | None
         Number of frames in a measurement; by default that of the instrument to start from.
     goal : MonitorGoalSpec
-        Standard deviations to be reached.
+        Standard deviations of the monitored changes that the layout must reach.
     limits : MonitorLimitsSpec
-        Limits that must not be exceeded.
+        Limits of blocked pupil, mass, spot positions and ghosts that a layout must not exceed.
     search : MonitorSearchSpec
-        Effort of the search.
+        Effort of the search: numbers of beams, layouts, rounds and starts.
     seed : int
         Seed of all random numbers.
     """
@@ -455,7 +455,7 @@ class ImageSpec(Spec):
     Attributes
     ----------
     z : float
-        Position on the parent axis, in metres.
+        Position of the focal plane on the parent axis, in metres.
     tilt : float | None
         Rotation about the prescription's x, the direction of the line CCD, in radians; by default the plane is
         perpendicular to the axis.
@@ -503,9 +503,9 @@ class CameraSpec(TitledSpec):
     mirrors : Mapping[str, MirrorSpec]
         Name -> surface, in the order of the light: mirrors, and also faces of lenses and a separate stop.
     image : ImageSpec
-        Focal plane.
+        Position and tilt of the focal plane.
     line : LineSpec
-        Line CCD.
+        Pixels of the line CCD.
     bands : Mapping[str, BandSpec]
         Name of a spectral band -> its line CCD, for images of targets; none by default.
     spectrum : SpectrumSpec | None

@@ -159,7 +159,7 @@ class MissetSpec(Spec):
     rotate : tuple[float, float, float]
         Rotations about X', Y', Z' through the centre of the panchromatic line, in radians.
     shift : tuple[float, float, float]
-        Shifts along X', Y', Z', in metres.
+        Shifts of the assembly along X', Y', Z', in metres.
     chips : float
         Height error of each line CCD relative to the assembly, which no shim can correct, in metres.
     """
@@ -181,7 +181,7 @@ class FocusTestSpec(CameraUnderTestSpec):
     collimator : CollimatorSpec
         Collimator in front of the camera.
     edge : EdgeSpec
-        Target.
+        Slanted knife edge at the collimator's focus, the target that is imaged.
     fields : tuple[float, ...]
         Fields along the line, as fractions of half the line's length, -1 to 1.
     white : float
@@ -191,13 +191,13 @@ class FocusTestSpec(CameraUnderTestSpec):
     scan : ScanSpec
         Scan of the target through focus.
     misset : MissetSpec
-        Initial misalignment of the assembly.
+        Standard deviations of the initial misalignment of the focal-plane assembly.
     mount : MountSpec
-        Mount of the assembly.
+        Mount of the focal-plane assembly: screws with shims.
     level : float
         Standard deviation of the theodolite's reading of the line's level, in radians.
     rounds : int
-        Number of rounds of shimming.
+        Number of rounds in which the assembly is measured and then corrected by shims.
     seed : int
         Seed of all random numbers.
     """
@@ -450,7 +450,7 @@ class MeasuredFocusSpec(TitledSpec):
     measured : FocusFiles
         Through-focus series.
     mount : MountSpec
-        Mount of the assembly.
+        Mount of the focal-plane assembly: screws with shims.
     shims : tuple[float, ...] | None
         Present thickness of the shim at each hole, in metres; by default the `thickness` of `mount`.
     vertex_error : float

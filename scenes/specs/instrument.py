@@ -498,7 +498,7 @@ class MonitorSpec(Spec):
     return_face : ReturnFaceSpec
         Mirror that returns the beam of each channel.
     frames : int
-        Number of frames in a measurement.
+        Number of frames averaged in a measurement.
     """
 
     wavelength: Wavelength
@@ -530,9 +530,9 @@ class InstrumentSpec(TitledSpec):
     temperature : float
         Temperature at which all parts have their nominal shape, in kelvin.
     materials : MaterialsSpec
-        Materials of the parts.
+        Materials of structures, mirrors and carriers of detectors.
     baffles : Mapping[str, BaffleSpec]
-        Name -> baffle; none by default.
+        Name -> baffle, a black part that blocks light; none by default.
     altitude : float | None
         Altitude of the orbit, in metres. It is needed to express changes of a pair's cameras as errors on the ground.
     disturbances : str | None

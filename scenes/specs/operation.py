@@ -273,11 +273,11 @@ class ReadingTableSpec(Spec):
     time : str
         Head of the column of times.
     time_scale : {'UTC', 'GPS', 'TAI', 'TT', 'GAL', 'QZS', 'BDT'}
-        Time scale of the clock.
+        Time scale of the times in the tables.
     epoch : str | None
-        Reading of that clock at 0, if the column has numbers instead of dates.
+        Date and time, in that time scale, at which the times are 0, if the column has numbers instead of dates.
     time_unit : str
-        Unit of those numbers.
+        Unit of the times, if the column has numbers instead of dates.
     columns : Mapping[str, ReadingColumnSpec]
         Body, star tracker or camera -> its columns, for kinds with numbers.
     name : str | None

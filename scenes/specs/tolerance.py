@@ -455,12 +455,12 @@ class ToleranceBudgetSpec(Spec):
     disturbances : JobDisturbancesSpec | None
         Disturbances between two measurements of the monitor, as in a job; by default those of the instrument.
     tolerances : Mapping[str, ToleranceSpec]
-        Name -> tolerance.
+        Name -> tolerance of one parameter of the camera.
     compensators : Mapping[str, CompensatorSpec]
         Name -> adjustment of every camera, in this order; the adjustments minimise the mean square wavefront error over
         all fields of the merits.
     merits : Mapping[str, MeritSpec]
-        Name -> requirement.
+        Name -> requirement on the camera.
     light : {'spectrum', 'design'} | None
         Light for wavefronts and MTFs: `spectrum` of the camera, or `design` for its design wavelength alone. By default
         the spectrum for a camera with lenses that has one, else the design wavelength.

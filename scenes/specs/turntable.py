@@ -26,7 +26,7 @@ class GraduationSpec(Spec):
     Attributes
     ----------
     rms : float
-        Expected rms over the full circle, in radians.
+        Expected rms of the curve over the full circle, in radians.
     first : int
         Lowest harmonic of the curve; harmonic 1 has one period in the full circle.
     last : int
@@ -55,7 +55,7 @@ class SubdivisionSpec(Spec):
     Attributes
     ----------
     rms : float
-        Expected rms, in radians.
+        Expected rms of the interpolation error, in radians.
     lines : int
         Number of signal periods in a full circle.
     harmonics : tuple[int, ...]
@@ -85,9 +85,9 @@ class DividingErrorSpec(Spec):
     Attributes
     ----------
     axis : float
-        Wobble of the axis, first and second harmonic, in radians.
+        Expected rms of the error due to wobble of the axis, first and second harmonic, in radians.
     eccentricity : float
-        Eccentricity of the grating, first harmonic, in radians.
+        Expected rms of the error due to eccentricity of the grating, first harmonic, in radians.
     graduation : GraduationSpec
         Errors of the grating's lines.
     subdivision : SubdivisionSpec
@@ -211,9 +211,9 @@ class TurntableTestSpec(TitledSpec):
     dividing_error : DividingErrorSpec
         True dividing error of the simulated turntable; the analysis does not use it.
     reference : ReferenceSpec
-        Reference standard.
+        Errors of the reference standard of angles: a polygon on an indexing table, read by an autocollimator.
     calibration : CalibrationPlanSpec
-        Plan of the calibration.
+        Readings that are compared with the reference, and number of repeats.
     camera_angle : float
         Reading of the turntable at the centre of the camera's field in the distortion test, in radians.
     seed : int

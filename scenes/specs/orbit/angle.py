@@ -95,7 +95,7 @@ class TerrainSpec(Spec):
     Attributes
     ----------
     height : float
-        Mean height, in metres.
+        Mean height above the ellipsoid, in metres.
     relief : float
         Standard deviation of the heights about the mean, in metres.
     length : float

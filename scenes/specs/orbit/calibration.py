@@ -320,7 +320,7 @@ class OrbitCalibrationSpec(TitledSpec):
     effects : EffectsSpec
         Effects on the light path.
     errors : CalibrationErrorsSpec
-        Measurement errors.
+        Errors of orbit, attitude, image points and control points.
     drift : Mapping[str, CameraDriftSpec]
         Line -> change of its camera from field to field.
     monitor : MonitorReadingSpec | None

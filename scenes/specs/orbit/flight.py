@@ -72,9 +72,9 @@ class JitterSpec(Spec):
     Attributes
     ----------
     lines : tuple[JitterLineSpec, ...]
-        Oscillations; none by default.
+        Oscillations of single frequencies (lines of the spectrum); none by default.
     bands : tuple[JitterBandSpec, ...]
-        Bands of noise; none by default.
+        Bands of frequencies with random motion; none by default.
     """
 
     lines: tuple[JitterLineSpec, ...] = Field(default=(), max_length=100)
@@ -248,9 +248,9 @@ class OrbitSpec(Spec):
     passing : PassingSpec | None
         Place over which the orbit passes at the epoch.
     elements : ElementsSpec | None
-        Osculating elements.
+        Osculating elements at the epoch.
     state : StateSpec | None
-        State vector.
+        Position and velocity at the epoch.
     """
 
     epoch: UtcTime
@@ -366,9 +366,9 @@ class StarTrackerErrorsSpec(Spec):
     noise : tuple[float, float, float]
         Standard deviation of a reading, independent from reading to reading, in radians.
     bias : tuple[float, float, float]
-        Constant error, in radians.
+        Constant error about body X, Y and Z, in radians.
     thermal : ThermalDriftSpec
-        Error that depends on the latitude.
+        Error that changes with the satellite's temperature, and so with the latitude.
     slow : SlowErrorsSpec
         Error that changes within a pass.
     drift : tuple[float, float, float]
@@ -392,9 +392,9 @@ class ErrorsSpec(Spec):
     Attributes
     ----------
     gps : GpsErrorsSpec
-        Errors of the orbit.
+        Errors of the measured orbit.
     star_tracker : StarTrackerErrorsSpec
-        Errors of the attitude.
+        Errors of the measured attitude.
     """
 
     gps: GpsErrorsSpec = GpsErrorsSpec.model_construct()

@@ -156,11 +156,11 @@ class OrbitJitterSpec(PayloadTestSpec):
     time : float
         Time of the strip's middle from the orbit's epoch, in seconds.
     points : BandPointsSpec
-        Points that are measured.
+        Ground points that all lines observe, and their noise.
     errors : ErrorsSpec
         Errors of the satellite's orbit and attitude measurements.
     search : JitterSearchSpec
-        Settings of the search.
+        Settings of the search: frequencies, axes, false-alarm probability and models.
     seed : int
         Seed of all random numbers.
     """
