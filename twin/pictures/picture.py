@@ -1,7 +1,7 @@
 """Pictures of an instrument, rendered by Mitsuba and denoised.
 
-Pixels are sampled in lists of equal sample count rather than picture by picture: those on matt surfaces need few
-samples, glass many. The samples of a pixel are averaged in a fixed order, so that a seed reproduces the same picture.
+Pixels are sampled in groups with the same number of samples: pixels on matt surfaces need few, those on glass many. The
+samples of a pixel are averaged in a fixed order, so that a seed reproduces the same picture.
 
 ``picture.png`` shows both cameras, ``picture_prisms.png`` the central prism and its neighbours, and
 ``picture_focal_plane.png`` the detectors of the first camera. They are illustrations and not for measuring: light beams
@@ -37,7 +37,7 @@ BRIGHTEST = 4.0
 DEPTH = 14
 """Largest number of path segments: light crosses two prisms and more."""
 SOFT = 0.75
-"""Half width of the tent filter of a pixel, pixels."""
+"""Half-width of the tent-shaped weight with which samples around a pixel's middle are averaged, in pixels."""
 
 
 class PictureError(RuntimeError):
@@ -141,7 +141,8 @@ class Studio:
         Returns
         -------
         tuple of ndarray
-            Number of the part, (H, W), -1 where there is none; and unit normal of its surface, (H, W, 3).
+            Number of the part that each pixel of H rows and W columns shows, (H, W), -1 where there is none; and unit
+            normal of its surface, (H, W, 3).
         """
         import drjit as dr
 
@@ -238,7 +239,7 @@ def denoised(image: np.ndarray, patches: np.ndarray) -> np.ndarray:
 
 
 def displayed(light: np.ndarray) -> np.ndarray:
-    """Convert radiance to sRGB grey values, uint8, with exposure and tone curve applied."""
+    """Convert radiance to sRGB values, uint8, after multiplication by the exposure and compression of highlights."""
     x = np.clip(EXPOSURE * light, 0.0, None)
     room = 1.0 - SHOULDER
     x = np.where(x > SHOULDER, SHOULDER + room * -np.expm1(-(x - SHOULDER) / room), x)
@@ -253,10 +254,10 @@ def _patches(part: np.ndarray, normal: np.ndarray) -> np.ndarray:
 
 
 PICTURE = "render the pictures"
-"""Name of the work in the progress display."""
+"""Name of the rendering of pictures in the progress display."""
 
 LOOKS = ((0.0, 0.0), (-0.35, -0.25), (0.35, 0.25))
-"""Positions in a pixel at which it is tested for showing a single part, pixels from its middle."""
+"""Positions in a pixel, relative to its middle in pixels, where it is tested for showing one part of the scene only."""
 
 Advance = Callable[[str, int, int], None]
 

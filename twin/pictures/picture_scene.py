@@ -163,7 +163,7 @@ _MATERIALS = (
     (GLASS, "glass"),
     (BLOCK, "block"),
 )
-"""Material of a body in ``scene.glb``, and the corresponding material of the picture."""
+"""Pairs of a body's material in ``scene.glb`` and the name of the corresponding material of the rendered picture."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -252,7 +252,7 @@ def _paint(material: Any) -> dict[str, Any]:
 
 
 def _part_of(mesh: trimesh.Trimesh, faces: np.ndarray) -> trimesh.Trimesh:
-    """Return a mesh of the selected faces alone."""
+    """Return a mesh of the faces of another mesh that are selected by a mask or by indices."""
     return trimesh.Trimesh(mesh.vertices, mesh.faces[faces], process=False)
 
 
@@ -270,7 +270,7 @@ def _edges(mesh: trimesh.Trimesh, radius: float) -> trimesh.Trimesh:
 
 
 def _floor(height: float, half_size: float = 500.0) -> trimesh.Trimesh:
-    """Return the floor as a large square."""
+    """Return the floor as a square of half side ``half_size`` at the height z = ``height``, metres."""
     corners = half_size * np.array([[-1.0, -1.0, 0.0], [1.0, -1.0, 0.0], [1.0, 1.0, 0.0], [-1.0, 1.0, 0.0]])
     corners[:, 2] = height
     return trimesh.Trimesh(corners, [[0, 1, 2], [0, 2, 3]], process=False)

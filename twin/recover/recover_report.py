@@ -1,4 +1,4 @@
-"""Verdict and report of a measurement."""
+"""Verdict and report of a measurement: changes of the cameras recovered from measured frames, and their sigmas."""
 
 from __future__ import annotations
 
@@ -27,9 +27,9 @@ def _name(run: RecoverRun) -> str:
 
 
 def _corrected(run: RecoverRun) -> tuple[int, int, SpotResult | None, str]:
-    """Return the number of corrected sets of frames, the number of all, and the one that lost most accuracy.
+    """Return how many sets of frames (one per channel and state) were corrected for artefacts, out of how many.
 
-    The last two values are that spot, or None, and its name.
+    The last two values are the spot that lost most accuracy, or None, and its name.
     """
     all_frames = [
         (result.channel.name, state_name(run.times, k), spot)
@@ -87,7 +87,7 @@ def _verdict(run: RecoverRun) -> tuple[str, tuple[str, ...]]:
 
 
 def recover_report(run: RecoverRun) -> Report:
-    """Return the report of ``python -m twin.recover``."""
+    """Return the report of ``python -m twin.recover``: verdict, changes, spots with their artefacts, estimators."""
     reading = run.last
     verdict, more = _verdict(run)
     facts = [
@@ -204,7 +204,7 @@ def _of(run: RecoverRun, camera: str) -> list[ChannelResult]:
 
 
 def _estimators(run: RecoverRun) -> Section:
-    """Return the section with the changes by all estimators and their sigmas."""
+    """Return the section with the cameras' changes by every estimator, and their sigmas."""
     reading = run.last
     heads = ["camera", "change", "unit"]
     for estimator in reading.estimators.values():

@@ -9,9 +9,10 @@ The signal chain is the linear camera model of EMVA Standard 1288 (release 3.1, 
 
 QE is the quantum efficiency, K the gain in grey values per electron, prnu and dsnu_offset the fixed differences of the
 pixels' response and offset, and normal a standard normal number. PRNU scales the response to light only; DSNU is a
-fixed additive pattern in electrons that adds no shot noise. Further noise is what a data sheet lists beyond the model,
-term by term (``NOISE_TERMS``). The Poisson numbers are exact at every mean (``twin.sensors.poisson_numbers``); no
-normal approximation is used. Pixel coordinates are (row, column); arrays are (..., H, W).
+fixed additive pattern in electrons that adds no shot noise. "further" is the sum of noise terms that a data sheet lists
+in addition to this model (``NOISE_TERMS``), in electrons. The Poisson numbers are exact at every mean
+(``twin.sensors.poisson_numbers``); no normal approximation is used. Pixel coordinates are (row, column); arrays are
+(..., H, W).
 """
 
 from __future__ import annotations
@@ -57,8 +58,8 @@ class NoiseTerm(FurtherNoise, Protocol):
     def temporal_e(self, electrons: np.ndarray, rng: np.random.Generator) -> np.ndarray | None:
         """Return the electrons of a noise that is new in every frame, (frames, H, W); None without such noise.
 
-        ``electrons`` holds the collected ones, in the same shape. Many frames are passed in several calls, one after
-        the other with the same ``rng``.
+        ``electrons`` (frames, H, W) are the collected electrons on which the noise may depend. Frames of one exposure
+        may be passed in several calls, one after the other with the same ``rng``.
 
         Dimensions: H rows, W columns.
         """
@@ -101,7 +102,7 @@ class ReadNoise:
 
 @dataclass(frozen=True)
 class FixedOffsets:
-    """Normally distributed differences of the pixels' offsets.
+    """Normally distributed differences between the offsets (dark grey values) of pixels, the same in every frame.
 
     Attributes
     ----------
@@ -465,13 +466,14 @@ class EmvaDetector:
 
     @property
     def _reading(self) -> Reading:
-        """Read-out of electrons to grey values, with this detector's numbers."""
+        """Detector's numbers for converting electrons to grey values: read noise, gain, full well, largest value."""
         return Reading(self.dark_noise_e, self.system_gain_dn_per_e, self.full_well_e, self.max_dn)
 
     def _read_out(self, level: np.ndarray, shift: np.ndarray, each: Sequence[np.random.Generator]) -> np.ndarray:
-        """Return grey values of frames (N, H, W) from electrons, in whose array they are written.
+        """Return grey values of frames (N, H, W) from their electrons ``level``; the array is overwritten.
 
-        Each noise term draws from its own generator.
+        ``shift`` is the black level with the pixels' offsets, in grey values; ``each`` has one generator per noise
+        term.
 
         Dimensions: N frames, H rows, W columns.
         """
@@ -545,9 +547,10 @@ def _photons(photons: ArrayLike) -> NDArray[np.float64]:
 
 
 def coarse_step_warnings(noise: NoiseModel, detector_name: str) -> tuple[str, ...]:
-    """Return a warning if the noise does not cover the steps of the grey values at low signal; otherwise none.
+    """Return a warning if a grey value's step is large compared with the noise at low signal; otherwise none.
 
-    It depends on the detector's numbers alone.
+    Rounding errors are then equal in all frames and do not average out. The warning depends on the detector's numbers
+    alone.
 
     Parameters
     ----------
@@ -568,7 +571,7 @@ def coarse_step_warnings(noise: NoiseModel, detector_name: str) -> tuple[str, ..
 
 
 def coarse_warnings(setup: Spec) -> tuple[str, ...]:
-    """Return the warnings about coarse grey values for the area CCDs that a job or test refers to.
+    """Return warnings for area CCDs of a job or test whose grey-value steps are large compared with their noise.
 
     Parameters
     ----------

@@ -167,9 +167,9 @@ class LineCcd:
     def expose(
         self, photons: np.ndarray, column: int, pattern: FixedPattern, frames: int, seed: np.random.SeedSequence
     ) -> np.ndarray:
-        """Return frames of images (..., H, W), uint16 (..., frames, H, W).
+        """Return recorded frames, uint16 grey values (..., frames, H, W), of images (..., H, W) in photons per pixel.
 
-        ``column`` is the pixel of the line at their first column.
+        ``column`` is the number of the line's pixel that records the images' first column.
 
         Dimensions: H rows, W columns.
 
@@ -191,7 +191,7 @@ _BEYOND = 30
 With the argument z, the term n falls off faster than (e z / 2 n)^n.
 """
 _PER_STEP = 8
-"""Number of integration nodes per step, if light falls in during only a part of the step."""
+"""Number of integration nodes per step of the charge, if light is collected during only a part of the step."""
 _PER_CYCLE = 6
 """Number of Gauss points per cycle of a function that is averaged over a step."""
 
@@ -232,7 +232,7 @@ class Collection:
         return self.steps * self.step
 
     def mean(self, frequency: np.ndarray | float) -> np.ndarray:
-        """Return the mean of exp(2 pi i f t) over the times t of the collection, for frequencies f in hertz.
+        """Return the mean of exp(2 pi i f t) over the times t at which light is collected, for frequencies f in hertz.
 
         It is real, since the times are symmetric about the middle of the collection, and 1 at frequency 0.
         """
@@ -372,7 +372,7 @@ class Motion:
 
     @property
     def speed(self) -> float:
-        """Speed of the image that the motion hardly exceeds, in pixels per second."""
+        """Upper estimate of the image's speed, in pixels per second, which the motion rarely exceeds."""
         square = self.level @ (self.last**3 - self.first**3) / 3.0
         return float(2.0 * np.pi * (self.frequency @ self.amplitude + 4.0 * np.sqrt(square)))
 
