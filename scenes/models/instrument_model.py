@@ -28,9 +28,9 @@ class Instrument:
     spec : InstrumentSpec
         Content of the instrument's file.
     assembly : Assembly
-        Bodies, elements, sequences.
+        Tree of rigid bodies, optical elements on them, and sequences in which light meets the elements.
     cameras : Mapping[str, CameraModel]
-        Name -> model.
+        Name of a camera -> its traced model.
     channels : tuple[Channel, ...]
         All monitor channels, camera by camera, left before right.
     nodes : Mapping[str, NodeInfo]
@@ -42,7 +42,7 @@ class Instrument:
     baffles : tuple[Plate, ...]
         Black plates, used by the path tracer, the shadows and the pictures.
     as_built : State
-        Departures of positions and shapes from the drawing. The assembly includes them, so that the nominal state, {},
+        Departures of positions and shapes from the design. The assembly includes them, so that the nominal state, {},
         is the instrument as built.
     """
 

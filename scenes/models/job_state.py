@@ -45,7 +45,7 @@ LEAST_INSIDE = 0.5
 unit.
 """
 SHOWN_OUTSIDE = 1e-3
-"""Fraction of the body's volume outside the nodes above which a warning is given."""
+"""Fraction of a body's volume outside the region that a table's nodes cover, above which a warning is given."""
 SEEN_HEAT = 1e-3
 """Interpolation error between nodes, in kelvin rms, below which no warning is given."""
 MESHED_TO = 0.1

@@ -438,7 +438,7 @@ class ThermalModel:
         motions: State | None = None,
         progress: Callable[[str], None] = lambda path: None,
     ) -> State:
-        """Return the perturbed state in which bodies have given temperatures, with other motions on top.
+        """Return the perturbed state in which bodies have given temperatures and, in addition, given motions.
 
         Parameters
         ----------

@@ -139,7 +139,7 @@ class SpectrumSpec(Spec):
 
     @property
     def lines(self) -> bool:
-        """True if the spectrum consists of lines, whose sum is exact."""
+        """True if the spectrum consists of discrete lines, for which a mean over the light is an exact sum."""
         return self.wavelengths is not None
 
     @property

@@ -489,7 +489,7 @@ class BaseSpec(Spec):
 
 
 TOTAL, NOISE = "_sigma", "_sigma_noise"
-"""Suffixes of the keys and columns of standard deviations: total, and by the noise alone."""
+"""Suffixes of the keys and columns of standard deviations: the total one, and the one due to image noise alone."""
 
 
 class ResponseSpec(Spec):

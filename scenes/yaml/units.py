@@ -159,7 +159,7 @@ _KNOWN: dict[str, tuple[Decimal, str]] = {
 With this table pint, which takes half a second to start, is rarely needed.
 """
 _ALIASES = ("µm", "μm", "µrad", "μrad", "%", "hour", "day")
-"""Further spellings of units that the patterns for editors accept."""
+"""Further spellings of units that the regular expressions in the JSON Schemas for editors accept."""
 
 
 def power_of_length(metre: int) -> Kind:

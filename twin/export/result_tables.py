@@ -117,7 +117,7 @@ DESCRIPTIONS: Mapping[str, tuple[str, str]] = FrozenMap(
 their names.
 """
 TITLES: Mapping[str, str] = FrozenMap({POINTS: "Points measured in the images", "study.csv": "Every run of the study"})
-"""File of a table that the run stores -> title; others are named by their file."""
+"""File of a table that the run stores as CSV -> title of the exported table; other tables are titled by their file."""
 _POINT_HEIGHT = ("m", "height of the ground point above the ellipsoid of WGS 84")
 _SIGMAS = {
     "_sigma": "standard deviation of {}, from noise and the disturbance prior",
