@@ -133,7 +133,15 @@ def statements(lines: list[str]) -> list[Statement]:
 
 
 def _cut(text: str, mark: str) -> list[str]:
-    """Return the parts of a text between marks, ignoring marks inside quotes."""
+    """Return the parts of a text between separators, ignoring separators inside quotes.
+
+    Parameters
+    ----------
+    text : str
+        The text.
+    mark : str
+        Separator: a single character.
+    """
     parts, quote = [""], ""
     for k, c in enumerate(text):
         if quote:

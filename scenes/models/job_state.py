@@ -35,8 +35,8 @@ COARSE_CELLS, FINE_CELLS = 12, 16
 PER_SIDE = (4, 6)
 """Finite elements along the longest side of a prism, coarse and fine."""
 LINEAR_TO = 1e-4
-"""Largest departure from a linear field, in kelvin, allowed at nodes of a body without finite elements: a metre of
-aluminium expands by 2 nm.
+"""Largest departure from a linear temperature field, in kelvin, allowed at nodes of a body without finite elements. It
+expands a metre of aluminium by 2 nm.
 """
 ROUNDING = 1e-9
 """Departure from a linear temperature field, in kelvin, below which it counts as zero."""

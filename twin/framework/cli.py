@@ -363,7 +363,7 @@ class WorkProgress:
 
 
 def time_text(seconds: float | None) -> str:
-    """Format a duration given in seconds, in a suitable unit."""
+    """Format a duration given in seconds as text: ``45 s``, ``3 min`` or ``2.5 h``."""
     if seconds is None:
         return "an unknown time"
     if seconds < 120.0:
