@@ -1,5 +1,9 @@
 """Reflectors of a monitor's beam, by kind: their bodies and faces, optical elements and clear apertures.
 
+A monitor is an autocollimator in a camera's focal plane; these reflectors lead its beam, which leaves the camera, to
+the mirror facet that sends it back. One kind returns a beam antiparallel and displaced (as the 180-deg prism), the
+other displaces it and keeps its direction (as the 0-deg prism).
+
 The 180-deg prism is a slice of a corner cube. Its frame has z along the beam that enters, x along the transfer, the
 origin in the middle of its window:
 

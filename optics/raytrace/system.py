@@ -94,7 +94,7 @@ class SystemBatch:
     size : (B,) ndarray
         Size of the last element's body relative to nominal.
     grids : tuple of ndarray, optional
-        Per element, the spline tables of all systems' grid figures, one after the other; None without any.
+        Per element, the spline coefficients of all systems' grid figures, one after the other; None without any.
     states : int
         Number of states S; systems are ordered sequence by sequence, B = sequences * S.
     """
@@ -206,11 +206,11 @@ class UploadedSystems:
     structure : tuple of Structure
         Structure of each element.
     form : (tuple of ElementNumbers, FrameNumbers)
-        Row of each of L numbers per element, as in ``SystemBatch``.
+        For each element and for the last pose, its numbers, each replaced by its row in the table of L numbers.
     numbers : Dr.Jit arrays
         L arrays (B,); or one array (L * B,), number by number.
     grids : tuple
-        Spline tables per element, as in ``SystemBatch``.
+        Per element, the spline coefficients of all systems' grid figures; None without any.
     count : int
         Number of systems B.
     differentiable : bool
@@ -253,16 +253,16 @@ class UploadedSystems:
 
 @dataclass(frozen=True, eq=False)
 class _Shapes:
-    """Changes of shape and index in some states that determine the code of a kernel.
+    """Changes of shape and refractive index in a set of states for which a kernel needs other code.
 
     Attributes
     ----------
     orders : mapping of str to int
-        Body -> highest radial order of its figures.
+        Body -> highest radial order of the Zernike figures that states give it.
     gridded : frozenset of str
-        Bodies with a grid figure.
+        Bodies to which a state gives a grid figure.
     graded : frozenset of str
-        Glass bodies with an index gradient.
+        Glass bodies with an index gradient in a state.
     """
 
     orders: Mapping[str, int]
@@ -271,7 +271,7 @@ class _Shapes:
 
     @classmethod
     def of(cls, states: Sequence[State]) -> _Shapes:
-        """Return the changes that the motions of the states cause."""
+        """Return the bodies to which the motions of the states give figures or index gradients."""
         orders: dict[str, int] = {}
         gridded, graded = set(), set()
         for state in states:
@@ -287,7 +287,7 @@ class _Shapes:
 
 @dataclass(frozen=True, eq=False)
 class _Chains:
-    """Sequences of a batch: C chains of K elements each.
+    """Sequences of optical elements that are traced together: C chains of K elements each.
 
     Attributes
     ----------
@@ -356,7 +356,7 @@ class _Chains:
         return tuple(out)
 
     def _graded(self, medium: int, shapes: _Shapes) -> bool:
-        """Return True when a medium has an index gradient in some chain and state."""
+        """Return True when medium number ``medium`` of a chain has an index gradient, in some chain and state."""
         return any(media[medium].solid in shapes.graded for media in self.media)
 
     def local_numbers(
@@ -391,17 +391,19 @@ class _Chains:
 
 @dataclass(frozen=True, eq=False)
 class _Sides:
-    """Sides of optical elements that one glass body fills, and where the numbers of their refractive index are kept.
+    """Places in the table of numbers that hold the refractive index of one glass body.
+
+    The index is needed at each side, before or after, of an optical element that the glass body fills.
 
     Attributes
     ----------
     rows, chains, bodies : (N,) ndarray of int
-        For each of N sides, the row of its index in the table of numbers, its chain, and the index of the element's
-        body.
-    gradient : ndarray of int
-        Sides that have an index gradient.
-    slopes : (3, ...) ndarray of int
-        Rows of the gradient's three components of those sides.
+        For each of N sides of elements, the row of its index in the table of numbers, its chain, and the index of the
+        element's body.
+    gradient : (G,) ndarray of int
+        Those G of the N sides whose numbers include an index gradient.
+    slopes : (3, G) ndarray of int
+        Rows of the three components of the gradient, for these sides.
     """
 
     rows: np.ndarray
@@ -413,25 +415,27 @@ class _Sides:
 
 @dataclass(frozen=True, eq=False)
 class _Design:
-    """Numbers of C chains of K elements in the nominal state, and how a state changes them.
+    """Numbers of C chains of K elements in the nominal state, and which of them a perturbed state changes.
+
+    The L numbers of a chain (poses, shapes, refractive indices) form a column of a table.
 
     Attributes
     ----------
     chains : _Chains
         The chains.
     structure, form : tuple
-        Structure of each element, and the row of each of L numbers, as in ``SystemBatch``.
+        Structure of each element; and the elements' numbers, each replaced by its row in the table.
     numbers : (L, C) ndarray
         Nominal numbers; those of frames are not set.
     grids : tuple of ndarray, optional
-        Spline tables of grid figures, as in ``SystemBatch``.
+        Per element, the spline coefficients of all chains' grid figures; None without any.
     scaling : mapping of int to (ndarray, ndarray, ndarray)
         Power -> rows and chains of the numbers that scale with that power of their bodies' sizes, and the indices of
         these bodies.
     glass : mapping of str to _Sides
         Glass body -> sides of elements that it fills.
     frame_rows : (K + 1, 12) ndarray of int
-        Rows of the elements' frames and of the last pose.
+        Rows of the 12 numbers of each element's frame, and of the pose of the last element.
     """
 
     chains: _Chains

@@ -409,11 +409,11 @@ class _TracePlan:
         Parameters
         ----------
         form : tuple
-            Row of each number per element, as in ``UploadedSystems``.
+            For each element, its numbers, each replaced by its row in the table of numbers.
         numbers : tuple
-            Numbers and grids as in ``UploadedSystems``; number of systems, as an array of width 1, or None for one;
-            offset of the numbers, likewise, or None for 0; and the indices of the B systems (B,) where each takes its
-            rays one after the other, else None.
+            Table of numbers; spline coefficients of grid figures; number of systems, as an array of width 1, or None
+            for one; position of the first element's numbers in the table, likewise, or None for 0; and the indices of
+            the B systems (B,) if the rays of each are traced one after the other, else None.
         rays : tuple
             Position, direction, path and validity.
         shared : UInt
@@ -661,11 +661,11 @@ class _Lookup:
     backend : Backend
         Backend of the rays.
     numbers : Dr.Jit arrays
-        Numbers, as in ``UploadedSystems``.
+        Numbers of all systems, one array per row or all rows in one array, as in ``UploadedSystems.numbers``.
     stride : UInt, optional
         Number of systems, as an array of width 1; None for a single one.
     start : UInt, optional
-        Offset of the first element's numbers, as an array of width 1; None for 0.
+        Position of the first element's numbers in the table, as an array of width 1; None for 0.
     system : UInt, optional
         System of each ray or lane; None for a single one.
     row : int

@@ -6,8 +6,8 @@ polynomials and inverted at the corners of the edge's outline. The blocked part 
 polygons, which ``optics.waves.pupil_shadow`` subtracts from the pupil exactly.
 
 ``IlluminatedStop`` is a quadrature over the illuminated part of a stop. A smooth integrand is integrated over the whole
-disk by Gauss' rule, and each shadow is subtracted by a rule of its own that ends at its sides. So edges leave no
-raster.
+disk by Gauss' rule, and each shadow is subtracted by a rule of its own that ends at its sides. Edges are thus not
+sampled on a raster.
 """
 
 from __future__ import annotations
@@ -285,7 +285,7 @@ def outlines_on_stop(
 
 
 def _passes_all(edge: Edge, around: np.ndarray, bright: np.ndarray) -> bool:
-    """Return True for a clear edge without a hole that passes all illuminated rays, with a margin.
+    """Return True for an edge without a hole, inside which light passes, if all illuminated rays pass with a margin.
 
     ``around`` (B, N, 2) are the positions of N rays in B images, moved outward by the margin, and ``bright`` is the
     mask of illuminated rays.

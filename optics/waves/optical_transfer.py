@@ -203,9 +203,11 @@ def _correlate(
 
 
 def _products(pupil: PupilFunction, points: np.ndarray, shift: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return products of the amplitudes of both shifted pupils, and differences of their eikonals and normal cosines.
+    """Return products of amplitude, and differences of eikonal and normal cosine, of two shifted copies of a pupil.
 
-    They are taken half a shift ahead of and half a shift behind the complex points of the overlap.
+    A point c of their overlap is, in the pupil's own coordinates, c + s/2 in one copy and c - s/2 in the other, with s
+    its shift. ``points`` (S, Q) are Q complex points c for each of S complex shifts ``shift`` (S,); each result is (S,
+    Q), the eikonal in metres, the normal cosine dimensionless.
     """
     ahead, behind = points + 0.5 * shift[:, None], points - 0.5 * shift[:, None]
     (path, light), (path_behind, light_behind) = pupil.values(ahead), pupil.values(behind)
@@ -215,10 +217,23 @@ def _products(pupil: PupilFunction, points: np.ndarray, shift: np.ndarray) -> tu
 def _spans(
     pupil: PupilFunction, shift: np.ndarray, right: np.ndarray, left: np.ndarray, wave: np.ndarray, defocus: np.ndarray
 ) -> np.ndarray:
-    """Return the range of the phase across and along the chords of S overlaps for the worst defocus, (2, S).
+    """Return how fast the integrand's phase changes across and along the chords of S overlaps, (2, S).
 
-    The unit is radians per radian of the angle in which Gauss nodes are evenly spaced: half the range of a linear
-    phase.
+    It is the largest change for any defocus, in radians of phase per radian of the angle a in which Gauss nodes cos(a)
+    are evenly spaced. For a phase that is linear along a chord, it is half of the phase's range.
+
+    Parameters
+    ----------
+    pupil : PupilFunction
+        Pupil of the image.
+    shift : (S,) ndarray
+        Complex shifts of the pupil against itself, in its normalised coordinates.
+    right, left : (2, S) ndarray
+        Angles of the overlap's corners on the edges of the two copies, from ``PupilEdge.corners``.
+    wave : (S,) ndarray
+        Wave numbers, rad/m.
+    defocus : ndarray
+        Shifts of the detector, metres.
     """
     probe = (_PROBE, np.ones_like(_PROBE))
     points, _ = pupil.edge.overlap(shift, right, left, probe, probe)
@@ -235,7 +250,11 @@ def _spans(
 def _blocks(
     used: np.ndarray, across: np.ndarray, along: np.ndarray, layers: int
 ) -> Iterator[tuple[np.ndarray, int, int]]:
-    """Yield the indices of shifts with similar ranges of phase, and their numbers of nodes, in bounded blocks."""
+    """Yield groups of shifts that need similar numbers of quadrature nodes, and these numbers across and along chords.
+
+    A group is limited by memory. ``used`` are the indices of the shifts, ``across`` and ``along`` the changes of phase
+    of each (``_spans``), and ``layers`` is the number of positions of the detector.
+    """
     order = np.argsort(along)[::-1]
     start = 0
     while start < len(order):
@@ -357,7 +376,8 @@ class TransferTable:
     to_shift : (2, 2) ndarray
         Matrix from cycles/m to normalised shifts at the shortest wavelength.
     reach : ndarray
-        Fourier terms of the longest normalised shift over exp(2 i direction), complex.
+        Complex coefficients of a polynomial in exp(2 i direction), whose real part is the longest shift with an overlap
+        (the cut-off) in that direction, in normalised pupil coordinates.
     spline : ndarray
         Spline coefficients over shift / longest shift and direction, complex.
     """
@@ -509,7 +529,25 @@ def _shadow_table(
     radius: np.ndarray,
     directions: int,
 ) -> np.ndarray:
-    """Return the shadow's contribution to a table of the transfer function, complex, at given radii and directions."""
+    """Return the shadow's contribution to the band's transfer function on a polar grid, complex, (R, directions).
+
+    Parameters
+    ----------
+    pupil : PupilFunction
+        Pupil with a shadow.
+    wavelengths : (K,) ndarray
+        K wavelengths, metres.
+    share : (K,) ndarray
+        Weights of the wavelengths, with sum 1.
+    defocus : float
+        Shift of the detector, metres.
+    centroid : (2,) ndarray
+        Centroid of the image, metres, whose phase is removed.
+    radius : (R,) ndarray
+        R frequencies, relative to the cut-off of the shortest wavelength in the same direction.
+    directions : int
+        Number of directions, evenly spaced over the circle.
+    """
     rings, arms = _SHADOW_GRID
     direction = np.pi * np.arange(arms) / arms
     ratio = np.arange(rings) / rings

@@ -222,9 +222,10 @@ _CORNER_LIMITS = (12, 20, 32, 52)
 
 
 def _similar(*corners: np.ndarray) -> Iterator[tuple[np.ndarray | slice, tuple[int | None, ...]]]:
-    """Yield groups of polygons with similar numbers of corners, and upper bounds of these numbers for each set.
+    """Yield groups (indices) of polygons with similar numbers of corners, and upper bounds of these numbers.
 
-    The bounds are None where all polygons form one group.
+    ``corners`` are the numbers of corners for one or more sets of polygons; a group's k-th members in all sets are
+    processed together, and there is a bound for each set. The bounds are None where all polygons form one group.
     """
     if max((int(np.max(count, initial=0)) for count in corners), default=0) <= _CORNER_LIMITS[0]:
         yield slice(None), (None,) * len(corners)
@@ -558,9 +559,9 @@ def _radius_and_slope(terms: np.ndarray, phasor: np.ndarray) -> tuple[np.ndarray
 
 
 def in_rows(owner: np.ndarray, rows: int) -> tuple[np.ndarray, np.ndarray, int]:
-    """Return how to arrange F items in an array with one row per owner: their order, columns, and the rows' length.
+    """Return how to arrange F items in a table with one row per owner: order of the items, their columns, longest row.
 
-    ``owner`` (F,) is the row of each item.
+    ``owner`` (F,) is the row to which each item belongs, one of ``rows``.
     """
     order = np.argsort(owner, kind="stable")
     counts = np.bincount(owner, minlength=rows)

@@ -38,8 +38,8 @@ from optics.waves.pupil_terms import (
 DEGREE = 8
 """Degree of the polynomials for eikonal and amplitude over a pupil without vignetting.
 
-The library's gf7 leaves an eikonal residual of 1e-8 wavelengths, nominal or perturbed; with 5 nm of every Zernike term
-to seventh order on each mirror it leaves 2e-5.
+For the example camera gf7 the residual of the eikonal (optical path over the pupil) is 1e-8 wavelengths, nominal or
+perturbed; with 5 nm of every Zernike term to seventh order on each mirror it is 2e-5.
 """
 
 VIGNETTED_DEGREES = (DEGREE, 10, 12, 14, 16, 18, 20)
@@ -62,8 +62,8 @@ A thin ring or a crescent of light has to contain enough rays for the polynomial
 VIGNETTED_RESIDUAL = 1e-4
 """Rms eikonal residual up to which a fit to a vignetted pupil is accepted at once, wavelengths.
 
-The best of VIGNETTED_DEGREES may leave more. The errors of the polynomials are largest along the edges, at which the
-overlap of a pupil with itself ends.
+The residual with the best of VIGNETTED_DEGREES may be larger. The errors of the polynomials are largest along the
+edges, at which the overlap of a pupil with itself ends.
 """
 
 WORST_RESIDUAL = 1e-3
