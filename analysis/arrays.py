@@ -30,10 +30,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 ARCSEC = math.pi / 180 / 3600
-"""One second of arc, rad."""
+"""One second of arc, in radians."""
 
 ARCMIN = 60.0 * ARCSEC
-"""One minute of arc, rad."""
+"""One minute of arc, in radians."""
 
 UM_PER_M, MM_PER_M = 1e6, 1e3
 """Micrometres and millimetres in a metre."""

@@ -34,7 +34,7 @@ class Process:
     name : str
         Name such as "PASS attitude walk".
     support : Support
-        Unknowns of the error model.
+        Unknowns of the error model, with their prior precision.
     column : int
         Index of the first unknown among all unknowns of the adjustment.
     kind : str
@@ -214,7 +214,7 @@ def _scopes(block: Block, term: Term, times: Mapping[str, Array]) -> dict[str, l
 
 
 def _axes(block: Block, name: str) -> Array:
-    """Return the (3, 3) rotation nearest to the mean attitude of a pass."""
+    """Return the mean body axes of a pass as columns, ITRS: the (3, 3) rotation nearest to its mean attitude."""
     attitudes = [s.rays.attitude for s in block.scenes if s.of == name and len(s.rays.point)]
     attitudes += [f.attitude for f in block.footprints if f.of == name]
     return np.asarray(Rotation.from_matrix(np.concatenate(attitudes)).mean().as_matrix())

@@ -15,7 +15,7 @@ from analysis.orbit.three_line_model import LineModel, Rays
 
 Scope = Literal["pass", "tracker", "block"]
 SENSORS = ("ties", "control", "monitor", "laser", "terrain", "tracker_angles")
-"""Names of the observations that can be excluded from a block."""
+"""Names of the kinds of observations that can be excluded from a block."""
 
 
 @dataclass(frozen=True)
@@ -273,7 +273,7 @@ class Block:
 
     @property
     def sensors(self) -> tuple[str, ...]:
-        """Names of the `SENSORS` that the block has."""
+        """Names of those kinds of observations, out of `SENSORS`, that the block contains."""
         has = {
             "ties": bool(np.any(self.points.role == "tie")),
             "control": bool(np.any(self.points.role == "control")),

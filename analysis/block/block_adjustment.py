@@ -1,7 +1,7 @@
 """Block adjustment: Gauss-Newton on observations and priors, robust weights, variance components.
 
 Weights and variance factors follow the rules of `reweighting`. Before the adjustment, gross faults of a block are
-detected: points that lie elsewhere than their images, and points seen only once.
+detected: points far from the rays of their image points, and points seen only once.
 
 **Test of the error models** of the readings by serial correlation. With the right model the whitened unknowns e of a
 process are independent, of unit variance; the estimated ones have the covariance S = I - C, with C the covariance of
@@ -40,7 +40,7 @@ FAR = 0.02
 and attitudes are known a hundred times better.
 """
 _NAMED = 8
-"""Largest number of points that an error message lists."""
+"""Largest number of faulty points that an error message lists by name."""
 
 
 def pruned(block: Block) -> Block:
@@ -380,7 +380,7 @@ def adjust_block(
 
 @dataclass(frozen=True, eq=False)
 class _AdjustmentState(State):
-    """State of an adjustment with the number of Gauss-Newton steps so far."""
+    """Unknowns, points, weights and variance factors of an adjustment, with the number of Gauss-Newton steps so far."""
 
     steps: int = 0
 
@@ -459,7 +459,7 @@ def _solved(
 
 
 def _part_of(covariance: Array) -> Callable[[Indices], Array]:
-    """Return a function from indices of k unknowns to their covariance (k, k)."""
+    """Return a function that takes the indices of k unknowns and returns their covariance (k, k)."""
     return lambda columns: np.asarray(covariance[np.ix_(columns, columns)])
 
 

@@ -39,15 +39,15 @@ class Packets(Protocol):
 
     @property
     def name(self) -> str:
-        """Name of the set, such as that of the scene, for messages."""
+        """Name of the set of observations, such as that of the scene, for messages."""
 
     @property
     def group(self) -> str:
-        """Name of the variance group, whose measurements share one variance factor."""
+        """Name of the variance group of the set; measurements of a group share one variance factor."""
 
     @property
     def rows(self) -> int:
-        """Number d of equations of each packet."""
+        """Number d of equations of each packet (measurement of a ground point)."""
 
     @property
     def point(self) -> Indices:
@@ -94,9 +94,10 @@ class LineImage:
     corrections : Corrections
         Corrections of the readings.
     change : (4,) ndarray of int
-        Indices, among all unknowns, of the camera's changes d_alpha, d_beta, d_gamma, d_f.
+        Indices, among all unknowns, of the camera's changes d_alpha, d_beta, d_gamma (rotations about its Y, X and Z
+        axes) and d_f (principal distance).
     unit : (4,) ndarray
-        Unit of each of these unknowns, in radians and metres.
+        Scale of each of these unknowns: the change, in radians or metres, for a value of 1.
     group : str
         Variance group.
     """
@@ -304,7 +305,7 @@ class Heights:
     common : (1,) ndarray of int
         Index, among all unknowns, of the model's common height error.
     unit : float
-        Unit of the common error, in metres.
+        Scale of that unknown: the common height error, in metres, for a value of 1.
     group : str
         Variance group.
     """
@@ -676,7 +677,7 @@ class Reduction:
         return sparse.csc_matrix((np.concatenate(values), where), shape=(self.size, self.size))
 
     def prior_square(self, x: Array, factor: Mapping[str, float]) -> dict[str, float]:
-        """Return the weighted sum of squares of the priors of each group."""
+        """Return, for each variance group, the sum of squared residuals of its priors, weighted by their precision."""
         squares: dict[str, float] = {}
         for prior in self.priors:
             deviation = x[prior.columns] - prior.mean
@@ -886,7 +887,7 @@ class SharedReduction:
         return cls(whole, pool, points, packets, held, columns)
 
     def _states(self, state: State) -> list[State]:
-        """Return the part of a state that each share needs."""
+        """Return the part of a state (unknowns, points, weights) that each process needs for its share."""
         return [
             State(
                 state.x,

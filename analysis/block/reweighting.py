@@ -89,7 +89,7 @@ class GroupTest:
 
 
 class UnsettledError(MeasurementError, ValueError):
-    """Error for robust weights or variance factors that do not converge."""
+    """Error raised if robust weights or variance factors do not converge."""
 
 
 def standardised_packets(residual: Array, cofactors: Array, weight: Array, unit: float) -> Array:
@@ -217,7 +217,7 @@ class Reweighted(Protocol[S, T]):
         """Return state and solution of the adjustment with fixed weights; a rough solution suffices while screening."""
 
     def judged(self, at: S, found: T) -> tuple[Array, ...]:
-        """Return the standardised residuals of each set of observations."""
+        """Return the standardised residuals of each set of observations, (n, d) for n measurements of d equations."""
 
     def tests(self, at: S, found: T) -> Mapping[str, GroupTest]:
         """Return the test of the residuals' variance of each group of observations, by its name."""

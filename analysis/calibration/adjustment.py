@@ -46,7 +46,7 @@ run.
 _WAVES = 4
 """Largest number of cosines that describe slow variations of x, and of y, along a line."""
 _POINTS_PER_WAVE = 4
-"""Number of image points that each cosine requires."""
+"""Smallest number of image points for each cosine that describes slow variations along a line."""
 _RANK = 1e-9
 """Smallest eigenvalue of the gradient's covariance S, relative to the largest, of a combination of omitted terms that
 residuals can show. A term that the estimated unknowns imitate exactly has the eigenvalue zero.
@@ -67,7 +67,7 @@ class Rates:
 
     @classmethod
     def of(cls, fields: Sequence[calibration_parameters.CalibrationField]) -> Rates:
-        """Return rates for all fields whose rays have times."""
+        """Return the attitude drift rates, as terms to test, of all fields whose rays have times."""
         times = {f.name: [r.time for r in f.rays.values() if r.time is not None and r.point.size] for f in fields}
         return cls({name: float(np.mean(np.concatenate(rows))) for name, rows in times.items() if rows})
 
@@ -100,7 +100,7 @@ class Rates:
 
 @dataclass(frozen=True, eq=False)
 class SlowVariations:
-    """Slow variations of x and y along the time of each line of each field, in metres in the image.
+    """Slow variations of the image coordinates x and y with time, for each line of each field, in metres.
 
     They are cosines of up to four half periods, without the constant.
 
@@ -115,7 +115,7 @@ class SlowVariations:
 
     @classmethod
     def of(cls, fields: Sequence[calibration_parameters.CalibrationField]) -> SlowVariations:
-        """Return the slow variations of all lines with times and enough points."""
+        """Return the slow variations, as terms to test, of all lines whose rays have times and enough points."""
         waves: dict[tuple[str, str], tuple[float, float, int, int]] = {}
         first = 0
         for site in fields:
@@ -236,12 +236,12 @@ class OmittedTermsTest:
 
     @property
     def degrees_of_freedom(self) -> int:
-        """Number of combinations of the terms that the residuals can show."""
+        """Number of linear combinations of the omitted terms that the residuals can show."""
         return int(np.linalg.matrix_rank(self._unit, tol=1e-6, hermitian=True)) if len(self.score) else 0
 
     @property
     def chi_square(self) -> float:
-        """Chi-square of all terms together."""
+        """Chi-square of the test that all omitted terms are zero."""
         return float(self.score @ self._inverse @ self.score) if len(self.score) else 0.0
 
     @property
@@ -261,12 +261,12 @@ class OmittedTermsTest:
 
     @property
     def _unit(self) -> Array:
-        """Cofactor matrix scaled to unit diagonal."""
+        """Covariance of the gradient (the cofactor matrix) scaled to unit diagonal, (G, G) for G terms."""
         return np.asarray(self.cofactor / self._size / self._size[:, None])
 
     @property
     def _inverse(self) -> Array:
-        """Pseudo-inverse of the cofactor matrix."""
+        """Pseudo-inverse of the cofactor matrix (covariance of the gradient), (G, G) for G terms."""
         inner = np.linalg.pinv(self._unit, rcond=1e-6, hermitian=True)
         return np.asarray(inner / self._size / self._size[:, None])
 
@@ -276,8 +276,8 @@ FARTHEST = 2e3
 no datum moves half of the points farther: an arc minute is 150 m, one second of a clock 7 km.
 """
 _EXPECTED = 20.0
-"""Distance between points and the rays of their image points, in sigmas due to the start values, above which the points
-are not those in the image.
+"""Largest plausible distance between points and the rays of their image points, in sigmas due to the start values;
+beyond it the points are not those in the image.
 """
 
 
@@ -455,7 +455,7 @@ class Adjustment:
 
     @property
     def sigma(self) -> dict[str, float]:
-        """Standard deviation of each unknown; 0 for fixed unknowns."""
+        """Standard deviation of each unknown by its name, in metres or radians; 0 for fixed unknowns."""
         return dict(zip(self.names, np.sqrt(np.diag(self.covariance)).tolist(), strict=True))
 
     @cached_property
@@ -465,7 +465,7 @@ class Adjustment:
 
     @cached_property
     def slow_variations(self) -> OmittedTermsTest:
-        """Test for errors that vary slowly along the lines."""
+        """Test of the residuals for image errors that vary slowly along the lines."""
         return self.omitted_terms_test(SlowVariations.of(self.fields))
 
     def sigma_with(self, start: Mapping[str, float]) -> dict[str, float]:
@@ -522,7 +522,7 @@ _CONVERGED = 1e-6
 ends it, too.
 """
 _HUBER_ROUNDS = 6
-"""Number of first rounds with Huber weights before those of IGG III."""
+"""Number of first rounds of reweighting with Huber's weights, before the weights of IGG III are used."""
 
 
 def adjust(
@@ -610,7 +610,7 @@ def adjust(
 def _adjusted(
     problem: _Problem, state: _Iteration, robust: reweighting.Robust | None, variance_components: bool
 ) -> Adjustment:
-    """Return the solution with converged weights and factors."""
+    """Iterate weights and variance factors to convergence and return the solution."""
     if robust and variance_components:
         # Detect gross errors against the scatter of the others first. Variance components then need good points with
         # full weight, because weights that fall with the residual would look like smaller noise.
@@ -697,7 +697,7 @@ class _Problem:
         return replace(state, weights=Weights(np.where(lost[self.place], 0.0, weight[0]), factor), lost=lost)
 
     def equations(self, state: _Iteration, omitted: OmittedTerms | None = None) -> Equations:
-        """Return the equations at a state, optionally with omitted terms as unknowns."""
+        """Return the equations linearised at a state, optionally with omitted terms as further unknowns."""
         return assemble(
             self.fields,
             self.cameras,

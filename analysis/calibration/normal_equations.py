@@ -92,7 +92,7 @@ class SharedNoise:
 
     @property
     def size(self) -> int:
-        """Number of unknowns, K."""
+        """Number K of unknowns of the shared noise."""
         return self.precision.shape[0]
 
     def corrected(self, name: str, line: str, rays: Rays, shared: Array) -> Rays:
@@ -349,7 +349,7 @@ class Equations:
     def tests(
         self, covariance: Array, cofactors: Array, weights: Weights, priors: Sequence[Prior]
     ) -> dict[str, GroupTest]:
-        """Return the tests of the variance groups after an adjustment.
+        """Return the chi-square tests of the residuals of each variance group after an adjustment, by its name.
 
         Parameters
         ----------
@@ -487,7 +487,7 @@ class OmittedTermsModel(Protocol):
 
     @property
     def size(self) -> int:
-        """Number of omitted terms."""
+        """Number of terms that are omitted from the model and tested."""
 
     def columns(self, field: CalibrationField, line: str, rays: Rays, by: Partials) -> Array:
         """Return the derivatives of n image points' misclosures (x, y) with respect to the terms, (n, 2, size).
@@ -541,7 +541,7 @@ def _reduce(
     weights: Weights,
     shared: SharedNoise,
 ) -> Equations:
-    """Eliminate ground points and shared noise from the whitened equations."""
+    """Return the normal equations of the unknowns, with ground points and shared noise eliminated."""
     exact = np.concatenate([f.control & ~np.any(f.covariance, axis=(1, 2)) for f in fields])
     control = np.concatenate([f.control for f in fields]) & ~exact
     total, count = len(exact), rows.design.shape[1]

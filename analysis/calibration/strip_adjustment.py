@@ -54,9 +54,9 @@ from analysis.orbit.three_line_model import BIAS, LineModel, Rays, bias_rotation
 
 _NAME = "strip"
 _STEPS = 10
-"""Largest number of Gauss-Newton steps."""
+"""Largest number of Gauss-Newton steps of a strip adjustment."""
 _CONVERGED = 1e-6
-"""Largest step of a converged iteration, in metres, as in forward intersection."""
+"""Largest step of the ground points, in metres, at which a strip adjustment counts as converged."""
 
 
 @dataclass(frozen=True)
@@ -184,7 +184,7 @@ def adjust_strip(
 def _solved(
     site: CalibrationField, cameras: Mapping[str, LineModel], noise: Noise, shared: SharedNoise
 ) -> tuple[State, Equations]:
-    """Return the converged state of readings and points, and the equations."""
+    """Iterate a strip adjustment to convergence and return the state of readings and points, with the equations."""
     fixed = (np.array([-1]),) * 5
     parameters = Parameters((), np.zeros(0), np.zeros(0), {(_NAME, k): fixed for k in site.rays})
     state = State(np.zeros(0), (site.ground,), np.zeros(shared.size))

@@ -94,7 +94,7 @@ class RigidMotion:
 
     @property
     def matrix(self) -> Array:
-        """Rotation matrix (3, 3)."""
+        """Rotation matrix (3, 3) of the motion, in the assembly's frame."""
         return np.asarray(Rotation.from_rotvec(self.rotation).as_matrix())
 
     @property
@@ -107,11 +107,11 @@ class RigidMotion:
         return float(np.arctan2(-line[0], line[1]))
 
     def moved(self, point: ArrayLike) -> Array:
-        """Return points (..., 3) after the motion, in metres."""
+        """Return the positions of points of the assembly, (..., 3), after the motion, in metres."""
         return np.asarray(np.asarray(point, np.float64) @ self.matrix.T + self.shift)
 
     def displacement(self, point: ArrayLike) -> Array:
-        """Return the displacements of points (..., 3), in metres."""
+        """Return the displacements of points of the assembly, (..., 3), due to the motion, in metres."""
         return self.moved(point) - np.asarray(point, np.float64)
 
 
@@ -303,7 +303,7 @@ def fit_focal_plane(
     freedom = len(height) - 3
 
     def solve(extra: float) -> tuple[Array, Array, float]:
-        """Parameters, covariance and weighted chi-square with an extra scatter."""
+        """Return parameters, covariance and weighted chi-square of the plane for a given extra scatter, in metres."""
         root = 1.0 / np.sqrt(spread**2 + extra**2)
         inverse = statistics.gain(design * root[:, None])
         parameters = inverse @ (height * root)

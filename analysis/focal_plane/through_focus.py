@@ -41,11 +41,11 @@ QUARTIC = 0.3
 """Coefficient q of the fitted curve p (1 - u + q u^2), u = a (z - z0)^2: peak value p at defocus z0, width parameter a.
 """
 FRACTION = 0.5
-"""Fraction of the peak above which the fitted curve uses points."""
+"""Fraction of the peak value above which points of a through-focus curve are used in the fit."""
 LEAST_POINTS = 5
 """Smallest number of different focus positions to which a through-focus curve is fitted."""
 WIDEST_FRACTION = 0.3
-"""Fraction of the peak to which the window may extend if it holds too few points."""
+"""Smallest fraction of the peak value down to which points are used if there are too few above `FRACTION`."""
 _ROUNDS, _NEWTON_STEPS = 12, 4
 _AT_REST = 1e-6
 """Relative change in a step below which a curve has converged; further rounds would change it only by rounding."""
@@ -289,7 +289,7 @@ class FocusVertex:
     Attributes
     ----------
     position : float
-        Position of the vertex.
+        Position of the vertex (best focus), in the unit of the positions.
     sigma : float
         Standard deviation of the position from the given sigmas, not scaled by chi-square.
     peak, peak_sigma : float
@@ -346,7 +346,7 @@ class FocusVertices:
     covariance: Array
 
     def at(self, *index: int) -> FocusVertex:
-        """Return the vertex of one curve."""
+        """Return the vertex of one of the curves, given by its index along the leading axes."""
         values = {field.name: getattr(self, field.name)[index] for field in fields(FocusVertex)}
         return FocusVertex(**{name: value if value.ndim else value.item() for name, value in values.items()})
 

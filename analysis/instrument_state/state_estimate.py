@@ -415,7 +415,7 @@ def _gauss_newton(
     unit: Array,
     out: dict[str, list[str]],
 ) -> StateEstimate:
-    """Return the estimate by Gauss-Newton steps from a start, without the excluded blocks."""
+    """Return the estimate of the state by Gauss-Newton steps, without the excluded blocks of measured numbers."""
     whiteners = [group.whitener(out.get(group.name, ())) for group in groups]
     values = np.concatenate([group.values for group in groups])
 
@@ -715,7 +715,7 @@ def best_move(residual: Array, slope: Array, actuators: Actuators) -> NextMove:
 def merit_reduction(
     spread: Array, slope: Array, actuators: Actuators, response: Array, candidates: Mapping[str, Array]
 ) -> dict[str, float]:
-    """Return the expected reduction of the merit, after the following move, by one more measurement of each kind.
+    """Return the expected reduction of the merit after the next move by one more measurement of each kind.
 
     The uncertainty of the state matters only where actuators could correct it: tr(H D P D' H) with H the projection on
     their range.
@@ -731,7 +731,7 @@ def merit_reduction(
     actuators : Actuators
         Actuators of the instrument; their steps are ignored, their limits only exclude those that cannot move.
     response : (R, C) ndarray
-        Derivatives A with respect to the actuators.
+        Derivatives A of the merit's numbers with respect to the actuators.
     candidates : dict of str to (N, U) ndarray
         Whitened derivatives of each candidate measurement with respect to the units, by name.
     """

@@ -117,7 +117,7 @@ class Reason(IntEnum):
 
     @property
     def text(self) -> str:
-        """Description of the reason."""
+        """Description of the verdict in a few words."""
         return _TEXTS[self]
 
 

@@ -361,7 +361,7 @@ be an order of magnitude smaller.
 _LONGEST_STEP = 0.7
 """Longest Gauss-Newton step of the position, in pixels."""
 _RIDGE = 1e-11
-"""Relative ridge that keeps singular normal matrices solvable."""
+"""Number added to the diagonal of scaled normal matrices to keep singular ones solvable, relative to the diagonal."""
 _SMOOTHINGS = (0.0, 0.35, 0.7, 1.1, 1.7, 2.6)
 """RMS radii of the Gaussians that may smooth a template, in pixels; those up to a ninth of the window's side are used.
 """
@@ -460,7 +460,7 @@ class Fits:
         return self.halves.judged(self.spread.variance * coloured * hidden, typical)
 
     def _parts(self, good: NDArray[np.bool_] | None) -> tuple[Array, Array, Array, float]:
-        """Return covariance by residual noise, factor for noise hidden by smoothing, and variances of relief.
+        """Return covariance due to residual noise, factor for noise hidden by smoothing, and variances of relief.
 
         The variances of relief, in px^2, are that of each point and that of a typical point.
         """
@@ -528,7 +528,7 @@ def least_squares(
 
 
 def _fit(image: NDArray[np.generic], templates: Array, start: Array, options: MatchOptions) -> Fits:
-    """Fit a group of points at once; arguments are those of `least_squares`."""
+    """Fit the positions of a group of points at once; the arguments are those of `least_squares`."""
     count, half = len(templates), templates.shape[1] // 2
     reach = half - options.margin
     row, column = (g.ravel().astype(np.float64) for g in np.mgrid[-reach : reach + 1, -reach : reach + 1])
@@ -708,7 +708,7 @@ def _step(
 
 
 def _solve(design: Array, grey: Array) -> Array:
-    """Solve scaled normal equations with a small ridge."""
+    """Solve the scaled normal equations of linear least-squares fits, with a small ridge against singularity."""
     scale = 1.0 / np.maximum(np.sqrt(np.einsum("mqp,mqp->mq", design, design)), 1e-300)
     scaled = design * scale[:, :, None]
     normal = scaled @ np.swapaxes(scaled, 1, 2) + _RIDGE * np.eye(design.shape[1])
@@ -728,7 +728,7 @@ def _summary(
     reach: int,
     template_noise_effect: TemplateNoise,
 ) -> Fits:
-    """Return the fits with their statistics and window checks."""
+    """Return the converged fits with their statistics and the checks of their windows."""
     unfitted = np.isin(reason, (Reason.TEMPLATE, Reason.OUTSIDE, Reason.IMAGE, Reason.FLAT, Reason.SATURATED))
     square = np.einsum("np,np->n", residual, residual)
     centred = grey - grey.mean(axis=1, keepdims=True)

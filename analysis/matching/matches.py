@@ -225,13 +225,13 @@ def _worst(covariance: Array) -> Array:
 # Probability of drawing no sample free of mismatches, for the share of mismatches _WRONG.
 _MISSED, _WRONG = 1e-6, 0.45
 _MOST_SAMPLES = 8000
-"""Largest number of random samples."""
+"""Largest number of random minimal samples of points in the search for a consensus."""
 _VALUES = 2_000_000
-"""Number of candidates' distances that are held in memory at once."""
+"""Number of distances of points from candidate displacement fields that are held in memory at once."""
 _MEDIAN = 2.0 * math.log(2.0)
-"""Median of chi-square with two degrees of freedom."""
+"""Median of the chi-square distribution with two degrees of freedom."""
 _ROUNDS = 50
-"""Largest number of iterations of the consensus."""
+"""Largest number of iterations of selecting and fitting the points of a consensus."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -73,7 +73,7 @@ def resampled(image: ArrayLike, rows: ArrayLike, columns: ArrayLike, *, smoothin
 
 
 def _fill(sample: Array, image: NDArray[np.generic], row: Array, column: Array, smoothing: float) -> None:
-    """Fill one patch with the grey values of an image at rows and columns."""
+    """Fill an array with the grey values of an image at given rows and columns, all of one patch."""
     height, width = image.shape
     # NaN compares false
     inside = (row >= 0) & (row <= height - 1) & (column >= 0) & (column <= width - 1)

@@ -416,7 +416,7 @@ def _square(apart: Array, covariance: Array) -> Array:
 
 
 _BLOCKS = 5
-"""Number of blocks along each side of a window."""
+"""Number of blocks of constant relief along each side of a window."""
 _LENGTH = 1.0
 """Correlation length of the relief over the window's side: a shorter one would act as noise on the affine change, a
 longer one follows it.

@@ -64,13 +64,16 @@ class Shifts:
 
     @property
     def spots(self) -> dict[str, slice]:
-        """Camera -> slice of its spots among the spots of all cameras."""
+        """Mapping from the name of each camera to the range of its spots among those of all cameras."""
         ends = np.cumsum([0, *(len(camera.channels) for camera in self.cameras.values())]).tolist()
         return {name: slice(a, b) for name, a, b in zip(self.cameras, ends[:-1], ends[1:], strict=True)}
 
     @property
     def coordinates(self) -> dict[str, slice]:
-        """Camera -> slice of its spot coordinates (row and column of each spot) among those of all cameras."""
+        """Mapping from the name of each camera to the range of its spot coordinates among those of all cameras.
+
+        Spot coordinates are row and column of each spot.
+        """
         return {name: slice(2 * spots.start, 2 * spots.stop) for name, spots in self.spots.items()}
 
 
@@ -84,7 +87,7 @@ class Estimator(ABC):
     note : str
         Description shown in reports.
     stated : bool
-        True if it needs a prior of the disturbances; without one it is not in the results.
+        True if it needs a prior of the disturbances (motions of bodies); without one it is not in the results.
     """
 
     title: str
@@ -317,7 +320,7 @@ def preferred_estimator(names: Iterable[str]) -> str:
 
 
 def applicable(cameras: Mapping[str, CameraCalibration], disturbances: Disturbances | None) -> dict[str, Estimator]:
-    """Return name -> estimator for the estimators that can be used with these cameras and this prior.
+    """Return the estimators that can be used with these cameras and this prior, by their names.
 
     Parameters
     ----------

@@ -75,7 +75,7 @@ class Observed:
 
     @property
     def spots(self) -> bool:
-        """True if this is a reading of the spots."""
+        """True if this is a reading of the spots, False for temperatures or camera parameters."""
         return not self.sensors and self.parameters is None
 
 
@@ -333,9 +333,10 @@ class Hint:
     log_weight : (L,) ndarray
         Logarithm of the weight of each hypothesis, its likelihood ratio times its prior probability.
     mean : (L, r) ndarray
-        Mean of the amounts if the jump occurred there.
+        Mean, if the jump occurred in that gap, of the r independent amounts of unit prior variance that make up the
+        jump.
     covariance : (L, r, r) ndarray
-        Covariance of the amounts.
+        Covariance of these amounts.
     """
 
     log_weight: Array
@@ -352,11 +353,11 @@ class Hint:
         Parameters
         ----------
         looked : tuple of ndarray
-            Score (L, q) and information (L, q, q) by which the weights are computed.
+            Score (L, q) and information (L, q, q) of steps from which the weights of the hypotheses are computed.
         own : tuple of ndarray
-            Score and information by which the amounts are computed.
+            Score and information of steps from which the amounts of the jump are computed.
         outputs : (q, r) ndarray
-            Effect on the outputs of independent amounts of unit variance.
+            Effect on the outputs of the r independent amounts of unit prior variance that make up the jump.
         expected : (L,) ndarray
             Mean number of jumps in the gap before each reading; 0 where there is no gap.
         """
@@ -408,7 +409,7 @@ def mixture(mean: Array, covariance: Array, hints: Sequence[Hint], moved: Sequen
     hints : sequence of Hint
         Hypotheses of a jump for each body, with their weights.
     moved : sequence of (L, n, r) ndarrays
-        Effect of unit amounts before each reading on the present states, for each body.
+        For each body, derivatives of the present states with respect to the amounts of a jump before each reading.
     """
     probabilities = _chances(hints)
     away = [np.einsum("knr,kr->kn", m, hint.mean) for m, hint in zip(moved, hints, strict=True)]
@@ -432,8 +433,8 @@ def undetected_variance(
     Parameters
     ----------
     score : sequence of (N, r) ndarrays
-        For each body, the score of a step of unit amounts before each of N readings: weighted sum of all readings, from
-        which the amounts are estimated.
+        For each body, the score of a step before each of N readings: weighted sum of all readings, from which the
+        amounts of the step are estimated.
     information : sequence of (N, r, r) ndarrays
         For each body, the information (inverse covariance) on these amounts.
     gap : (N,) ndarray

@@ -109,7 +109,7 @@ class Steps:
 
 @dataclass(frozen=True)
 class Jump:
-    """Detected jump: a step of one body's motions at an unknown time, with everything that was found out about it.
+    """Detected jump: a step of one body's motions, with its estimated sizes, time and significance.
 
     Attributes
     ----------
@@ -187,7 +187,7 @@ class Jump:
 
 @dataclass(frozen=True, eq=False)
 class Step:
-    """One step of some motions by unknown amounts, either at a given event or as a detected jump.
+    """Step of motions by unknown amounts, either at the time of a specified event or as a detected jump.
 
     Dimensions: D spot coordinates (row and column of every spot), P parameters.
 
@@ -236,7 +236,8 @@ class Step:
 class Amounts:
     """Estimated amounts of a jump's motions under each of L hypotheses about its time.
 
-    Each hypothesis is that the jump occurred just before a certain reading.
+    Each hypothesis is that the jump occurred just before a certain reading. The amounts are independent under the
+    prior; together they make up the motions of the body.
 
     The fields are the means of the amounts (L, r), their covariances (L, r, r) and the log weights of the hypotheses
     (L,).
@@ -262,9 +263,9 @@ class Amounts:
         information : (L, q, q) ndarray
             Information (inverse covariance) on the step's effect on the outputs.
         outputs : (q, r) ndarray
-            Effect on the outputs of one prior standard deviation of each motion.
+            Derivatives of the outputs with respect to the r independent amounts that make up the body's motions.
         times : float
-            Ratio of their standard deviations to those of ``outputs``.
+            Standard deviation of the amounts before the readings; 1 for the prior of the motions.
         """
         information = outputs.T @ information @ outputs
         score = score @ outputs
@@ -439,7 +440,7 @@ def jump_scale(information: Array, score: Array) -> float:
 
 
 def with_jumps(stated: Disturbances, found: Sequence[Jump]) -> Disturbances:
-    """Return the prior with a copy of the motions of each detected jump appended as an event, in this order.
+    """Return the prior with a step of the same motions, of known distribution in time, added for each detected jump.
 
     Parameters
     ----------
@@ -547,9 +548,9 @@ class Bodies:
     Attributes
     ----------
     own : tuple of Candidate
-        All motions of each body that may jump.
+        For each body, all of its motions that may jump.
     times : tuple of float
-        Ratio of each body's jump to the prior standard deviations.
+        Ratio of the standard deviations assumed for each body's jump to the prior ones.
     weight : (B, L) ndarray
         Probability of each hypothesis (body and reading); their sum is 1.
     judged : tuple of Amounts
@@ -610,7 +611,9 @@ class Bodies:
 
     @property
     def spots(self) -> list[Array]:
-        """Effect of unit amounts of each body on the q outputs, one array (q, r) for each body.
+        """Derivatives of the q outputs with respect to the r amounts of a jump, one array (q, r) for each body.
+
+        Outputs are the values that readings can contain.
 
         Dimensions: r motions of the body that may jump.
         """
@@ -638,11 +641,11 @@ class Bodies:
         covariance : (n, n) ndarray
             Covariance of the filter.
         response : (L, n, q) ndarray
-            Response of the mean to steps of unit outputs before each reading.
+            Change of the mean by a step before each reading that shifts each output by one unit.
         levels : sequence of (n, r) ndarrays
-            Effect of unit amounts on the states, for each body.
+            For each body, derivatives of the states with respect to the r amounts of a jump.
         amounts : sequence of Amounts
-            Amounts of each body.
+            Estimated amounts of the jump, for each body.
         """
         shift, spread = np.zeros(len(mean)), np.zeros(covariance.shape)
         for amount, share, level, effect in zip(amounts, self.weight, levels, self.spots, strict=True):
@@ -666,7 +669,7 @@ def mixture_moments(amounts: Sequence[Amounts], effects: Sequence[Array], weight
     amounts : sequence of Amounts
         Amounts of each of B bodies if it has jumped before each of L readings.
     effects : sequence of (o, r) ndarrays
-        Effect of unit amounts, for each body.
+        For each body, derivatives of the o values with respect to the r amounts of its jump.
     weight : (B, L) ndarray
         Probability of each hypothesis (body and reading); their sum is 1.
     """

@@ -59,7 +59,7 @@ class Quantity:
 
     @property
     def key(self) -> str:
-        """Name of the quantity in files of results, which ends in its unit."""
+        """Name of the quantity in files of results, which ends in its unit: ``d_f_um``."""
         return self.parameter.key
 
     @property
@@ -160,7 +160,7 @@ class Split:
 
     @property
     def sigma(self) -> Array:
-        """Standard deviations of the estimate's error due to motions and noise, (Q,), in the units of the quantities.
+        """Standard deviations of the estimates' errors due to motions and noise, (Q,), in the units of the quantities.
 
         Dimensions: Q quantities.
         """
@@ -420,9 +420,9 @@ def calibrated_sigma(rows: Array, stated: Disturbances, noise: Array, field: Arr
 
 
 UNOBSERVED = 0.1
-"""Ratio of a motion's spot shift to the shift's noise below which the motion has no effect on a spot."""
+"""Ratio of the spot shift due to a motion to the noise of the shift below which the spot does not show the motion."""
 SHARE = 0.01
-"""Smallest fraction of the variance of a quantity from which on a body that the spots do not reveal is reported."""
+"""Smallest fraction of a quantity's variance at which a body that the spots do not reveal is reported."""
 DEGREES = 4.0
 """Degrees of freedom of Student's distribution assumed for standard deviations of the prior that are guesses."""
 _DRAWS = 8_000

@@ -342,7 +342,7 @@ class IntersectionAngleChange(StateArrays):
 
     @property
     def noise_rad(self) -> Array:
-        """Standard deviation due to the noise of the images alone, (...) rad."""
+        """Standard deviation of the angle's change due to the noise of the images alone, (...) rad."""
         return self.sigma_rad if self.sigma_noise_rad is None else self.sigma_noise_rad
 
 
@@ -499,7 +499,7 @@ class GroundGeometry:
 
     @cached_property
     def incidences_rad(self) -> tuple[float, float]:
-        """Angles of the rays from the vertical at the ground, rad."""
+        """Angles of incidence of the two cameras' rays at the ground, from the vertical, rad."""
         ratio = 1.0 + self.altitude_m / EARTH_RADIUS_M
         first, second = (math.asin(ratio * math.sin(a)) for a in self.looks_rad)
         return first, second

@@ -228,7 +228,9 @@ GROUND = (
 
 
 def rows_of(camera: CameraCalibration) -> Array:
-    """Return the coefficients of a camera's readings on its four parameters, (P, 4), in their units per rad and m.
+    """Return the coefficients of a camera's readings on d_alpha, d_beta, d_gamma (rad) and d_f (m), (P, 4).
+
+    They are in the units of the readings per radian and per metre.
 
     Dimensions: P readings of the camera.
 

@@ -49,7 +49,7 @@ ALIKE = 2.0
 specified variance) at which that noise still explains the misfit.
 """
 LOUD = 1.3
-"""Squared ratio of the frames' noise to the specified one above which it is too large.
+"""Ratio of the noise variance of the frames to the specified one above which the noise counts as too large.
 
 A median over an image exceeds it by chance only with a deviation of 6 sigma.
 """
@@ -95,30 +95,30 @@ class SpotEvidence:
     after: FitStates
 
     def at(self, states: slice) -> SpotEvidence:
-        """Return the evidence of a slice of the states.
+        """Return the goodness of fit of the spots in selected states.
 
         Parameters
         ----------
         states : slice
-            Range of the states.
+            Range of the states to keep.
         """
         before = self.before if len(self.before.whole) == 1 else self.before.at(states)
         return SpotEvidence(before, self.after.at(states))
 
     @classmethod
     def joined(cls, parts: Sequence[SpotEvidence]) -> SpotEvidence:
-        """Return the evidence of several series against one nominal state, joined.
+        """Return the goodness of fit of several series of states, which share one nominal state, joined.
 
         Parameters
         ----------
         parts : sequence of SpotEvidence
-            Evidence of each series; at least one.
+            Goodness of fit of each series; at least one.
         """
         return cls(parts[0].before, FitStates.joined([part.after for part in parts]))
 
     @property
     def holds(self) -> NDArray[np.bool_]:
-        """True for states whose spots before and after are as assumed, (S,).
+        """True for states in which all spots have the assumed shape and noise, before and after, (S,).
 
         Dimensions: S states.
         """
@@ -134,7 +134,7 @@ class SpotEvidence:
 
     @property
     def worst(self) -> int:
-        """Index of the state whose spots fit worst."""
+        """Index of the state whose spots fit the calibrated shape worst."""
         return int(np.argmax(np.max(self.widening, axis=1)))
 
     def course_doubt(self, moments: Sequence[str], names: Sequence[str]) -> str | None:
@@ -223,7 +223,7 @@ _MOST_STEPS = 20
 
 @dataclass(frozen=True, eq=False)
 class Retraced:
-    """Exact effects of S states on spots and cameras, from a ray trace.
+    """Exact spot shifts and camera changes in S states of the instrument, from a ray trace.
 
     Dimensions: D spot coordinates (row and column of every spot), K cameras.
 
@@ -514,12 +514,12 @@ class Recovery(StateArrays):
     curvature: Mapping[str, Curvature] = field(default_factory=dict)
 
     def at(self, states: slice) -> Recovery:
-        """Return the results of a slice of the states, without ``parts``.
+        """Return the results of selected states, without ``parts``.
 
         Parameters
         ----------
         states : slice
-            Range of the states.
+            Range of the states to keep.
         """
         return StateArrays.at(replace(self, parts=None), states)
 

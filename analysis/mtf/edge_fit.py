@@ -355,7 +355,7 @@ class EdgeRows:
 
     @staticmethod
     def of(lines: Array, shape: tuple[int, ...], bend: Array) -> EdgeRows:
-        """Return the rows of pages, one page after the other.
+        """Return the rows of several pages, one page after the other, with the line of each page and the common bend.
 
         Dimensions: P pages, B coefficients of the bend.
 

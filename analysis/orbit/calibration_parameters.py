@@ -138,7 +138,7 @@ class Noise:
         return tuple(t for t in terms if t.sigma > 0)
 
     def check(self) -> None:
-        """Raise CalibrationError if a sigma or an interval is invalid."""
+        """Raise CalibrationError if a standard deviation or an interval is negative, missing or not finite."""
         sigmas = (self.image, self.attitude, self.station, self.slow_attitude, self.attitude_walk)
         if not (np.isfinite(sigmas).all() and self.image > 0 and min(sigmas) >= 0):
             raise CalibrationError(
@@ -570,7 +570,7 @@ _CLOSED = 10.0
 unknown.
 """
 _SHOWN = 1e-2
-"""Smallest image motion of an unknown listed in a combination, as a fraction of the largest one in it."""
+"""Smallest image motion due to an unknown that is listed in a linear combination, relative to the largest one in it."""
 _ANGLES = (*BIAS, *DRIFT[:3], "rate")
 
 
@@ -729,7 +729,7 @@ def weak_vectors(reduced: Array, length: Array, scale: Array, basis: Array) -> A
 def combinations(
     names: Sequence[str], scale: Array, vectors: Array, reduced: Array, length: Array
 ) -> tuple[Combination, ...]:
-    """Return a space of combinations as k combinations of named unknowns, as sparse as possible.
+    """Return k linear combinations of named unknowns, as sparse as possible, that span a given space.
 
     A combination lists the unknowns that take part with at least a hundredth of the largest motion. Each combination
     has an unknown that is in no other one.

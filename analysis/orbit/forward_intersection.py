@@ -197,7 +197,7 @@ def third_difference(time: ArrayLike, series: ArrayLike) -> ThirdDifference:
 
 
 _STEPS = 10
-"""Largest number of Gauss-Newton steps."""
+"""Largest number of Gauss-Newton steps of a forward intersection."""
 _CONVERGED = 1e-6
 """Largest step of a converged iteration, in metres; coordinates of 6.4e6 m are rounded to 1e-9 m."""
 _PARALLEL = 3e-4

@@ -76,9 +76,9 @@ _NEVER = 1e-280
 _LEAST_ROWS = 30
 """Smallest number of degrees of freedom of a spectrum or of an estimated variance factor."""
 _REWEIGHTED = 3
-"""Number of iterations of the variance estimation."""
+"""Number of iterations in which the variances of the kinds of errors are estimated."""
 _LEAST_FACTOR = 0.01
-"""Smallest variance factor that is estimated, a tenth of the a-priori sigma."""
+"""Smallest variance factor that is estimated; sigma is then a tenth of the a-priori one."""
 
 
 class JitterError(MeasurementError, ValueError):
@@ -294,7 +294,7 @@ class Observations:
 
     @cached_property
     def _row(self) -> NDArray[np.intp]:
-        """Number of each of R observations among those of its ground point, from 0 on."""
+        """Position of each of R observations among those of its ground point, counted from 0."""
         return _within(self.group, len(self.time))
 
     def _of_groups(self, columns: Array) -> Array:
@@ -312,7 +312,7 @@ class Observations:
 
 
 def _within(group: NDArray[np.intp], count: int) -> NDArray[np.intp]:
-    """Return the number of each of R observations among those of its ground point, from 0 on.
+    """Return the position of each of R observations among those of its ground point, counted from 0.
 
     `group` is ascending.
     """
@@ -628,7 +628,7 @@ def peaks(observations: Observations, lowest: float, highest: float) -> tuple[Ar
 
 
 MOST_LINES = 20
-"""Largest number of lines that a search detects."""
+"""Largest number of oscillations (spectral lines) that a search detects."""
 _FAR = 5.0
 """Robust standard deviations beyond which an observation is excluded as wrong; of normally distributed observations it
 excludes one in two million.
@@ -650,12 +650,12 @@ _MOST_ALIASES = 24
 first.
 """
 _ALIKE = 0.8
-"""Smallest approximate power of a candidate alias, as a fraction of the power of the line."""
+"""Smallest approximate power of a candidate alias, as a fraction of the power of the detected oscillation."""
 
 
 @dataclass(frozen=True, eq=False)
 class Lines:
-    """Detected oscillations, fitted together.
+    """Detected oscillations (spectral lines) of an attitude, fitted together.
 
     The attitude angle about each axis at time t is the sum over the lines of sine * sin(2 pi f (t - origin)) + cosine *
     cos(2 pi f (t - origin)), f being the frequency of a line.
@@ -767,7 +767,7 @@ class JitterSearch:
     factors : (K,) ndarray
         Estimated factor on the a-priori variance of each of K kinds of errors.
     threshold : float
-        Power of ``after`` that noise alone exceeds with the specified probability.
+        Power in ``after`` that noise alone exceeds with the specified false-alarm probability.
     beyond : float
         Highest frequency at which aliases were searched, in hertz.
     """
@@ -947,7 +947,7 @@ def find_jitter(
 def _unaliased(
     observations: Observations, lines: Lines | None, fitted: Lines, band: tuple[float, float], false_alarm: float
 ) -> tuple[Lines, tuple[float, ...]]:
-    """Return all lines with the last one at its most likely frequency, and its aliases, in hertz.
+    """Return all oscillations (lines) with the last one at its most likely frequency, and its aliases, in hertz.
 
     Parameters
     ----------
@@ -987,18 +987,18 @@ def _unaliased(
 
 
 def _left(observations: Observations, lines: Lines) -> float:
-    """Return the sum of squared residuals of the observations after fitting nuisance parameters and lines."""
+    """Return the sum of squared residuals of the observations after fitting nuisance parameters and oscillations."""
     residual = observations.rest(observations.value - _predicted(observations, lines))
     return float(residual @ residual)
 
 
 def _beside(observations: Observations, lines: Lines | None) -> Observations:
-    """Return the observations with all parameters of the lines as additional nuisance parameters."""
+    """Return the observations with all parameters of the oscillations as additional nuisance parameters."""
     return observations if lines is None else observations.beside(_columns(observations, lines))
 
 
 def _columns(observations: Observations, lines: Lines) -> Array:
-    """Return the derivatives of R observations with respect to the P parameters of the lines, (R, P)."""
+    """Return the derivatives of R observations with respect to the P parameters of the oscillations, (R, P)."""
     design = np.zeros((len(observations.value), lines.covariance.shape[0]))
     for j in range(observations.time.shape[1]):
         design += np.einsum(
@@ -1017,7 +1017,7 @@ def _predicted(observations: Observations, lines: Lines) -> Array:
 
 
 def _good(observations: Observations, lines: Lines | None) -> NDArray[np.bool_]:
-    """Return a mask of the observations that nuisance and lines explain within the noise.
+    """Return a mask of the observations that nuisance parameters and oscillations explain within the noise.
 
     Either all or no observations of a ground point are used.
     """

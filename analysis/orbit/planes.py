@@ -198,7 +198,7 @@ class PlaneFit:
 
     @property
     def degrees_of_freedom(self) -> int:
-        """Degrees of freedom of the residuals."""
+        """Degrees of freedom of the residuals of n points: n - 2."""
         return len(self.residual) - 2
 
     @property
@@ -284,7 +284,7 @@ def fit_plane(station: Station, strip: Strip, method: Method = "tls") -> PlaneFi
 
 
 def _explicit(station: Station, strip: Strip, arm: Array, method: Method) -> PlaneFit:
-    """Fit the plane by eqs. 1 and 5, with the printed or the right sign."""
+    """Fit the plane z = a0 x + a1 y + a2 by eqs. 1 and 5 of paper 000, with the printed or the right sign."""
     flat = arm[:, :2]
     matrix = flat.T @ flat
     condition = float(np.linalg.cond(matrix))

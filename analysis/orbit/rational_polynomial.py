@@ -19,7 +19,7 @@ from analysis.arrays import Array, UndeterminedError
 from optics.numerics.backend import one_blas_thread
 
 TERMS = 20
-"""Number of coefficients of a cubic in three coordinates."""
+"""Number of coefficients of a cubic polynomial in three coordinates."""
 _POWERS = np.array(
     [
         *((0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1), (1, 1, 0), (1, 0, 1), (0, 1, 1), (2, 0, 0), (0, 2, 0), (0, 0, 2)),
@@ -124,7 +124,7 @@ class RationalPolynomial:
         return self.offset[0] + self.scale[0] * line, self.offset[1] + self.scale[1] * sample
 
     def text(self) -> str:
-        """Return the contents of NAME_RPC.TXT, which GDAL reads beside NAME.tif."""
+        """Return the polynomials as the text of a file NAME_RPC.TXT, which GDAL reads beside NAME.tif."""
         names = (("LINE", "pixels"), ("SAMP", "pixels"), ("LAT", "degrees"), ("LONG", "degrees"), ("HEIGHT", "meters"))
         errors = (("ERR_BIAS", self.bias_m), ("ERR_RAND", self.random_m))
         rows = [f"{name}: {value!r} meters" for name, value in errors if value is not None]

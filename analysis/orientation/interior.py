@@ -513,7 +513,7 @@ class InteriorOrientation:
 
     @property
     def correlation(self) -> Array:
-        """Correlation matrix of the P terms, in their order."""
+        """Correlation matrix of the P fitted terms, (P, P), in the order of `terms`."""
         sigma = np.sqrt(np.diagonal(self.covariance))
         return np.asarray(self.covariance / np.outer(sigma, sigma))
 
@@ -651,7 +651,7 @@ LINE_TERMS = ("axis", "principal_distance", "principal_point", "k1")
 distortion. The last three are keys of a line in a payload file.
 """
 _STEPS = 20
-"""Largest number of Gauss-Newton steps."""
+"""Largest number of Gauss-Newton steps of the fit of the line model."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -672,7 +672,7 @@ class LineOrientation:
 
     @property
     def sigma(self) -> Array:
-        """Standard deviations of the four values, in rad, m, m, 1/m^2."""
+        """Standard deviations of axis reading (rad), principal distance (m), principal point (m) and k1 (1/m^2)."""
         return np.sqrt(np.diagonal(self.covariance))
 
 

@@ -201,7 +201,7 @@ Released = Callable[[NDArray[Any]], None]
 _HELD = 1 << 25
 """Number of bytes of frames that are processed at a time, to limit memory."""
 GROWTH_SIGMAS = 3.5
-"""Residual, in sigmas, from which a neighbour of a transient belongs to it."""
+"""Residual, in sigmas, above which a pixel next to a transient (cosmic ray) counts as part of it."""
 _DIM = 0.5
 """Fraction of the brightest frame's light below which a frame counts as not containing the spot."""
 _UNLIKE = 0.01
@@ -290,12 +290,12 @@ class ScreenedFrames:
 
     @property
     def clean(self) -> bool:
-        """True if no defect changed the measurement."""
+        """True if no defect of the frames changed the measurement."""
         return not any(finding.corrects for finding in self.findings)
 
 
 def _in_memory(frames: NDArray[Any]) -> None:
-    """Do nothing, for frames that are held in memory."""
+    """Do nothing: the default for `released` if the frames are in memory and no file has to be released."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -326,7 +326,7 @@ class _Stack:
 
     @classmethod
     def of(cls, frames: NDArray[Any], bad: Mask | None, released: Released, blank: bool = False) -> _Stack:
-        """Return the stack of all frames."""
+        """Return the stack of all recorded frames of one state."""
         known = np.zeros(frames.shape[1:], dtype=bool) if bad is None else bad
         return cls(frames, np.arange(len(frames)), known, released, blank)
 
@@ -335,7 +335,7 @@ class _Stack:
 
     @property
     def shape(self) -> tuple[int, int]:
-        """Number of rows and columns."""
+        """Number of rows and columns of a frame."""
         return self.frames.shape[1], self.frames.shape[2]
 
     def taken(self, numbers: NDArray[np.intp]) -> _Stack:

@@ -421,9 +421,9 @@ class FitStates(StateArrays):
     whole, core : ndarray
         Reduced chi-squares of all pixels and of the core's; NaN where no shape was fitted.
     whole_limit, core_limit : ndarray
-        Limits of these; infinite where no shape was fitted.
+        Limits of these chi-squares; infinite where no shape was fitted.
     whole_sigma, core_sigma : ndarray
-        Standard deviations of these due to the noise of the frames.
+        Standard deviations of these chi-squares due to the noise of the frames.
     noise : ndarray
         Squared ratio of the frames' noise to the specified one, from the median of all pixels.
     """

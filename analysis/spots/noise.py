@@ -244,7 +244,7 @@ class NoiseModel:
 
     @property
     def dsnu_variance_dn2(self) -> float:
-        """Variance of the fixed additive patterns, DN^2."""
+        """Variance over pixels of the fixed patterns that do not depend on the light, DN^2."""
         further = sum(term.fixed_variance_e2 for term in self.further)
         return (self.gain_dn_per_e * self.dsnu_e) ** 2 + self.gain_dn_per_e**2 * further
 

@@ -118,7 +118,7 @@ class SpotTemplate:
         background: float = 0.0,
         tolerance: float = 1e-8,
     ) -> SpotTemplate:
-        """Calibrate a shape from one image.
+        """Make the template of a spot's shape from one image of the spot.
 
         Dimensions: M rows of template samples, N columns of template samples.
 
@@ -215,7 +215,7 @@ class SpotTemplate:
 
     @property
     def count(self) -> int:
-        """Number T of shapes held."""
+        """Number T of spot shapes in the template."""
         return int(self.centre.shape[0])
 
     @property

@@ -94,7 +94,7 @@ def network(x: Array, y: Array, s: Array, seed: int) -> tuple[dict[str, float], 
         )
 
     def curve(a: Array) -> Array:
-        """Return the mean prediction of the networks at angles."""
+        """Return the mean of the trained networks' predictions at given angles."""
         return mean + scale_of_values * np.mean([net.predict(scale * (a[:, None] - middle)) for net in nets], axis=0)
 
     solves = [response(net, scale * (x - middle), (y - mean) / scale_of_values, weight) for net in nets]

@@ -66,7 +66,7 @@ SMOOTHINGS = (0.0, *np.logspace(-8.0, 1.0, 46))
 one.
 """
 SLACK = 1e-9
-"""Tolerance, in radians, within which an angle equals that of a point."""
+"""Tolerance, in radians, within which an angle counts as equal to that of a fitted point."""
 GAP_ORDER = {"piecewise_linear": 2, "polynomial": 0, "cubic_spline": 4, "fourier": 0, "network": 0}
 """Exponent p with which the error of a fit between points, h apart, decreases as h^p for a smooth curve: 2 and 4 for
 the local fits. The error of the others is due to missing terms and does not depend on the step (0).
@@ -186,7 +186,7 @@ class CrossValidation:
 
     @property
     def excess(self) -> float:
-        """Mean square of the residuals beyond the noise, at least zero."""
+        """Mean square of the prediction errors minus that expected from noise, at least zero."""
         return max(0.0, float(np.mean(self.residual**2 - self.variance)))
 
 
@@ -471,7 +471,7 @@ FITS: Mapping[str, Callable[[Array, Array, Array, int], _FitResult]] = {
     "fourier": _fourier,
     "network": network,
 }
-"""Functions that fit each kind of curve, by its name."""
+"""Functions that fit a curve to a dividing error, by the name of the kind of curve."""
 
 
 FEWEST = 3
@@ -610,7 +610,7 @@ class CalibrationSeries:
     present: NDArray[np.bool_] | None = None
 
     def __post_init__(self) -> None:
-        """Raise ValueError for invalid shapes and numbers."""
+        """Raise ValueError for arrays whose shapes do not match, and for numbers that are out of range."""
         x, y = np.asarray(self.angle, np.float64), np.asarray(self.comparisons, np.float64)
         if x.ndim != 1 or y.ndim != 2 or len(y) != len(x):
             raise ValueError(f"calibration: angles (N,) and comparisons (N, repeats), found {x.shape} and {y.shape}")
@@ -646,7 +646,7 @@ class CalibrationSeries:
 
     @property
     def repeats(self) -> int:
-        """Largest number of comparisons of an angle."""
+        """Largest number of comparisons that were made at one angle."""
         return self.comparisons.shape[1]
 
     @property
@@ -661,7 +661,7 @@ class CalibrationSeries:
 
     @property
     def rejected(self) -> int:
-        """Number of rejected comparisons."""
+        """Number of comparisons that Chauvenet's criterion rejects."""
         return int(np.sum(self.excluded_comparisons))
 
     @cached_property
@@ -748,13 +748,13 @@ class CalibrationSeries:
 
     @property
     def step(self) -> float:
-        """Median distance of neighbouring angles, in radians."""
+        """Median distance of neighbouring readings of the table, in radians."""
         return float(np.median(np.diff(self.angle)))
 
 
 @dataclass(frozen=True, eq=False)
 class Trial:
-    """Fit with its cross-validation on the calibration points."""
+    """Curve fitted to a calibration series, with its cross-validation on the calibration points."""
 
     fit: AngleFit
     validation: CrossValidation

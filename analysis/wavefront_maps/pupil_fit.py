@@ -34,7 +34,7 @@ _ORIENTATION_NAMES = {
     (True, 2): "mirrored x",
     (True, 3): "mirrored antidiagonal",
 }
-"""Name of each orientation, by (mirrored, quarter turns)."""
+"""Name of each orientation of a map, by (mirrored, number of rotations by 90 degrees)."""
 _COSINE = (1, 0, -1, 0)
 """Cosine of 0, 90, 180 and 270 degrees, as exact integers."""
 
@@ -169,9 +169,9 @@ class Orientation:
 
 
 ORIENTATIONS = tuple(Orientation(*key) for key in _ORIENTATION_NAMES)
-"""All eight orientations with the sign of the file."""
+"""The eight orientations of a map (mirrored or not, four rotations), with the sign of the file."""
 SIGNED_ORIENTATIONS = tuple(Orientation(o.mirrored, o.quarter_turns, sign) for sign in (1, -1) for o in ORIENTATIONS)
-"""All sixteen orientations with both signs."""
+"""The sixteen orientations of a map: eight mirrors and rotations, each with either sign."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -528,5 +528,5 @@ def _checked_map(values: ArrayLike) -> Array:
 
 
 def _chunks(count: int) -> Iterator[slice]:
-    """Yield slices of at most `_CHUNK` elements."""
+    """Yield slices of at most `_CHUNK` elements that together cover a given number of pixels."""
     return (slice(k, k + _CHUNK) for k in range(0, count, _CHUNK))
