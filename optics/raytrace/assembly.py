@@ -92,7 +92,7 @@ class Element:
         return self.surface.figure_disk(outer)
 
     def figured(self, motion: Motion) -> Surface:
-        """Return the surface changed as a motion says: in radius, conic constant and figure.
+        """Return the surface with the changes of radius, conic constant and figure error that a motion of its body has.
 
         Raises
         ------
@@ -217,7 +217,7 @@ class Assembly:
     def with_nominal(self, state: State) -> Assembly:
         """Return the assembly whose nominal poses, surfaces and refractive indices are those of a state of this one.
 
-        States of the new assembly come on top, as in ``optics.geometry.tree.compose``.
+        A state of the new assembly is applied on top of that state (``optics.geometry.tree.compose``).
 
         Parameters
         ----------

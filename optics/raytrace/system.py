@@ -190,7 +190,11 @@ class Poses:
         return FrameNumbers.of(self.last_rows())
 
     def last_rows(self) -> np.ndarray:
-        """Return the 12 numbers of the last element's pose in each of B systems, (12, B), as in ``FrameNumbers``."""
+        """Return the poses of the last elements of B systems as 12 numbers each, (12, B).
+
+        For each axis of the world these are the shift and the row of the rotation matrix, in the order of
+        ``FrameNumbers``.
+        """
         both = np.concatenate([self.translation[:, -1, :, None], self.rotation[:, -1]], axis=-1)
         return np.ascontiguousarray(both.reshape(len(both), 12).T)
 

@@ -260,7 +260,7 @@ def _from_samples(
 ) -> None:
     """Fill ``out`` (B, R, C) with the irradiance of B images at R rows and C columns, from samples of the field.
 
-    ``k`` is the wave number, 1/m; rows of samples are paired as in ``_irradiance``.
+    ``k`` is the wave number, 1/m; rows of samples at equal distances on both sides of the middle share their waves.
     """
     (x, columns), (y, rows) = across, down
     count, nodes = field.u.shape
@@ -293,7 +293,7 @@ def _real_rows(first: np.ndarray, factor: np.ndarray, count: int) -> np.ndarray:
     """Return the real, then the imaginary parts of ``first`` times the powers 0 .. ``count`` - 1 of ``factor``.
 
     Both are complex, (B, N) for N nodes in B images; the result has the shape (B, 2 count, N). The powers are built by
-    doubling as in ``_waves``.
+    doubling: the powers m, m + 1, ..., 2 m - 1 are the first m powers times ``factor``^m.
     """
     table = np.empty((len(first), count, first.shape[1]), np.complex128)
     table[:, 0] = first

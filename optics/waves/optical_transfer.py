@@ -490,10 +490,12 @@ def _centroid(pupil: PupilFunction, wavelength: float, defocus: float) -> np.nda
 def _polar_terms(
     pupil: PupilFunction, wavelengths: np.ndarray, defocus: float, centroid: np.ndarray, rings: int, arms: int
 ) -> np.ndarray:
-    """Return Chebyshev and Fourier coefficients of the transfer function at K wavelengths about its centroid.
+    """Return Chebyshev and Fourier coefficients of the transfer function at K wavelengths, about the image's centroid.
 
-    The result is complex, (K, rings, 2 arms). Chebyshev polynomials are of the arc cosine of shift / cut-off, Fourier
-    terms of the direction, in the order of ``np.fft.fft``.
+    The result is complex, (K, rings, 2 arms). Chebyshev polynomials are of the arc cosine of (frequency / cut-off),
+    Fourier terms of the frequency's direction, in the order of ``np.fft.fft``. ``rings`` and ``arms`` are the numbers
+    of frequencies along the radius and of directions over half the circle, ``centroid`` (2,) is in metres, and
+    ``defocus`` is a shift of the detector, metres.
     """
     node = np.cos(np.pi * (np.arange(rings) + 0.5) / rings)
     direction = np.pi * np.arange(arms) / arms
@@ -690,7 +692,10 @@ class VariedTransfer:
 def _wavelength_terms(
     pupil: PupilFunction, frequency: np.ndarray, wavelength: float, cosines: np.ndarray, degree: int
 ) -> tuple[np.ndarray, np.ndarray] | None:
-    """Return phasors and phase matrix of one wavelength (see ``_WavelengthTerms``); None beyond its cut-off.
+    """Return the known pupil's phasors and the phase matrix of one wavelength, or None beyond its cut-off.
+
+    The phasors are at the nodes of the overlap of the pupil with its copy shifted by the frequency, times quadrature
+    weights; the matrix maps optical paths at the N rays to phase changes at these nodes (see ``_WavelengthTerms``).
 
     Parameters
     ----------

@@ -154,7 +154,8 @@ class PupilStack:
         eikonal : (B, N) ndarray
             Eikonal (optical path of each ray's plane wave to the image point), metres.
         amplitude : (B, N) ndarray
-            Amplitudes of the nodes as in ``optics.waves.diffraction.PupilField``, positive.
+            Amplitudes of the nodes times their areas in direction cosines, as in
+            ``optics.waves.diffraction.PupilField``, positive.
         nodes : PupilNodes
             N nodes of a quadrature over the stop's unit disk.
         degree : int
@@ -236,7 +237,8 @@ class PupilStack:
         eikonal : (B, N) ndarray
             Eikonal, metres.
         amplitude : (B, N) ndarray
-            Amplitudes of the nodes as in ``optics.waves.diffraction.PupilField``.
+            Amplitudes of the nodes times their areas in direction cosines, as in
+            ``optics.waves.diffraction.PupilField``.
         nodes : PupilNodes
             Quadrature over the stop's unit disk.
         wavelength : float
@@ -459,7 +461,7 @@ def clear_power(harmonics: np.ndarray, amplitude_terms: np.ndarray) -> np.ndarra
     harmonics : (2H + 1, B) ndarray
         Complex harmonics, of orders -H to H, of their edges.
     amplitude_terms : (B, D + 1, D + 1) ndarray
-        Amplitude coefficients of degree D, as in ``PupilStack``.
+        Coefficients of the products T_i(x) T_j(y) of Chebyshev polynomials to degree D, of the amplitude density.
     """
     edges, nothing = PupilEdge(harmonics), np.zeros(len(amplitude_terms), complex)
     right, left, _ = edges.corners(nothing)
@@ -660,7 +662,8 @@ def circular_pupil(f_number: float, eikonal_terms: np.ndarray | None = None) -> 
     f_number : float
         Focal ratio of the beam.
     eikonal_terms : ndarray, optional
-        Wavefront over the unit disk as in ``PupilFunction``, metres; none by default.
+        Coefficients of the products T_i(x) T_j(y) of Chebyshev polynomials of the eikonal over the unit disk, metres; a
+        perfect wavefront by default.
     """
     aperture = 0.5 / f_number
     flat = np.zeros((1, 1)) if eikonal_terms is None else np.asarray(eikonal_terms, float)

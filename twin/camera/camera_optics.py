@@ -381,12 +381,10 @@ class CameraOptics:
         return np.concatenate([self.beams(part).errors(plane) for part in parts])
 
     def pupils(self, fields: Sequence[Field] | np.ndarray) -> tuple[PupilFunction, ...]:
-        """Compute the exit pupils of F fields, (F, 2), with axes along the line and along the track.
+        """Compute the exit pupils of F fields, (F, 2), with image axes along the line and along the track.
 
-        Each is seen from the image of its field.
-
-        The pupils are centred on the design wavelength's chief rays, whatever the wavelength of the light, so that they
-        include lateral colour.
+        Each is the pupil as seen from the image of its field. The pupils are centred on the design wavelength's chief
+        rays, whatever the wavelength of the light, so that they include lateral colour.
 
         Raises
         ------

@@ -196,7 +196,10 @@ class ClearSegments:
         return replace(segment, after=after, behind=self.segments[after].exit_side % 2)
 
     def _between(self, start: Patch, end: Patch) -> Segment | None:
-        """Return the segment from one aperture to another, in their glass body or in the open; None if not clear."""
+        """Return the segment from one aperture to another, or None if another surface may lie between.
+
+        Both lie in the same glass body, or outside all glass.
+        """
         if start.solid is not None and start.solid == end.solid:
             return None if start.surface == end.surface else Segment(start.surface, 2 * start.aperture + 1, end)
         for behind in (0, 1):

@@ -281,7 +281,7 @@ class PathResult:
     paths : int
         Number of traced paths.
     detections : Detections
-        Single detections that were kept: all except the nominal families', or all.
+        Single detections: all those of ghosts and stray light, and those of nominal light only if requested.
     """
 
     families: tuple[Family, ...]

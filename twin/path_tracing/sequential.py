@@ -141,9 +141,10 @@ def make_steps(
     scenery : Scenery
         Surfaces.
     line : sequence of (int, Patch)
-        Apertures that nominal light meets, each with the row of the segment that leads to it, see ``Step``.
+        Apertures that nominal light meets, each with the row in ``tables.segment_table`` of the clear segment that
+        leads to it; 0 where that is not clear.
     codes : Sequence[int]
-        Codes of the family's events.
+        Numbers of the events of nominal light, see ``path_families.code``.
     source : (3,) ndarray
         Middle of the source, world frame, metres.
     """

@@ -202,7 +202,7 @@ def trace_stray(
     sampling : Sampling
         Sampling of the paths.
     cone : float or None
-        Sine of the half-angle into which the pinholes emit, see ``pinhole``.
+        Sine of the half-angle into which the pinholes emit; by default ``CONE_MARGIN`` times that of the pupil.
     chunk : int
         Number of paths of one launch.
     progress : Progress or None

@@ -1,10 +1,10 @@
 """Intersections of paths with the next surface.
 
-In the open, Mitsuba's ``Scene.ray_intersect_preliminary`` (float32, on triangles) finds the surface; Newton's method
+Outside glass, Mitsuba's ``Scene.ray_intersect_preliminary`` (float32, on triangles) finds the surface; Newton's method
 then finds the point on the analytic surface in float64. Inside a glass body no triangles are needed: the body is convex
-and its faces are flat, so the next face is the nearest one ahead, exactly, and no path leaks through an edge. Back in
-the open, a triangle that is hit by rounding only (of the surface just left, the inside of a glass face, the rim of a
-mesh beyond a mirror's edge) is skipped, and the search continues behind it. Paths start in the open, outside all glass.
+and its faces are flat, so the next face is the nearest one ahead, exactly, and no path leaks through an edge. Outside
+glass again, a triangle that is hit by rounding only (of the surface just left, the inside of a glass face, the rim of a
+mesh beyond a mirror's edge) is skipped, and the search continues behind it. Paths start outside all glass.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ class Flight:
     position, direction : Dr.Jit Vector3
         Position, metres, and unit direction, ``Vector3``.
     body : Dr.Jit array
-        Number of the glass body that they are in: None in a scene without glass, 0 in the open.
+        Number of the glass body that they are in: None in a scene without glass, 0 outside of glass.
     ahead : Dr.Jit array
         Distance ahead at which the search for a surface starts, metres.
     active : Dr.Jit mask

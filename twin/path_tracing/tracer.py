@@ -362,7 +362,7 @@ class PathTracer:
         source : Source
             Source of the paths.
         toward : str or None
-            Detector, see ``run``.
+            Name of the detector whose nominal light the source emits; None for the first one.
         paths : int
             Number of paths of the run.
         """

@@ -164,8 +164,8 @@ class Found:
     warnings : tuple[str, ...]
         Reasons why measurements are inconsistent with the sigmas, and other warnings to read before using the numbers.
     from_statement : pd.Series
-        Fraction of each reading's variance, for the estimator ``posterior``, that would remain without image noise: due
-        to the prior alone, not to the spots; (row) with levels camera and parameter, empty without a prior.
+        Fraction of the variance of each change estimated by ``posterior`` that would remain without image noise: it is
+        due to the prior, not to the spots. The index has the levels camera and parameter; empty without a prior.
     """
 
     values: xr.DataArray

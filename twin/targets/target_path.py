@@ -302,7 +302,7 @@ class TargetPath:
     ) -> tuple[PupilFunction, ...]:
         """Return the pupil function of the image of each of F directions, about its position on the line CCD.
 
-        Its lengths are in the units of ``places``.
+        Lengths in the image are in metres of the nominal (unexpanded) line CCD, as in ``places``.
 
         Parameters
         ----------
