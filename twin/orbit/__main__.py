@@ -37,7 +37,7 @@ PROGRAM = "twin.orbit"
 
 
 class Correction(StrEnum):
-    """Kind of the correction of an image that control points determine, as an option's choices."""
+    """Choices of the option `--correction`: image correction that is fitted to the control points."""
 
     shift = "shift"
     affine = "affine"
@@ -79,7 +79,7 @@ def adjust(
     ] = None,
     scheduler: cli.Scheduler = None,
 ) -> None:
-    """Adjust a block of scenes; the command's help is that of the test."""
+    """Adjust a block of scenes; the text of the command's help comes from the table of tests."""
     procedure = PROCEDURES["orbit adjust"]
 
     def reduced() -> AnyAdjust:
@@ -264,7 +264,7 @@ def _sigma(name: str, text: str | float) -> float:
 
 
 _SIGMAS = {"position": (DISTANCE, 1e5, "1 m"), "attitude": (ANGLE, 0.1, "2 arcsec"), "height": (DISTANCE, 1e4, "3 m")}
-"""Kind of quantity, largest value in SI units, and an example, by name of the option."""
+"""Kind of quantity, largest accepted value in SI units, and an example for error messages, by name of the option."""
 
 
 def _ground(lowest: str | None, highest: str | None) -> tuple[float, float] | None:

@@ -31,7 +31,7 @@ METHOD_NAMES = {
 }
 """Name in reports of each method of fitting planes."""
 EFFECT_NAMES = {"light_time": "light time", "all": "all three", "datum": "shift of all points"}
-"""Name in reports of effects whose key is not their name."""
+"""Names in reports of the effects on the light (light time, aberration, refraction) whose key is not their name."""
 _FALSE_ALARM = 1e-4
 """Probability that a plane whose points are correct raises a warning."""
 _GREEK = {"alpha": "α", "beta": "β", "gamma": "γ", "delta": "δ"}
@@ -389,7 +389,7 @@ def _moved(what: str) -> str:
 
 
 def _panels(run: SimulatedAngleRun) -> dict[str, list[tuple[str, str]]]:
-    """Return the panels of each figure, as (quantity with an error, angle), in the paper's order: Figs. 3 to 5."""
+    """Return the panels of each sensitivity figure (Figs. 3 to 5 of paper 000): (quantity with an error, angle)."""
     pairs = run.flight.pairs
     out = {"station": [("station", name) for name in pairs]}
     return out | {f"{name}-points": [(line, name) for line in pair] for name, pair in pairs.items()}
@@ -491,7 +491,7 @@ def _histogram_of_passes(axes: Axes, scatter: Scatter) -> None:
 
 
 def _far_points(result: PassAngles) -> list[tuple[str, int, float]]:
-    """Return points that lie improbably far from their plane: line, index in it, distance in sigmas."""
+    """Return outliers, points improbably far from their fitted plane: line, index in the line, distance in sigmas."""
     points = []
     for line, fit in zip(result.measurement.strips, result.estimate.planes["tls"], strict=True):
         sigma = np.sqrt(np.einsum("i,nij,j->n", fit.normal, fit.strip.covariance, fit.normal))

@@ -28,7 +28,7 @@ ACCURACY: Record[Accuracy] = Record(
     Quantity("points", lambda accuracy: accuracy.count, "number of points"),
 )
 ALARM = 1e-3
-"""p-value below which a test of a run raises a warning; a run has about ten tests."""
+"""p-value below which one of a run's tests (about ten) raises a warning."""
 CONTRIBUTION: Record[SensorContribution] = Record(
     "90% errors of the check points with some of the block's sensors.",
     Quantity("excluded", lambda case: list(case.excluded), "sensors that were not used"),
@@ -143,8 +143,8 @@ BLOCK: Record[BlockRun] = Record(
 
 
 _WEAK = 0.1
-"""Observability below which a combination of unknowns is listed as determined by the priors: its prior sigma divided by
-its sigma from the observations alone.
+"""Observability (prior sigma divided by the sigma from the observations alone) below which a combination of unknowns is
+listed as determined by the priors.
 """
 
 

@@ -1,8 +1,8 @@
 """Calibration of a camera in orbit over fields of points (paper 003).
 
 All fields are calibrated in one simultaneous adjustment, and each field by itself as in paper 003, from the
-measurements of a campaign alone; the truth enters only where an estimate is compared with it. `exported` writes the
-measurements as a folder of tables with a test file that reads them back.
+measurements alone; the simulated truth is used only to compare estimates with it. `exported` writes the measurements as
+a folder of tables with a test file that reads them back.
 """
 
 from __future__ import annotations
@@ -68,15 +68,18 @@ if TYPE_CHECKING:
     from scenes.specs.orbit.setup import AnyCalibration, CalibrationSetup
 
 _EVEN = 1e-3
-"""Largest deviation of an interval between readings from their median interval, relative, for which the readings count
-as evenly spaced.
+"""Largest relative deviation of an interval between readings from their median interval for which the readings count as
+evenly spaced.
 """
 _LEAST_EVEN = 5
 """Smallest number of evenly spaced readings from which third differences are computed."""
 STEPWISE_TOLERANCE = 1e-3
-"""Largest step of the last round of the stepwise solution, in sigmas, at which it counts as converged."""
+"""Largest change of an unknown in the last round of the stepwise solution, in sigmas, at which it counts as converged.
+"""
 _TIE = 1.7e5
-"""Memory per tie point of a strip, in each line and field, with the splines that it determines, in bytes."""
+"""Memory that the adjustment of a strip needs per tie point, line and field, in bytes, including the spline
+coefficients of the attitude that the point determines.
+"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -197,13 +200,14 @@ class Unknown:
     value : float
         Estimated value.
     sigma : float
-        Standard deviation if the unknowns that the gauge holds are exact; 0 for those held.
+        Standard deviation if the unknowns that the gauge fixes are exact; 0 for the fixed ones.
     sigma_with_gauge : float
-        Standard deviation that includes the uncertainty, after launch, of the unknowns that the gauge holds.
+        Standard deviation that includes the uncertainty, after launch, of the unknowns that the gauge fixes.
     prior_share : float
-        Share of the variance that comes from the sigmas of launch and season and not from the points, 0 to 1.
+        Share of the variance, 0 to 1, that comes from the prior sigmas (changes at launch and with the season) and not
+        from the points.
     held : bool
-        True where the gauge holds the unknown.
+        True where the gauge fixes the unknown at its laboratory value.
     truth : float or None
         True value; None for measured passes.
     """
@@ -267,7 +271,7 @@ in tables of measurements.
 
 
 def _key_and_remedy(error: ValueError, measured: bool) -> tuple[tuple[str, ...], str]:
-    """Return the key of the file and the remedy for an error of the adjustment, of measurements or of a simulation."""
+    """Return the key of the file to change and the remedy, for an error of the adjustment."""
     if isinstance(error, RankError):
         return ("data" if measured else "points",), "a field with width and length, and more points"
     if isinstance(error, NoiseError):
@@ -436,7 +440,7 @@ def files_of(setup: AnyCalibration, campaign: Campaign) -> dict[str, str]:
 
 
 def _test(setup: AnyCalibration) -> dict[str, Any]:
-    """Return the content of the test file, with the schemes, sigmas of readings, effects and limits of the test."""
+    """Return the content of a test file for the exported measurements, with the test's schemes, sigmas and limits."""
     spec = setup.test
     plain: Mapping[str, Any] = spec.plain()
     given_errors = plain["errors"]

@@ -31,7 +31,8 @@ from twin.orbit.images.point_report import SORTS, points_png
 _SCALES = {"rad": (ARCSEC, "arcsec"), "rad/s": (1e-3 * ARCSEC, "mas/s"), "m": (1.0, "m")}
 """Unit of an unknown in result files -> unit of the tables of the report, as its size in SI units and its name."""
 MOSTLY = 0.5
-"""Share of an unknown's variance above which the prior of the launch determines it, not the points."""
+"""Share of an unknown's variance above which it counts as determined by the prior (change at launch), not the points.
+"""
 Rows = list[tuple[Cell, ...]]
 
 

@@ -27,7 +27,7 @@ from twin.orbit.export.line_scanner import ModelError
 from twin.orbit.export.rational_polynomial import residual_sigma
 
 _UNLIKELY = 1e-3
-"""p-value of chi-square below which the covariances of control points are reported as too small."""
+"""p-value of chi-square below which the covariances given for control points are reported as too small."""
 _MOST_PANELS = 6
 _MOST_ROWS = 400
 """Largest number of control points in the table of a report."""

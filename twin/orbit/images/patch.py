@@ -39,7 +39,7 @@ if TYPE_CHECKING:
     from scenes.yaml.errors import KeyPath
 
 LARGEST_GROUND = 40_000.0
-"""Largest side of the ground of one patch, in metres; against input that asks for more than the memory holds."""
+"""Largest accepted side of the ground of one patch, in metres, so that no input exceeds the memory."""
 _PIXEL, _SAMPLE = 150.0, 47.0
 """Memory per pixel of the image of a line, and per sample of the ground's texture, in bytes."""
 
@@ -52,7 +52,7 @@ class PatchError(PhysicalError, ValueError):
     part
         Part of the input that must change: ``span`` of the pass, ``place``, ``size`` or ``terrain``.
     line
-        Name of the line that cannot image the patch; empty where it is not one line's fault.
+        Name of the line that cannot image the patch; empty where the cause is not a single line.
     """
 
     def __init__(self, problem: str, part: str, line: str = "") -> None:
@@ -62,7 +62,7 @@ class PatchError(PhysicalError, ValueError):
 
 @dataclass(frozen=True, eq=False)
 class ImagedLine:
-    """Line that records images.
+    """Line camera that records images, with its true and its known geometry.
 
     Attributes
     ----------
@@ -73,7 +73,7 @@ class ImagedLine:
     optics : LineOptics
         Lens and CCD.
     pattern : FixedPattern
-        Fixed pattern of its pixels.
+        Fixed-pattern noise of its pixels.
     """
 
     sensor: Sensor
@@ -93,7 +93,8 @@ class LineImage(LineFrame):
     motion : ImageMotion
         Motion of the image over the line, in the window's middle.
     nyquist : tuple of float
-        Modulation transfer at half a cycle per pixel, and per line.
+        Modulation transfer at the Nyquist frequencies: half a cycle per pixel along the line, and half a cycle per line
+        along the track.
     saturated : int
         Number of saturated pixels.
     error : float
@@ -152,7 +153,7 @@ def fly_patch(
 ) -> Patch:
     """Image a patch of ground with every line.
 
-    Each line's window of the same size has the patch's middle in its middle, to half a pixel.
+    The windows of all lines have the same size and are centred on the patch's middle to half a pixel.
 
     Parameters
     ----------
@@ -171,7 +172,7 @@ def fly_patch(
     oversampling : int
         Number of ground samples along each side of a pixel.
     advance : callable
-        Callback that receives the number of lines whose images are made.
+        Callback that receives the number of lines whose images are finished.
 
     Raises
     ------
@@ -209,7 +210,7 @@ def fly_patch(
 
 
 class _Size:
-    """Size of a patch, reported in errors as the input whose file is not known here."""
+    """Source of error messages about the size of a patch, for callers that know no input file."""
 
     def error(self, problem: str, key: KeyPath, *, found: object, allowed: str) -> PatchError:
         return PatchError(f"{problem}; {found} lines or pixels, allowed: {allowed}", "size")
@@ -233,7 +234,7 @@ def imaged_lines(
     optics: Mapping[str, LineOptics],
     seed: np.random.SeedSequence,
 ) -> dict[str, ImagedLine]:
-    """Return lines that record images.
+    """Combine sensors and optics to line cameras that record images, by name.
 
     Parameters
     ----------
@@ -244,7 +245,7 @@ def imaged_lines(
     optics : mapping of str to LineOptics
         Lens and CCD.
     seed : SeedSequence
-        Seed of the fixed pattern, which stays the same in all images of the line.
+        Seed of the fixed-pattern noise, which is the same in all images of a line.
     """
     return {
         name: ImagedLine(
@@ -350,11 +351,12 @@ class LineComparison:
     Attributes
     ----------
     found, matched, accepted : int
-        Number of measured positions, before any is rejected, after matching and after consensus.
+        Number of positions that were measured, that matching accepted, and that also agree with their neighbours
+        (consensus).
     wrong_found, wrong_matched, wrong_accepted : int
-        Number of wrong ones among these.
+        Number of wrong positions (see `WRONG`) among each of these.
     right_rejected_by_consensus : int
-        Number of right matches that consensus has rejected.
+        Number of right positions that were rejected because they disagree with their neighbours.
     error : (n, 2) ndarray for n points
         Measured minus true, lines and pixels; NaN without a measurement.
     wrong : (n,) ndarray of bool
@@ -392,8 +394,8 @@ class LineComparison:
 def true_ground(patch: Patch, points: MatchedPoints) -> np.ndarray:
     """Return the true ground points that the measured points show, ITRS, (n, 3) for n points, in metres.
 
-    The ground shown at a position of a map lies at that position minus its error; a tie point is what its source's
-    pixel truly sees.
+    The ground shown at a position of a map lies at that position minus the map's error in plan; a tie point is the
+    ground that the pixel of the frame in which it was chosen truly sees.
     """
     if points.kind == "map":
         east, north = patch.control.error(points.east, points.north)

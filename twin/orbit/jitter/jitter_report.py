@@ -21,11 +21,11 @@ _MOST, _SIGMAS = 4000, 5.0
 _COURSE, _ROWS = 0.02, 5000
 """Least time between rows of the attitude table, in seconds, and largest number of its rows."""
 _MOST_WRONG = 0.3
-"""Share of observations rejected as gross errors above which there is a warning."""
+"""Share of rejected observations (gross errors) above which there is a warning."""
 _NAMED = 8
-"""Largest number of alias frequencies of an oscillation that are listed."""
+"""Largest number of alias frequencies of an oscillation that the report lists."""
 _FIT = 1.3
-"""Ratio of the scatter of the residuals to the sigmas of the points above which there is a warning."""
+"""Scatter of the residuals, divided by the sigmas of the points, above which there is a warning."""
 
 
 def jitter_report(run: JitterRun) -> Report:
@@ -74,7 +74,7 @@ def _verdict(run: JitterRun) -> tuple[str, tuple[str, ...]]:
 
 
 def _doubts(line: Oscillation) -> list[str]:
-    """Return the reasons why the true frequency of an oscillation may differ from the detected one."""
+    """Return reasons, such as aliasing, why an oscillation's true frequency may differ from the detected one."""
     frequency, doubts = f"{line.frequency[0]:.4g} Hz", []
     if not line.in_search:
         doubts.append(f"{frequency} lies beyond the search range, in which it appears as a slower oscillation")
@@ -234,7 +234,7 @@ def _disparity_figure(jitter: PassJitter) -> Figure:
 
 
 def _spectrum_figure(jitter: PassJitter) -> Figure:
-    """Draw the amplitude over frequency, before and after the detected oscillations are removed."""
+    """Draw the amplitude spectrum of the attitude before and after the detected oscillations are removed."""
     result = jitter.result
     figure, panels = _panels(jitter, 2.0, 2.0, "frequency [Hz]; shaded: blind")
     for k, axes in enumerate(panels):

@@ -1,8 +1,8 @@
 """Tables of a pass's measurements: reading with explicit conventions, writing without loss of digits.
 
-Rows may be in any order, columns in any order and unit. Conventions that the numbers do not show, such as the order of
-a quaternion's components, are specified by the test's file; what the numbers do show, such as a velocity that is not
-that of the positions, is checked.
+Rows may be in any order, columns in any order and unit. Conventions that cannot be inferred from the numbers, such as
+the order of a quaternion's components, are specified in the test's file; inconsistencies in the numbers, such as a
+velocity that is not the rate of change of the positions, are reported as errors.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ _PLACE = tuple(Column(axis, LENGTH, least=-_FAR, most=_FAR) for axis in "xyz")
 _SPEED = tuple(Column(f"v{axis}", SPEED, needed=False, least=-_FAST, most=_FAST) for axis in "xyz")
 _QUATERNION = tuple(Column(f"q{k}", least=-1.001, most=1.001) for k in range(1, 5))
 _LARGE = 1e6
-"""Largest sigma of a ground coordinate that is plausible, in metres."""
+"""Largest accepted sigma of a ground coordinate, in metres."""
 _CORRELATIONS = ("correlation_xy", "correlation_xz", "correlation_yz")
 COLUMNS: Mapping[str, tuple[Column, ...]] = {
     "platform": (_TIME, *_PLACE, *_SPEED, *_QUATERNION),
@@ -75,9 +75,7 @@ _SIGMAS = (("sigma",), ("plan_sigma", "height_sigma"), ("x_sigma", "y_sigma", "z
 _EARTH_AXES = np.array([6_378_137.0, 6_378_137.0, 6_356_752.314])
 """Semi-axes of the WGS84 ellipsoid, in metres."""
 CALIBRATING: Mapping[str, int] = {"control": 1, "check": 2}
-"""Number of line cameras in which one or more of the ground points must be seen, by role of the point, for a
-calibration.
-"""
+"""Number of line cameras that must see at least one of the ground points for a calibration, by role of the points."""
 
 
 def read_pass(
@@ -100,7 +98,7 @@ def read_pass(
     camera : ThreeLineCameraSpec
         Payload whose lines the tables name.
     needed : mapping of str to int
-        Smallest number of line cameras that must see one of the points, by role.
+        Role of points (such as control) -> smallest number of line cameras that must see at least one of them.
 
     Raises
     ------
@@ -173,7 +171,7 @@ def read_measurements(
     advance : Advance
         Callback that reports progress.
     needed : mapping of str to int
-        Smallest number of line cameras that must see one of the points, by role.
+        Role of points (such as control) -> smallest number of line cameras that must see at least one of them.
 
     Raises
     ------
@@ -190,14 +188,14 @@ def read_measurements(
 def _line_times_of(
     table: Table, conventions: ConventionsSpec, camera: ThreeLineCameraSpec, platform: PlatformTable
 ) -> tuple[dict[str, LineTimes], dict[str, float]]:
-    """Return the line times of each line camera, counted from its first line, and that line's number in the file.
+    """Return each line camera's line times, with lines counted from its first, and the file's number of that line.
 
     Parameters
     ----------
     table : Table
         Times of the lines of all cameras.
     conventions : ConventionsSpec
-        Conventions, which say to which moment of an exposure its time refers.
+        Conventions, which specify to which moment of an exposure its time refers.
     camera : ThreeLineCameraSpec
         Payload with the lines.
     platform : PlatformTable
@@ -303,7 +301,7 @@ def _image_points_of(
     camera: ThreeLineCameraSpec,
     trajectory: TabulatedTrajectory,
 ) -> dict[str, ImagePoints]:
-    """Return the image points of each line camera, by number of the ground point.
+    """Return the image points of each line camera, with the numbers of their ground points.
 
     Parameters
     ----------
@@ -379,7 +377,7 @@ def require_known(table: Table, column: str, names: tuple[str, ...]) -> None:
 
 
 def _once(table: Table, column: str) -> None:
-    """Raise InputError if a name occurs twice in a column."""
+    """Raise InputError if a name occurs twice in a column of a table."""
     seen: dict[str, int] = {}
     for row, name in enumerate(table[column].tolist()):
         if name in seen:
@@ -497,7 +495,7 @@ def _columns(names: Sequence[str], values: np.ndarray) -> dict[str, np.ndarray]:
 
 
 def _csv(columns: Mapping[str, Any]) -> str:
-    """Return the text of a table, with the shortest digits that read back to the same bits."""
+    """Return a table as CSV text, each number with the fewest digits that reproduce it exactly."""
     cells = [[str(v) for v in np.asarray(c, dtype=object).tolist()] for c in columns.values()]
     rows = [", ".join(columns), *map(",".join, zip(*cells, strict=True))]
     return "\n".join(rows) + "\n"
@@ -519,7 +517,7 @@ def platform_of(epoch: str, orbit: Table, attitude: Table, conventions: Conventi
     Parameters
     ----------
     epoch : str
-        Zero of the times, UTC, ISO 8601.
+        Instant from which times count, UTC, ISO 8601.
     orbit : Table
         Table of the orbit.
     attitude : Table
@@ -530,8 +528,8 @@ def platform_of(epoch: str, orbit: Table, attitude: Table, conventions: Conventi
     Raises
     ------
     InputError
-        A time occurs twice, a position is impossible for a satellite, a velocity is not that of the positions, or a
-        quaternion is not of unit length.
+        A time occurs twice, a position is impossible for a satellite, a velocity is not the rate of change of the
+        positions, or a quaternion is not of unit length.
     """
     order, looks = _rising(orbit), _rising(attitude)
     time, place = orbit["time"][order], orbit.stacked("x", "y", "z")[order]
@@ -588,7 +586,7 @@ def _quaternions_of(numbers: Array, conventions: ConventionsSpec) -> Array:
 
 
 def _rising(table: Table) -> NDArray[np.intp]:
-    """Return the indices of the rows in the order of time; raise InputError if a time occurs twice."""
+    """Return the indices that sort the rows by time; raise InputError if a time occurs twice."""
     order = np.argsort(table["time"], kind="stable")
     for row in order[1:][np.diff(table["time"][order]) == 0.0][:1]:
         raise table.error(int(row), "time", "this time occurs twice", f"{table['time'][row]:.9g} s", "each time once")
@@ -596,7 +594,7 @@ def _rising(table: Table) -> NDArray[np.intp]:
 
 
 def _check_jumps(table: Table, order: NDArray[np.intp], time: Array, place: Array) -> None:
-    """Raise InputError for a position that no orbit passes between its neighbours."""
+    """Raise InputError for a position that is impossible on an orbit through its neighbours in time."""
     step = np.diff(time)
     with np.errstate(over="ignore", invalid="ignore"):  # times can almost coincide
         rate = np.diff(place, axis=0) / step[:, None]
