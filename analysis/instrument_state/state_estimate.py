@@ -117,7 +117,7 @@ class StatePrior:
 class MeasuredGroup:
     """Measured numbers of one measurement with the covariance of their errors and possible biases.
 
-    Dimensions: B biases.
+    Dimensions: D measured numbers, B biases.
 
     Attributes
     ----------
@@ -717,8 +717,9 @@ def merit_reduction(
 ) -> dict[str, float]:
     """Return the expected reduction of the merit after the next move by one more measurement of each kind.
 
-    The uncertainty of the state matters only where actuators could correct it: tr(H D P D' H) with H the projection on
-    their range.
+    The uncertainty of the state matters only where actuators could correct it: the expected merit has the part tr(H D P
+    D' H), with the covariance P of the state, the derivatives D of the merit's numbers, and the projection H on the
+    range of the actuators' effects A.
 
     Dimensions: U independent units of the prior, R numbers of the merit, C actuators, N numbers.
 

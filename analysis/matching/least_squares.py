@@ -474,9 +474,9 @@ class Fits:
             return np.asarray(np.trace(noise, axis1=1, axis2=2) / np.trace(self.spread.plain, axis1=1, axis2=2))
 
     def _hidden(self) -> Array:
-        """Return the factor by which noise where grey values change exceeds that in residuals, (n,) for n points.
+        """Return the factor by which the noise at slopes of the grey values exceeds that in the residuals, (n,).
 
-        It is NaN if unknown.
+        It is NaN where unknown. A smoothed template hides part of its noise from the residuals.
 
         A smoothed template has one independent value per 4 pi rms^2 pixels. Its noise is in these alone and loses one
         to each unknown, while that of the image is white. With equal noise in both, and where half of the amplitude

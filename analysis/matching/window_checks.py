@@ -83,7 +83,7 @@ class WindowHalves:
         variance : (n,) ndarray
             Variance of the noise in each of n windows, including its correlation, in DN^2.
         relief : float
-            Variance of the displacements within a typical window (tau^2 of the module), in px^2.
+            Variance of the relief, the displacements of parts of a typical window from the common fit, in px^2.
 
         Returns
         -------

@@ -381,7 +381,7 @@ class Periodogram:
     def chance(self, power: ArrayLike) -> Array:
         """Return an upper bound of the probability that noise alone reaches a power at any searched frequency.
 
-        The variance of the noise is unknown.
+        The noise variance is estimated from the residuals, with `freedom` degrees of freedom.
         """
         share = np.clip(np.asarray(power, np.float64) / self.total, 0.0, 1.0)
         single = np.maximum(stats.beta.sf(share, 0.5 * self.order, 0.5 * (self.freedom - self.order)), _NEVER)

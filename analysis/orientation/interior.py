@@ -79,8 +79,8 @@ TERMS = tuple(_POWER)
 _WIDEST = np.pi / 4
 """Largest plausible angle, in radians: line cameras see a few degrees, and larger values are probably in degrees."""
 _SINGULAR = 1e-9
-"""Smallest determinant of the normal equations of eq. (2), relative to the product of their diagonal elements; a
-determinant of 1e-9 leaves six correct digits.
+"""Smallest determinant of the normal equations of eq. (2) of paper 004, relative to the product of their diagonal
+elements; a determinant of 1e-9 leaves six correct digits.
 """
 
 
@@ -728,7 +728,7 @@ def line_orientation(fit: InteriorOrientation) -> LineOrientation:
 
 
 CALIBRATED = ("constant", "principal_distance", "principal_point")
-"""Names of the terms that are subtracted to obtain the distortion: those of eq. (2), with a constant."""
+"""Names of the terms that are subtracted to obtain the distortion: those of eq. (2) of paper 004, with a constant."""
 SMOOTH = (*CALIBRATED, "radial3")
 """Names of the terms of the smooth model (with radial distortion), whose residuals measure the scatter of the points.
 """
