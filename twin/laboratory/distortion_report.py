@@ -1,4 +1,4 @@
-"""Report of a distortion test: results, accuracy and its limits; of a simulated bench also the truth."""
+"""Report of a distortion test: results, accuracy and what limits it; for a simulated bench also the true values."""
 
 from __future__ import annotations
 
@@ -30,7 +30,10 @@ RAW, COMPENSATED = "angles as read", "compensated angles"
 SHOWN = 3
 """Number of points whose frames are saved: first, middle, last."""
 ZERO_SHARE = 0.3
-"""Shift of the principal point due to the zero of the angles, relative to its sigma, above which it is reported."""
+"""Ratio above which a shift of the principal point due to an error of the angles' zero is reported.
+
+The ratio is that of the shift to the standard deviation of the principal point.
+"""
 
 
 def distortion_report(run: DistortionRun) -> Report:
@@ -56,7 +59,7 @@ def distortion_report(run: DistortionRun) -> Report:
 
 
 def _frames(run: SimulatedDistortion) -> tuple[dict[str, np.ndarray], dict[str, FrameFacts]]:
-    """Return the frames of a simulated bench that are saved, and their facts."""
+    """Return the frames of a simulated bench that are saved, by name, and facts about each for the report."""
     test = run.setup.test
     facts = FrameFacts(f"{test.camera}, line CCD {test.band}", run.bench.ccd.band.pitch, note="spot of the pinhole")
     numbers = np.linspace(0, len(run.reading) - 1, SHOWN).astype(int)
@@ -290,7 +293,9 @@ ESTIMATES = {
 
 
 def _joint(joint: Mapping[str, Any]) -> Section:
-    """Return the section on the joint model with a radial term, as fitted and as a line of a payload's file.
+    """Return the report section on the joint model, which fits a radial distortion term with the orientation.
+
+    It gives the parameters as fitted, and converted to those of a line in a payload's file.
 
     Parameters
     ----------
@@ -331,7 +336,7 @@ def _joint(joint: Mapping[str, Any]) -> Section:
 
 
 def _estimates(run: DistortionRun, data: Mapping[str, Any]) -> Section:
-    """Return the section on the estimates by each equation and on which quantities can be observed."""
+    """Return the report section on the estimates by each equation, and on which quantities they can determine."""
     heads, digits = (["estimate", *(q.shown_head for q in ESTIMATE)], [None, *(q.decimals for q in ESTIMATE)])
     rows: list[tuple[Cell, ...]] = [(ESTIMATES[name], *record.values()) for name, record in data["estimates"].items()]
     constant_text = (

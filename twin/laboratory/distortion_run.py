@@ -1,9 +1,9 @@
 """Interior orientation and distortion by paper 004 (section 3), from the turntable's calibration to distortion.json.
 
-The analysis gets frames, readings, the calibration of the table and what a laboratory knows beforehand: the pixels,
-their noise, and the energy centroid of a spot minus its chief ray by the camera's design; or spots and readings from
-files of measurements. The truth of a simulated bench comes from exact chief rays of the as-built camera at the true
-angles, and is put through the same definitions.
+The analysis gets frames, turntable readings, the calibration of the table and what a laboratory knows beforehand: the
+pixels, their noise, and the energy centroid of a spot minus its chief ray by the camera's design; or spots and readings
+from files of measurements. The true values of a simulated bench come from exact chief rays of the as-built camera at
+the true angles, from which the same equations compute the true orientation and distortion.
 
 The records at the end define the contents of distortion.json.
 """
@@ -51,14 +51,15 @@ from twin.laboratory.measured_readings import (
 from twin.laboratory.turntable_run import TurntableModel, rms, usable_fits
 
 CLOSED_FORMS = tuple(name for name in FITS if name != "network")
-"""Names of the fits of the dividing error from which the compensation is chosen.
+"""Names of the closed-form fits of the turntable's dividing error from which the compensation is chosen.
 
-The network, which takes minutes to train, is ranked by the turntable test only.
+The neural network, which takes minutes to train, is compared in the turntable test only.
 """
 MAX_FIELD_ANGLE = np.radians(40.0)
 """Largest plausible angle from the middle of the line, radians; the model's tangents end at 45 deg."""
 _EXACT = 1e-9
-"""Nominal noise of the true positions, metres; the estimates from them do not depend on it."""
+"""Nominal noise given to the true positions, metres, because a fit needs a weight; the estimates do not depend on it.
+"""
 _GREY, _SPOT_PIXEL = 2.0, 33.0
 """Bytes per pixel of a frame, and of the mean image of a spot."""
 
@@ -86,22 +87,24 @@ class Estimate:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class DistortionRun:
-    """Distortion test on a simulated bench or on measured angles and spots.
+    """Results of a distortion test on a simulated bench or on measured angles and spots.
+
+    Dimensions: N points (nominal angles of the turntable), S sets of repeated exposures.
 
     Attributes
     ----------
     test : DistortionTestSpec or MeasuredDistortionSpec
         Specification from the test's file.
     seed : int
-        Seed of all that was drawn.
+        Seed of all random numbers.
     approximate_f : float
         Approximate principal distance, metres, used to compare sets with each other.
     reading : (N, S) ndarray
-        Readings of the turntable at N points in S sets, radians.
+        Readings of the turntable, radians.
     present : (N, S) ndarray of bool
         Exposures that were made.
     calibration : CalibrationSeries or None
-        Calibration of the turntable; None if angles count as read.
+        Calibration of the turntable; None if readings are used uncorrected.
     compensation : DividingCompensation or None
         Compensation of the dividing error; None without a calibration.
     spots : Spots
@@ -111,7 +114,7 @@ class DistortionRun:
     raw, compensated : Distortion
         Distortion with angles as read, and with angles corrected for the dividing error; equal without a calibration.
     specified_fit : InteriorOrientation
-        Fit of the smooth model with the specified noise alone, for its chi-square.
+        Fit of the smooth model weighted with the specified noise alone, for its chi-square.
     readings : SpotReadings or None
         Table of spots that was read; None for a simulated bench.
     tables : tuple of Comparisons
@@ -140,18 +143,21 @@ class DistortionRun:
 
     @cached_property
     def line(self) -> interior.LineOrientation:
-        """Joint model with compensated angles, as the parameters of a line in a payload's file."""
+        """Joint model of orientation and radial distortion, as the parameters of a line in a payload's file.
+
+        It uses compensated angles.
+        """
         return interior.line_orientation(self.compensated.smooth)
 
     @cached_property
     def estimates(self) -> Mapping[str, Estimate]:
-        """Name -> estimate by the printed equations and by the fits with a constant, all with compensated angles."""
+        """Name -> estimate by the paper's equations and by fits with a constant term, all with compensated angles."""
         return _estimates(self.compensated.fit, self.compensated.smooth, self.compensated.zero)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class SimulatedDistortion(DistortionRun):
-    """Distortion test on the simulated bench, with its truth.
+    """Distortion test on the simulated bench, with the true values.
 
     Attributes
     ----------
@@ -204,10 +210,10 @@ class SimulatedDistortion(DistortionRun):
 def _estimates(
     fit: interior.InteriorOrientation, smooth: interior.InteriorOrientation, zero: float
 ) -> dict[str, Estimate]:
-    """Return name -> estimate by the paper's equations (2), (3) and (4), and by the fits with a constant.
+    """Return name -> estimate by the paper's equations (2), (3) and (4), and by the fits with a constant term.
 
-    Equation (4) uses the principal distance of (3); equation (2) is evaluated once more with angles counted from
-    `zero`.
+    Equation (4) uses the principal distance of (3). Equation (2) is also evaluated with the angles counted from `zero`,
+    radians.
     """
     position, angles = fit.position, fit.angle
 
@@ -302,11 +308,11 @@ def reduce(
     approximate_f : float
         Approximate principal distance, metres, used to compare sets with each other.
     compensation : DividingCompensation or None
-        Compensation of the turntable; None for angles as read.
+        Compensation of the turntable's dividing error; None to use angles as read.
     angle_sigma : float
         Standard deviation of the angles as read, without a compensation, radians.
     reverse : bool
-        Readings increase where positions on the line decrease.
+        True if readings increase where positions on the line decrease.
     present : (N, S) ndarray of bool, optional
         Exposures that were made; by default all.
 
@@ -547,7 +553,7 @@ TRUE_ESTIMATE: Record[_Pair] = Record(
 
 
 def _f_error(run: SimulatedDistortion) -> float:
-    """Return the error of the principal distance from the fit with a constant, in its sigmas."""
+    """Return the error of the principal distance from the fit with a constant term, in units of its sigma."""
     fit = run.compensated.fit
     error = fit.value("principal_distance") - run.true_fit().value("principal_distance")
     return float(error / fit.sigma("principal_distance"))
@@ -565,7 +571,7 @@ def _read(run: DistortionRun) -> SpotReadings:
 
 
 def _across(run: DistortionRun) -> float | None:
-    """Return the range of the spots across the line, metres, or None if it was not measured."""
+    """Return the range of the spots' positions across the line, metres, or None if they were not measured."""
     across = None if run.readings is None else run.readings.across
     return None if across is None else float(np.ptp(across))
 
@@ -575,13 +581,13 @@ def _files(run: DistortionRun) -> list[DataFile] | None:
 
 
 def _from_mean(run: DistortionRun) -> Array:
-    """Return how far rejected exposures are from the mean of their point, metres on the line."""
+    """Return the distances of rejected exposures from the mean of their point, metres along the line."""
     rest = run.compensated.position - run.approximate_f * np.tan(run.compensated.angle)
     return np.asarray((rest - run.means.mean(rest)[:, None])[run.rejected])
 
 
 def _paired(run: SimulatedDistortion) -> dict[str, _Pair]:
-    """Return each estimate with the corresponding estimate from the truth."""
+    """Return name -> (measured estimate, the same estimate computed from the true values)."""
     return {name: (estimate, run.true_estimates[name]) for name, estimate in run.estimates.items()}
 
 

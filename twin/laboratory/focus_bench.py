@@ -41,7 +41,7 @@ _SEARCH = 0.3e-3
 
 @dataclass(frozen=True, eq=False)
 class Site:
-    """Position on the focal plane where the edge is imaged.
+    """Position on the focal plane where the edge target is imaged.
 
     Attributes
     ----------
@@ -54,12 +54,12 @@ class Site:
     point, direction : (3,) ndarray
         Point (metres) and unit direction of the chief ray in the focal-plane frame.
     imagers : mapping
-        Edge -> imager of that edge.
+        Edge (direction in which it measures the MTF) -> imager of that edge.
     defocus_per_shift : mapping
         Edge -> true defocus of the image per metre of target shift, in the direction of the edge's normal: (f of the
-        camera / f of the collimator)^2, with the camera's f in that direction.
+        camera / f of the collimator)^2, with the camera's focal length f in that direction.
     nominal_per_shift : mapping
-        Edge -> the corresponding ratio of the prescription, which the analysis may know.
+        Edge -> the corresponding ratio by the design prescription, which the analysis may know.
     edge_focus : mapping
         Edge -> Z' at which its MTF at the Nyquist frequency is largest, metres.
     """
@@ -85,7 +85,10 @@ class Site:
         return self.imagers[ALONG].ccd.band.nyquist
 
     def crossing(self, placement: Pose, height: float) -> np.ndarray:
-        """Return the intersection of the chief ray and the chip in the focal-plane frame, (3,), metres."""
+        """Return the intersection of the chief ray and the chip's surface in the focal-plane frame, (3,), metres.
+
+        ``height`` is that of the chip above the focal-plane assembly, metres.
+        """
         normal = placement.rotation[:, 2]
         chip = placement.translation + height * normal
         return np.asarray(self.point + self.direction * ((chip - self.point) @ normal) / (self.direction @ normal))
@@ -102,7 +105,7 @@ class Site:
         return int(np.clip(round(middle - 0.5 * imager.region), 0, imager.ccd.band.pixels - imager.region))
 
     def image(self, edge: str, placement: Pose, height: float, target_shift: float, offset: float) -> np.ndarray:
-        """Return the signal of every pixel as a fraction of white.
+        """Return the signal of every pixel in the image of an edge, as a fraction of that in the bright area.
 
         Parameters
         ----------
@@ -113,7 +116,7 @@ class Site:
         height : float
             Height of the chip above the assembly, metres.
         target_shift : float
-            Shift of the target, metres.
+            Shift of the target along the light, metres.
         offset : float
             Offset of the edge on the chip, metres.
         """
@@ -144,16 +147,16 @@ class BudgetLine:
 
 
 class FocusBench:
-    """Bench with all that stays the same from alignment to alignment.
+    """Simulated bench with everything that stays the same from alignment to alignment.
 
     Parameters
     ----------
     setup
-        Test with all files that it refers to.
+        Test with the contents of all files that it refers to.
     backend
         Array backend of the trace.
     advance
-        Called with the number of tables done and their total.
+        Called with the number of image tables done and their total.
 
     Raises
     ------
@@ -181,7 +184,7 @@ class FocusBench:
         return 1.22 * f_number / self.ccds[band].band.nyquist
 
     def _build_sites(self, advance: Advance) -> tuple[Site, ...]:
-        """Trace all sites and tabulate their images."""
+        """Trace all sites and tabulate the edge's images over defocus at each."""
         test, bands = self.setup.test, self.setup.camera.bands
         keys = [(name, field) for name in bands for field in test.fields]
         half = {n: 0.5 * (b.pixels - 2.0 * test.edge.region) * b.pitch for n, b in bands.items()}
@@ -250,9 +253,9 @@ def _modulus(optics: EdgeOptics, defocus: float, frequency: float) -> float:
 def _longitudinal(local: LocalMap, normal: np.ndarray) -> float:
     """Return the longitudinal magnification in the direction of an edge's normal: image shift per target shift.
 
-    A target moved by s adds s |p|^2 / 2F^2 to the path at the point p of the entrance pupil, with the collimator's
-    focal length F. By Lagrange's invariant p = F J^T u for direction cosines u at the image and the map's Jacobian J,
-    so the image's curvature is s J J^T.
+    A target moved by s along the axis adds s |p|^2 / 2F^2 to the optical path at the point p of the entrance pupil,
+    with the collimator's focal length F. By Lagrange's invariant p = F J^T u for direction cosines u at the image and
+    the Jacobian J of the map from object to image directions, so the curvature of the image's wavefront is s J J^T.
     """
     return float(np.sum((local.jacobian.T @ normal) ** 2))
 
@@ -273,21 +276,24 @@ NYQUIST = 0.5
 """Nyquist frequency, cycles per pixel."""
 
 VERTEX_ERROR = 0.5e-6
-"""Standard deviation of the error common to all fitted vertices, metres.
+"""Standard deviation of the error that all fitted positions of the MTF peak have in common, metres.
 
 It is due to the difference between the true MTF curve near its peak and the fitted form: wavefronts of 0.2 waves shift
 the vertices by this much. Without noise the vertices of the example are up to 0.6 um off.
 """
 
 VERTEX_TREND = 0.15e-6
-"""Standard deviation of the variation of the vertices' common error over the focal plane, metres.
+"""Standard deviation of the variation over the focal plane of the error in the fitted MTF peaks, metres.
 
 The variation is that from the middle to the ends of the line and of the bands, as wavefront and wavelength change.
 """
 
 _OFFSET, _FRAMES = range(2)
 _COARSE = 4
-"""Smallest number of positions of the first scan within the defocus at which all contrast is lost."""
+"""Smallest number of scan positions over the range of defocus in which the edge has contrast.
+
+A coarser scan could miss the peak.
+"""
 _ATTEMPTS = 3
 """Largest number of scans of one site."""
 
@@ -310,13 +316,12 @@ class Placement:
 
 @dataclass(frozen=True, eq=False)
 class SiteScan:
-    """Through-focus measurement of one site.
+    """Through-focus measurement of one site, at Z positions of the target.
 
     Attributes
     ----------
     shift : mapping
-        Edge -> shifts of the image at Z positions, in the edge's direction, metres, (Z,), computed from the target's
-        shifts.
+        Edge -> shifts of the image, in the edge's direction, metres, (Z,), computed from the target's shifts.
     mtf, sigma : mapping
         Edge -> MTF at the Nyquist frequency and its standard deviation, (Z,); the latter is infinite where no edge
         could be measured.
@@ -351,7 +356,7 @@ class SiteScan:
 
 @dataclass(frozen=True, eq=False)
 class NyquistMtf:
-    """MTF of one site with the target at the collimator's focus.
+    """MTF of one site at the Nyquist frequency, with the target at the collimator's focus.
 
     Attributes
     ----------
@@ -433,7 +438,11 @@ class Recorder:
         return *measure_pages(frames, noise=ccd.noise, step=grey_step(frames), even=True).at(NYQUIST), frames
 
     def attempt(self, number: int, edge: str, shift: float, take: int) -> tuple[float, float, np.ndarray, str]:
-        """Measure like ``measure``; for an image without a usable edge return MTF 0, infinite sigma and the reason."""
+        """Record an edge; return its MTF at the Nyquist frequency, standard deviation, frames, and any problem.
+
+        For an image without a measurable edge the MTF is 0, the standard deviation infinite, and the text gives the
+        reason.
+        """
         try:
             return *self.measure(number, edge, shift, take), ""
         except EdgeError as error:
@@ -446,12 +455,12 @@ def scan(recorder: Recorder, advance: Advance = silent, search: bool = True) -> 
     Parameters
     ----------
     recorder : Recorder
-        Recorder of one placement.
+        Recorder of one placement of the focal-plane assembly.
     advance : Advance
         Called with the number of sites done and their total.
     search : bool
-        First search the peak over the whole range of the scan. Otherwise the peak is assumed near zero, and searched
-        for only where it is not.
+        True to search the peak first over the whole range of the scan. False to assume it near zero, and search only
+        where it is not.
 
     Raises
     ------
