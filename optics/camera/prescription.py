@@ -219,7 +219,7 @@ class Camera:
 
     @cached_property
     def indices(self) -> tuple[float, ...]:
-        """Refractive index after each surface; a mirror keeps that before it."""
+        """Refractive index of the medium after each surface; after a mirror it is that before it."""
         out = [1.0]
         for surface in self.surfaces:
             named = surface.material

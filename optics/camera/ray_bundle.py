@@ -35,7 +35,7 @@ _MOST_NODES = 4_000_000
 
 
 class LightLostError(PhysicalError, ValueError):
-    """No light of a field comes through the camera."""
+    """Error: no light of a field point comes through the camera."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -56,7 +56,7 @@ class Variable:
 
     @property
     def name(self) -> str:
-        """Name for tables and messages, e.g. ``M1 conic``."""
+        """Name of the variable for tables and messages, e.g. ``M1 conic``."""
         return f"{self.element} {self.quantity}".strip()
 
 

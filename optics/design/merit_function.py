@@ -145,7 +145,11 @@ def _differentiated(
     rays: DesignRays,
     chief: np.ndarray,
 ) -> DesignRays:
-    """Return traced rays together with their derivatives with respect to the variables."""
+    """Return traced rays together with their derivatives with respect to the variables.
+
+    ``chief`` are the launch points of the chief rays, whose derivatives follow from the condition that these rays pass
+    the stop's vertex.
+    """
     along, axes = beam_axes(beams.fields, prescription.field_bias)
     stepped = beam_axes(beams.fields, prescription.field_bias + 1j * COMPLEX_STEP)
     biased = np.array([v.quantity == BIAS for v in variables], dtype=float)
@@ -243,7 +247,7 @@ class Operands:
 
 @dataclass(frozen=True)
 class Passage:
-    """Surface that beams pass without touching it, the segment of the beams that does so, and the side in y.
+    """Segment of the beams that passes a surface without touching it, and the side, in y, on which it passes.
 
     The segment leads from point number ``segment`` of the rays to the next.
     """
@@ -289,7 +293,7 @@ class Evaluation:
 
     @property
     def anamorphism(self) -> float:
-        """Ratio of the principal distance along the line to that across it."""
+        """Ratio of the principal distance along the imaged line to that across it, 1 without anamorphism."""
         return self.principal_distance / self.distance_across
 
     @property

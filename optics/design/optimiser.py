@@ -27,12 +27,12 @@ from optics.raytrace.aim import AimError
 from optics.raytrace.trace import BeamMissedError
 
 STEP_ITERATIONS = 4
-"""Number of iterations at each step in which the envelope is shortened, before the last step.
+"""Number of least-squares iterations at each step in which the envelope is shortened, before the last step.
 
 They are enough to stay near the optimum of that length.
 """
 ITERATIONS = 400
-"""Largest number of iterations at the last step."""
+"""Largest number of least-squares iterations at the last step, at which the envelope has its required length."""
 TOLERANCE = 1e-6
 """Relative decrease of the mean square error per iteration below which the search ends."""
 HELD = 2e-6
@@ -347,7 +347,7 @@ def active_constraints(
 
 
 def _constraint_names(merit: MeritFunction, prescription: Prescription, names: Sequence[str]) -> list[str]:
-    """Return a distinct name for each constraint, by adding the surfaces to kinds that occur several times."""
+    """Return a distinct name for each constraint: its kind, and the surfaces if there are several of a kind."""
     surfaces = ("scene", *prescription.names)
     passages = iter(merit.passages)
     sides = iter(("long", "short"))
@@ -374,7 +374,7 @@ _AT_LIMIT = 20e-6
 
 
 def _sizes(prescription: Prescription, variables: Sequence[Variable]) -> np.ndarray:
-    """Return the typical size of each variable, in its SI unit, by which it is divided to become dimensionless."""
+    """Return the typical size of each variable in its SI unit, by which its values are scaled in the least squares."""
     least = [_SMALLEST[v.quantity] for v in variables]
     return np.asarray(np.maximum(np.abs(prescription.values(variables)), least))
 
@@ -390,7 +390,7 @@ _SMALLEST = {
     "tilt": 0.01,
     "field_bias": 0.01,
 }
-"""Quantity -> smallest size by which its variables are divided to become dimensionless, SI units."""
+"""Quantity -> smallest typical size of a variable of this kind in its SI unit, for scaling in the least squares."""
 
 
 def _require_fulfilled(merit: MeritFunction, after: Evaluation) -> None:
@@ -480,7 +480,7 @@ class Search:
 
     @property
     def agreeing(self) -> int:
-        """Number of starts that ended within ``SAME`` of the best, itself included."""
+        """Number of starts whose final rms error is within the fraction ``SAME`` of the best one's, itself included."""
         least = rms_error(self.best.after)
         return sum(attempt.error <= (1.0 + SAME) * least for attempt in self.attempts)
 

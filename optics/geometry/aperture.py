@@ -18,21 +18,21 @@ import numpy as np
 
 @dataclass(frozen=True, eq=False)
 class DiskNumbers:
-    """Disk about (x, y), in metres, with the square of its radius, in m^2."""
+    """Numbers of a disk about (x, y): its centre, in metres, and the square of its radius, in m^2."""
 
     x: Any
     y: Any
     radius_squared: Any
 
     def contains(self, x: Any, y: Any) -> Any:
-        """Return the mask of points inside, the edge included."""
+        """Return the mask of points x, y (metres) inside the disk, its edge included."""
         dx, dy = x - self.x, y - self.y
         return dx * dx + dy * dy <= self.radius_squared
 
 
 @dataclass(frozen=True, eq=False)
 class RingNumbers:
-    """Disk about (x, y), in metres, with the squares of its radius and of that of its concentric hole, in m^2."""
+    """Numbers of a disk with a concentric hole: centre (x, y), in metres, and squares of both radii, in m^2."""
 
     x: Any
     y: Any
@@ -40,7 +40,7 @@ class RingNumbers:
     hole_squared: Any
 
     def contains(self, x: Any, y: Any) -> Any:
-        """Return the mask of points inside, both edges included."""
+        """Return the mask of points x, y (metres) inside the ring, both edges included."""
         dx, dy = x - self.x, y - self.y
         r2 = dx * dx + dy * dy
         return (r2 <= self.radius_squared) & (r2 >= self.hole_squared)
@@ -48,7 +48,7 @@ class RingNumbers:
 
 @dataclass(frozen=True, eq=False)
 class RectangleNumbers:
-    """Rectangle about (x, y) with its half-widths, in metres."""
+    """Numbers of a rectangle about (x, y): its centre and half-widths, in metres."""
 
     x: Any
     y: Any
@@ -56,13 +56,13 @@ class RectangleNumbers:
     half_y: Any
 
     def contains(self, x: Any, y: Any) -> Any:
-        """Return the mask of points inside, the edge included."""
+        """Return the mask of points x, y (metres) inside the rectangle, its edge included."""
         return (abs(x - self.x) <= self.half_x) & (abs(y - self.y) <= self.half_y)
 
 
 @dataclass(frozen=True, eq=False)
 class EllipseNumbers:
-    """Ellipse about (x, y) with its semi-axes, in metres."""
+    """Numbers of an ellipse about (x, y): its centre and semi-axes, in metres."""
 
     x: Any
     y: Any
@@ -70,7 +70,7 @@ class EllipseNumbers:
     half_y: Any
 
     def contains(self, x: Any, y: Any) -> Any:
-        """Return the mask of points inside, the edge included."""
+        """Return the mask of points x, y (metres) inside the ellipse, its edge included."""
         u, v = (x - self.x) / self.half_x, (y - self.y) / self.half_y
         return u * u + v * v <= 1.0
 
@@ -240,7 +240,7 @@ class Ray:
             raise ValueError(f"a vane needs a width, found {self.width}")
 
     def contains(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-        """Return the mask of points inside, the edge included."""
+        """Return the mask of points x, y (metres) inside the strip, its edge included."""
         return np.asarray((x >= self.centre[0]) & (np.abs(y - self.centre[1]) <= 0.5 * self.width))
 
 
@@ -265,7 +265,7 @@ class Polygon:
             raise ValueError(f"a polygon needs three corners or more, found {len(self.corners)}")
 
     def contains(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-        """Return the mask of points inside, by the parity of the sides that a line along x crosses."""
+        """Return the mask of points x, y (metres) inside, by the parity of the sides that a line along x crosses."""
         inside = np.zeros(np.broadcast_shapes(np.shape(x), np.shape(y)), dtype=bool)
         last_x, last_y = self.corners[-1]
         for next_x, next_y in self.corners:

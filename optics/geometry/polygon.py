@@ -21,7 +21,7 @@ _BLOCK_NODES = 2**13
 """Number of boundary nodes processed in one block: their polynomials stay in the processor's cache."""
 
 _COINCIDENT = 1e-13
-"""Distance below which two corners coincide."""
+"""Distance below which two corners of a polygon count as one, in the unit of their coordinates."""
 
 
 def area(polygons: np.ndarray) -> np.ndarray:

@@ -57,11 +57,11 @@ _Rings = dict[int, list[int]]
 
 
 class OpenBodyError(PhysicalError, ValueError):
-    """The half-spaces do not bound a body."""
+    """Error: half-spaces do not bound a body, as their intersection is infinite."""
 
 
 class EmptyBodyError(PhysicalError, ValueError):
-    """The half-spaces have no common body, or one thinner than ``MERGE_LENGTH``."""
+    """Error: half-spaces have no common body, or one thinner than ``MERGE_LENGTH``."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,7 +141,10 @@ def _box(planes: list[_Plane], first: int) -> tuple[list[_Corner], _Rings]:
 
 
 def _cut(corners: list[_Corner], rings: _Rings, planes: Sequence[_Plane], k: int) -> None:
-    """Cut off everything beyond plane number ``k``; a plane that cuts nothing off leaves no face."""
+    """Cut off the part of a body beyond plane number ``k``; a plane that cuts nothing off makes no face.
+
+    ``corners`` and ``rings`` are the corners and faces of the body, which are changed.
+    """
     a, b, c, d = planes[k]
     side = {}
     for v in {v for ring in rings.values() for v in ring}:
@@ -242,7 +245,7 @@ class Coating(Enum):
 
 
 class SolidError(PhysicalError, ValueError):
-    """The faces do not enclose a body."""
+    """Error: the faces of a solid do not enclose a body."""
 
 
 @dataclass(frozen=True)

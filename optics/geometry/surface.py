@@ -88,13 +88,13 @@ class GridFigure:
 
     @property
     def numbers(self) -> GridNumbers:
-        """Position, spacing and size of the grid for a kernel, whose table begins with the coefficients ``spline``."""
+        """Position, spacing and size of the grid, for a kernel whose table begins with the coefficients ``spline``."""
         dx, dy = self.spacing
         rows, columns = self.values.shape
         return GridNumbers(self.bounds[0], self.bounds[2], 1.0 / dx, 1.0 / dy, float(columns), float(rows), 0.0)
 
     def plus(self, other: GridFigure) -> GridFigure:
-        """Return the sum of two figures on the same samples; exact.
+        """Return the exact sum of two figures that are given at the same samples.
 
         Raises
         ------
@@ -406,14 +406,14 @@ class Surface:
 
     @property
     def zernike_figure(self) -> ZernikeFigure | None:
-        """Zernike part of the figure, or None."""
+        """Zernike part of the figure error, or None without one."""
         if isinstance(self.figure, SummedFigure):
             return self.figure.terms
         return self.figure if isinstance(self.figure, ZernikeFigure) else None
 
     @property
     def grid_figure(self) -> GridFigure | None:
-        """Grid part of the figure, or None."""
+        """Part of the figure error that is given on a grid, or None without one."""
         if isinstance(self.figure, SummedFigure):
             return self.figure.grid
         return self.figure if isinstance(self.figure, GridFigure) else None

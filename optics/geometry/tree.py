@@ -318,7 +318,7 @@ class RigidTree:
 
     @cached_property
     def _levels(self) -> tuple[tuple[Body, ...], ...]:
-        """Bodies grouped by their depth in the tree."""
+        """Bodies grouped by their depth in the tree, from the roots on."""
         far: dict[str, int] = {}
         for body in self.bodies:
             far[body.path] = far[body.parent] + 1 if body.parent else 0
@@ -337,7 +337,7 @@ class RigidTree:
 
     @cached_property
     def _nominal(self) -> tuple[np.ndarray, np.ndarray]:
-        """Nominal world rotations (bodies, 3, 3) and translations (bodies, 3)."""
+        """Nominal world rotations (bodies, 3, 3) and translations (bodies, 3), metres."""
         return self._at_rest(np.float64)
 
     @cached_property
@@ -346,7 +346,10 @@ class RigidTree:
         return self._at_rest(np.complex128)
 
     def _at_rest(self, dtype: Any) -> tuple[np.ndarray, np.ndarray]:
-        """Return the nominal world rotations (bodies, 3, 3) and translations (bodies, 3) in a data type."""
+        """Return nominal world rotations (bodies, 3, 3) and translations (bodies, 3), metres, as ``dtype``.
+
+        ``dtype`` is the NumPy type float or complex; the poses are computed in its arithmetic.
+        """
         rotation, translation = np.empty((len(self.bodies), 3, 3), dtype), np.empty((len(self.bodies), 3), dtype)
         for i, body in enumerate(self.bodies):
             rotation[i], translation[i] = body.pose.rotation, body.pose.translation
@@ -440,7 +443,10 @@ def compose_each(sequences: Sequence[Sequence[State]], bodies: Mapping[str, Body
 
 
 def _composed_pairs(pairs: Sequence[tuple[Motion, Motion]], bodies: Sequence[Body]) -> list[Motion]:
-    """Return, for each of N bodies, the one motion that applies a pair of motions, taken about the body's origin."""
+    """Return, for each of N bodies, the one motion that is equal to a pair of motions (first, then).
+
+    Its pivot is the body's origin; a point x moves to first(then(x)).
+    """
     (rot_1, offset_1, scale), (rot_2, offset_2, _) = (_affine([pair[k] for pair in pairs], bodies) for k in range(2))
     rotation, offset = product(rot_1, rot_2), matvec(rot_1, scale[:, None] * offset_2) + offset_1
     rotate = _composed_rotations(pairs, rotation)

@@ -311,7 +311,7 @@ Shape = Polygon | Disk | HalfPlane
 
 @dataclass(frozen=True, eq=False)
 class _Edges:
-    """Midpoints, vectors and outward normals (of the edges' lengths) of V edges, (V, 2) each."""
+    """V edges of a polygon: midpoints, edge vectors, and outward normals as long as the edges, (V, 2) each, metres."""
 
     middle: np.ndarray
     vector: np.ndarray
@@ -426,7 +426,7 @@ def _polyline(
 
 
 def _apply(point_map: PointMap, points: np.ndarray) -> np.ndarray:
-    """Return N mapped points (N, 2), after checking shape and finiteness."""
+    """Return the images (N, 2) of N points under a map, after checks that they have this shape and are finite."""
     mapped = np.asarray(point_map(points), float)
     if mapped.shape != points.shape:
         raise ValueError(f"the map must take (N, 2) to (N, 2), but took {points.shape} to {mapped.shape}")

@@ -27,7 +27,7 @@ from optics.numerics.array_math import UnphysicalError
 from optics.numerics.number_tree import FrozenMap
 
 REFERENCE_TEMPERATURE = 293.15
-"""Temperature at which the dispersion formulas hold, kelvin (20 C)."""
+"""Temperature of the glass to which the dispersion formulas refer, kelvin (20 C)."""
 SCHOTT_RANGE = TemperatureRange.celsius(
     -100.0, 140.0, 'Schott\'s measurements of dn/dT: Hartmann, "Optical Glass", SPIE Press 2014, sec. 3.7'
 )

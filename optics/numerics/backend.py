@@ -57,7 +57,7 @@ NAMES = ("llvm", "cuda")
 
 
 class BackendUnavailable(RuntimeError):
-    """The machine cannot run the requested backend (no GPU driver, no usable LLVM)."""
+    """Error: the machine cannot run the requested backend (no GPU driver, no usable LLVM)."""
 
 
 @dataclass(frozen=True)
@@ -239,7 +239,7 @@ ONE_THREAD = {
     "MKL_NUM_THREADS": "1",
     "NUMEXPR_NUM_THREADS": "1",
 }
-"""Environment variables of a worker process, so that it and its linear algebra run on one thread."""
+"""Environment variables with which a worker process and its linear algebra run on one thread."""
 
 
 def cores() -> int:

@@ -21,7 +21,7 @@ MAX_ITERATIONS = 25
 
 
 class AimError(PhysicalError, RuntimeError):
-    """No ray from the given point reaches the target."""
+    """Error: no ray of the requested kind reaches the target point, or the search for it does not converge."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -165,7 +165,7 @@ def aim(
 
 
 def _solve(matrix: np.ndarray, right: np.ndarray) -> np.ndarray:
-    """Return the solutions (..., 2) of 2 x 2 systems by Cramer's rule; not finite where singular."""
+    """Return the solutions (..., 2) of systems of two linear equations by Cramer's rule; not finite if singular."""
     (a, b), (c, d) = np.moveaxis(matrix, (-2, -1), (0, 1))
     x, y = np.moveaxis(right, -1, 0)
     with np.errstate(divide="ignore", invalid="ignore"):

@@ -24,7 +24,7 @@ class Interaction(Enum):
     REFRACT = "refract"
     PASS = "pass"
     TOTAL = "total"
-    """Total reflection inside glass; a ray that is not beyond the critical angle is lost."""
+    """Total internal reflection in glass; a ray whose angle of incidence is below the critical angle is lost."""
 
     # hash by identity: hashing by name makes looking up a recorded trace as slow as launching it
     __hash__ = object.__hash__
@@ -79,7 +79,7 @@ class Element:
 
     @property
     def figure_disk(self) -> ZernikeFigure:
-        """Zernike figure to which a state's figure terms are added: ``Surface.figure_disk`` over the clear aperture.
+        """Zernike figure to whose disk the Zernike terms of a perturbed state refer (``Surface.figure_disk``).
 
         Raises
         ------
@@ -181,11 +181,11 @@ class Assembly:
 
     @cached_property
     def system_cache(self) -> dict[Any, Any]:
-        """Cache of numbers of the nominal elements, which ``optics.raytrace.system.assemble`` fills and reads."""
+        """Cache of the numbers of the nominal elements, which ``optics.raytrace.system.assemble`` fills and reads."""
         return {}
 
     def index(self, solid: str, motion: Motion = AT_REST) -> float:
-        """Return the refractive index of a glass body with a motion, at the origin of its frame."""
+        """Return the vacuum refractive index of a glass body, changed by a motion, at the origin of its frame."""
         return self.media[solid] + motion.index + self.above_d.get(solid, 0.0) * motion.dispersion
 
     def sequence(self, name: str) -> tuple[Element, ...]:

@@ -31,7 +31,7 @@ from optics.raytrace.assembly import Assembly, Element, Interaction
 
 @dataclass(frozen=True)
 class Structure:
-    """Properties of one element that determine the code of a kernel, e.g. the kind of its surface."""
+    """Properties of an element that determine the code of the kernel that traces it, e.g. the kind of its surface."""
 
     interaction: Interaction
     plane: bool
@@ -154,7 +154,7 @@ def structure_of(elements: Sequence[Element]) -> Structure:
 
 
 def _known_figure(element: Element) -> Figure | None:
-    """Return the figure of an element's surface; raise ValueError for a type that the trace does not support."""
+    """Return the figure error of an element's surface; raise ValueError if the ray trace does not support its type."""
     match element.surface.figure:
         case None | ZernikeFigure() | GridFigure() | SummedFigure() as figure:
             return figure
@@ -218,7 +218,7 @@ def _surface_numbers(
     states: Sequence[State],
     step: Sequence[tuple[str, str, int]] | None,
 ) -> SurfaceNumbers:
-    """Return the numbers of an element's shape in each state; the grid figure is added elsewhere."""
+    """Return the numbers of an element's shape (curvature, conic, figure) in each state, except its grid figure."""
     surface = element.surface
     curvature, conic, even = None, None, []
     if not structure.plane:
@@ -252,7 +252,8 @@ def _figure_numbers(
 
 
 _NO_GRID = GridFigure(np.zeros((4, 4)), (-1.0, 1.0, -1.0, 1.0))
-"""Zero grid, read by a system without a grid where others of its batch have one."""
+"""Figure of zeros on a grid, for an element without a grid figure that is traced together with elements that have one.
+"""
 
 
 def grid_numbers(elements: Sequence[Element], states: Sequence[State]) -> tuple[GridNumbers, np.ndarray]:

@@ -357,9 +357,10 @@ def _on_frame(
     apex: tuple[float, float, float],
     axis: int,
 ) -> ReflectorParts:
-    """Return the parts of a hollow reflector: mirrors on plates, held by a bar beyond them all along ``axis``.
+    """Return the parts of a hollow reflector: mirrors on plates, held by a bar beyond all of them along axis ``axis``.
 
-    Each mirror is given with its normal toward the light.
+    ``mirrors`` are the beam's reflections, each with the mirror's normal toward the light, and ``apex`` is the point
+    about which rotations leave the beam unchanged.
     """
     passages = [passage for passage, _ in mirrors]
     planes: list[Plane] = [
@@ -466,7 +467,10 @@ def _faces(
 
 
 def _footprint(path: str, passage: Passage, shared: set[str]) -> str:
-    """Return the body that carries a passage's element: the face's, or its child if the beam meets the face twice."""
+    """Return the path of the body that carries the optical element where the beam meets a face.
+
+    It is the face's body, or a child of it if the beam meets the face twice.
+    """
     face = f"{path}/{passage.face}"
     return f"{face}/{passage.name}" if passage.face in shared else face
 
@@ -478,7 +482,10 @@ def _centre(passages: list[Passage]) -> tuple[float, float, float]:
 
 
 def _axes(normal: np.ndarray, direction: np.ndarray | None) -> np.ndarray:
-    """Return the axes of a face's frame as columns: z along the normal, x along the arriving beam's tangential part."""
+    """Return the axes of a face's frame as columns (3, 3): z along the normal, x along the beam's tangential part.
+
+    ``direction`` is the direction of the beam that arrives; without one, x is arbitrary.
+    """
     z = normal / norm(normal)
     lean = np.zeros(3) if direction is None else direction - inner(direction, z) * z
     if norm(lean) < 1e-6:

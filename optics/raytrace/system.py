@@ -111,7 +111,7 @@ class SystemBatch:
 
     @property
     def count(self) -> int:
-        """Number of systems B."""
+        """Number B of systems (element sequences in a perturbed state)."""
         return int(self.numbers.shape[1])
 
     @cached_property
@@ -150,7 +150,7 @@ class SystemBatch:
         return UploadedSystems(backend, self.structure, self.form, tuple(numbers_in(derived)), grids, self.count, True)
 
     def take(self, systems: np.ndarray) -> SystemBatch:
-        """Return some of the systems, given by their indices."""
+        """Return a batch of some of the systems, given by their indices."""
         if np.array_equal(systems, np.arange(self.count)):
             return self
 
@@ -186,7 +186,7 @@ class Poses:
     translation: np.ndarray
 
     def last(self) -> FrameNumbers:
-        """Return the poses of the last element of each system."""
+        """Return the world poses of the last element of each system, as ``FrameNumbers``."""
         return FrameNumbers.of(self.last_rows())
 
     def last_rows(self) -> np.ndarray:
@@ -345,7 +345,7 @@ class _Chains:
         return [chain[i] for chain in self.elements]
 
     def structure(self, shapes: _Shapes) -> tuple[Structure, ...]:
-        """Return the structure of the elements with the states' changes of shape."""
+        """Return the structure of each element, including what the states' changes of shape add to it."""
         changed, out = shapes.orders.keys() | shapes.gridded | shapes.graded, list(self.nominal)
         for i, nominal in enumerate(out):
             if changed.isdisjoint(self.depends[i]):
@@ -453,7 +453,7 @@ class _Design:
 
     @classmethod
     def of(cls, assembly: Assembly, chains: _Chains, structure: tuple[Structure, ...]) -> _Design:
-        """Return the nominal numbers of chains of one structure."""
+        """Return the nominal numbers of chains whose elements have a given structure."""
         placed, frame = assembly.place(), FrameNumbers.of(np.zeros((12, len(chains.elements))))
         twice = replace(placed, scale=np.full_like(placed.scale, 2.0))
 
@@ -553,9 +553,10 @@ class _Design:
         states: Sequence[State],
         known: dict[tuple[str, int, float], np.ndarray],
     ) -> None:
-        """Add to ``out`` the states' changes of the shapes of the elements at position ``i``.
+        """Apply to ``out`` the states' changes of the shapes of the elements at position ``i`` of the chains.
 
-        ``known`` caches figures by body, order and radius.
+        They are changes of radius, conic constant and Zernike figure; ``known`` caches figures by body, order and
+        radius.
         """
         surface = self.form[0][i].surface
         for c, element in enumerate(self.chains.elements_at(i)):

@@ -189,17 +189,17 @@ MIN_LANE_RAYS = 1 << 15
 """Smallest number of rays for which each SIMD lane traces one system: fewer take some milliseconds either way."""
 
 MAX_RECORDINGS = 16
-"""Largest number of recordings (instructions kept for replay) of one trace in one thread.
+"""Largest number of recordings (sequences of instructions kept for replay) of one kind of trace in one thread.
 
-A trace is recorded anew where a bundle shares other numbers, such as a direction.
+A new one is needed when other arrays of the rays have width 1, such as a direction that all rays share.
 """
 
 CONVERGED = 1e-12
-"""Largest distance from the surface, metres, at which an intersection counts as valid."""
+"""Largest distance of a ray's end from the surface, metres, at which its intersection counts as valid."""
 
 
 class BeamMissedError(PhysicalError, RuntimeError):
-    """No ray of a bundle passes through a sequence."""
+    """Error: no ray of a beam passes through a sequence of elements."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -211,7 +211,8 @@ class Rays:
     position, direction, path, valid : Dr.Jit arrays
         Arrays of width systems * N for N rays each, lengths in metres; a direction that all rays share has width 1.
     systems : int
-        Number of systems that the rays are for, system by system; 1: every system gets all of them.
+        Number of systems that the rays belong to; the arrays hold the rays of one system after the other. With 1, every
+        system gets all rays.
     """
 
     position: Any
@@ -223,7 +224,7 @@ class Rays:
 
 @dataclass(frozen=True, eq=False)
 class Traced:
-    """Rays at the last element of a sequence.
+    """Rays of B systems at the last element of a sequence.
 
     Attributes
     ----------
@@ -604,7 +605,10 @@ def _recorded(plan: _TracePlan, form: Any) -> Any:
 
 
 def require_rays(valid: np.ndarray, name: str) -> None:
-    """Raise BeamMissedError when one of B systems has no valid ray; ``valid`` (B, N) is the mask of N rays each."""
+    """Raise BeamMissedError when one of B systems has no valid ray.
+
+    ``valid`` (B, N) is the mask of N rays each, and ``name`` is what the error calls the beam.
+    """
     alive = np.asarray(np.any(valid.reshape(len(valid), -1), axis=1))
     if not alive.all():
         raise BeamMissedError(
@@ -638,7 +642,7 @@ def _full_width(backend: Backend, rays: Rays, count: int) -> tuple[Rays, Any]:
 
 
 def _lanes(systems: UploadedSystems, rays: int) -> Any:
-    """Return the indices of the B systems (B,), one for each SIMD lane, or None where they do not fill the lanes."""
+    """Return the indices of B systems, (B,), if each SIMD lane is to trace all rays of one system; else None."""
     import drjit as dr
 
     backend, threads = systems.backend, dr.thread_count()

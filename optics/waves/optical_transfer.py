@@ -274,8 +274,7 @@ def _blocks(
 
 
 FINER = (4, 8, 16, 32, 64)
-"""Numbers of additional nodes along each direction that are tried, in this order, until a transfer function converges.
-"""
+"""Numbers of additional nodes along each direction that are tried in turn until a transfer function converges."""
 
 CONVERGED = 2e-4
 """Largest change of a transfer function due to additional nodes with which there are enough nodes."""
@@ -284,7 +283,8 @@ WORST_TRANSFER = 1e-3
 """Largest allowed change of a transfer function due to additional nodes; beyond it an error is raised."""
 
 _TEST_FREQUENCIES = np.array([[x, 0.0] for x in (0.12, 0.3, 0.55, 0.8)] + [[0.0, y] for y in (0.2, 0.4, 0.6, 0.9)])
-"""Frequencies at which numbers of nodes are compared, in units of the cut-off along both axes."""
+"""Frequencies at which results with different numbers of nodes are compared, relative to the cut-off along each axis.
+"""
 
 
 def with_enough_nodes(pupil: PupilFunction, wavelength: float) -> PupilFunction:
@@ -338,10 +338,13 @@ def with_enough_nodes(pupil: PupilFunction, wavelength: float) -> PupilFunction:
 
 
 TABLE_TAIL = 1e-6
-"""Largest coefficient in the last quarter of a table's series, for a transfer function that is 1 at zero frequency."""
+"""Largest accepted coefficient in the last quarter of the series of a tabulated transfer function.
+
+The transfer function is 1 at zero frequency.
+"""
 
 _DENSE = (1536, 512)
-"""Number of cells of a table's spline from zero to the cut-off, and around the circle."""
+"""Number of cells of the spline of a tabulated transfer function from zero to the cut-off, and around the circle."""
 
 _PAD = 12
 """Number of cells by which the spline is extended beyond its edges.
@@ -350,7 +353,7 @@ The effect of an edge on a cubic spline falls by a factor of 0.27 per cell.
 """
 
 _MOST_NODES = 400
-"""Largest number of radial nodes of a table."""
+"""Largest number of frequencies along the radius at which a tabulated transfer function is computed."""
 
 _SHADOW_GRID = (48, 64)
 """Number of steps from zero to the cut-off, and over half the circle, for a shadow's contribution to a table.
@@ -572,8 +575,10 @@ def _shadow_table(
 
 
 ACROSS, ALONG, IN_SHADOW = 24, 18, 12
-"""Numbers of nodes of ``VariedTransfer`` across and along the chords of an overlap, and along each side of a shadow's
-box: with one wave of error at the edge of the pupil the MTF is accurate to 1e-6."""
+"""Numbers of nodes of ``VariedTransfer`` across and along the chords of an overlap, and on each side of a shadow's box.
+
+With one wave of wavefront error at the edge of the pupil the MTF is then accurate to 1e-6.
+"""
 
 
 @dataclass(frozen=True, eq=False)

@@ -27,7 +27,10 @@ to 4e-6 where the same arc cuts twice.
 """
 
 FEW_SIDES = 64
-"""Number of sides of that polygon for many pupils at once: 16 times the errors."""
+"""Number of sides of the polygon that represents a pupil's edge if many pupils are computed at once.
+
+The errors are 16 times those with ``RIM_SIDES``.
+"""
 
 MAX_PIECE = 0.5
 """Largest size along x and y of a polygon of a shadow, in radii of the pupil; larger ones are divided.
@@ -50,7 +53,7 @@ _ANGLE_TOLERANCE = 1e-12
 """Angle of an arc, radians, below which it is zero to rounding."""
 
 _MIN_TERM = 1e-10
-"""Size below which a Fourier term of an edge's radius is omitted."""
+"""Modulus below which a Fourier term of the radius of a pupil's edge is omitted, in radii of the pupil."""
 
 _AREA_TOLERANCE = 1e-5
 """Tolerance of the area of a part of a polygon, for a pupil of radius 1: arcs are integrated by Gauss' rule."""

@@ -50,7 +50,9 @@ optimal.
 """
 
 MORE_DEGREES = (24, 28)
-"""Further degrees for a pupil from which no shadows are subtracted; otherwise their values in the dark are too large.
+"""Further polynomial degrees that are tried for a vignetted pupil from which no shadows are subtracted.
+
+With shadows they are not used, as the polynomials' values in the dark, which are subtracted again, are too large.
 """
 
 VIGNETTED_RINGS = 20
@@ -88,7 +90,7 @@ MIN_ILLUMINATED = (DEGREE + 1) * (DEGREE + 2) // 2
 EVEN_WEIGHT = 1e-2
 """Weight of nodes in the dark relative to illuminated ones, in fits of direction cosines and amplitudes.
 
-These vary so little that no higher polynomials are needed.
+These vary so little over the pupil that no polynomials of higher degree are needed.
 """
 
 _BLOCK = 2**14
@@ -328,9 +330,10 @@ class PupilStack:
         return np.asarray(total / self.power[:, None])
 
     def _shifts(self, frequency: np.ndarray, wavelengths: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the normalised shifts that M frequencies mean at K wavelengths, and the wave number of each, rad/m.
+        """Return the shifts of a pupil against itself for M frequencies at K wavelengths, and wave numbers, rad/m.
 
-        Shifts are complex, (B, K * M) for B pupils; wave numbers have the shape (K * M,).
+        Shifts are complex, in normalised pupil coordinates, (B, K * M) for B pupils; wave numbers have the shape (K *
+        M,).
         """
         steps = (wavelengths[:, None, None] * frequency).reshape(-1, 2)
         moved = np.linalg.solve(self.axes, np.broadcast_to(steps.T, (len(self.axes), 2, len(steps))))
@@ -386,7 +389,11 @@ class PupilStack:
         return np.asarray(np.einsum("k,bkm->bm", share, values.reshape(len(values), len(share), len(frequency))))
 
     def _pieces(self, wave: float, shifts: int, points: int) -> Iterator[tuple[np.ndarray, int, int]]:
-        """Yield groups of pupils that need the same numbers of nodes, in blocks of bounded size."""
+        """Yield groups of pupils that need the same numbers of nodes, and these numbers across and along chords.
+
+        ``wave`` is the largest wave number, rad/m, ``shifts`` the number of shifts of each pupil, and ``points`` the
+        largest number of points in a group.
+        """
         along = np.array([nodes_for(float(span), LEAST_ALONG) for span in wave * self.span])
         for count in np.unique(along):
             rows = int(count) + LEAST_ACROSS - LEAST_ALONG

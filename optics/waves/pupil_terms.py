@@ -104,8 +104,11 @@ def to_terms(nodes: PupilNodes, degree: int) -> np.ndarray:
 
 
 BASE_DEGREE, STIFFNESS = 8, 1e-6
-"""Degree of the polynomials that are continued into the dark, and the penalty on the squares of their coefficients
-times their orders above those of a plane, relative to the squared residuals in the light."""
+"""Degree of the polynomials by which a wavefront is continued into the dark part of a pupil, and strength of smoothing.
+
+The strength is the penalty, relative to the squared residuals in the light, on the squares of coefficients times their
+orders, except those of a plane.
+"""
 
 DARK_WEIGHT = 1e-6
 """Weight of a dark node relative to an illuminated one, for the remainder of a wavefront."""
