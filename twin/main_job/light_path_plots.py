@@ -252,7 +252,7 @@ def footprints_svg(instrument: Instrument, paths: LightPaths) -> str:
 
 
 def _style(colour: str, filled: bool) -> dict[str, Any]:
-    """Return the line style of a footprint: filled at +Y, outlined at -Y, since the two footprints may coincide."""
+    """Return the line style of a beam footprint: filled for channels at +Y, outlined at -Y, since two may coincide."""
     return {"fc": colour, "ec": colour, "alpha": 0.5} if filled else {"fill": False, "ec": colour, "lw": 1.4}
 
 

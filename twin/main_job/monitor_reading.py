@@ -88,7 +88,10 @@ class MonitorReading:
 
     @cached_property
     def gains(self) -> dict[str, np.ndarray]:
-        """Estimator -> gain matrix, (4 x cameras, 2 x spots): camera parameters (rad or m) per pixel of spot shift."""
+        """Estimator -> its linear map from spot shifts (px) to camera parameters (rad or m).
+
+        Each is a (4 x cameras, 2 x spots) array.
+        """
         return estimator_gains(self.cameras, self.disturbances, self.recovery.shift_covariance[0])
 
     @cached_property
@@ -129,14 +132,14 @@ class MonitorReading:
 
     @cached_property
     def unobserved(self) -> tuple[str, ...]:
-        """Warnings of bodies whose motions hardly move the spots but contribute to sigma, without full stops."""
+        """Warnings about bodies whose motions hardly move the spots but contribute to sigma, without full stops."""
         prior, noise = self.disturbances, self.recovery.shift_covariance[0]
         if prior is None or not np.any(noise):
             return ()
         return unobserved_texts(prior, noise, self._quantities, self.gains[self.judged])
 
     def _error_text(self, name: str) -> str:
-        """Return the quantity whose linear estimate differs most from a ray trace of the estimated state, as text.
+        """Return the parameter whose linear estimate differs most from a ray trace of the estimated state, as text.
 
         The text also gives the size of the difference.
         """
@@ -156,9 +159,10 @@ class MonitorReading:
 
     @cached_property
     def from_statement(self) -> dict[str, dict[str, float | None]]:
-        """Group -> key -> share of the posterior's variance due to the prior alone, which remains without image noise.
+        """Group -> key -> fraction of the posterior variance due to the prior alone, which remains without image noise.
 
-        The share is None for a quantity that no motion of the prior changes. Empty without a prior and without noise.
+        The fraction is None for a quantity that no motion of the prior changes. The mapping is empty without a prior
+        and without noise.
         """
         prior, noise = self.disturbances, self.recovery.shift_covariance[0]
         if prior is None or not np.any(noise):
@@ -177,8 +181,8 @@ class MonitorReading:
     def consistency(self) -> Consistency | None:
         """Chi-square test of the shifts against the prior on disturbances.
 
-        None without a prior, and where shifts have no noise: a body that the prior holds fixed would then contradict it
-        by rounding.
+        It is None without a prior, and where shifts have no noise: rounding would then contradict a prior that holds a
+        body fixed.
         """
         if self.disturbances is None or not np.any(self.recovery.shift_covariance):
             return None
@@ -187,7 +191,7 @@ class MonitorReading:
         return consistency(recovery.shift[0], recovery.shift_covariance[0], self.disturbances, candidates, rate)
 
     def any_motions(self, prior: Disturbances) -> dict[str, np.ndarray]:
-        """Return the response of all spots to the motions of each body, including bodies that the prior holds fixed.
+        """Return the spot shifts due to the motions of each body, including bodies that the prior holds fixed.
 
         Parameters
         ----------
@@ -197,7 +201,8 @@ class MonitorReading:
         Returns
         -------
         dict of str to (2 C, M) ndarray
-            Body -> spot shifts of C channels, in pixels per table unit of each of the body's M motions.
+            Body -> shifts of C spots (row and column of each), in pixels per table unit (arcsec, um, ppm) of each of
+            the body's M motions.
         """
         columns: dict[tuple[str, str, int], np.ndarray] = {}
         for name, table in self.crosstalk.items():
@@ -284,7 +289,7 @@ class MonitorReading:
         }
 
     def _stated(self, test: Consistency | None) -> dict[str, Any]:
-        """Return the prior's name and the test of the shifts against it; numbers are None without prior or noise."""
+        """Return the prior's name and the test of the shifts against it, as plain data; None without prior or noise."""
         name = None if self.disturbances is None else self.disturbances.name
         numbers = {key: None if test is None else number(test) for key, number in _TEST_KEYS.items()}
         suspects = [
@@ -340,7 +345,7 @@ def _suspect_text(test: Consistency, prior_bodies: Sequence[str]) -> str:
 
 
 def _fits(what: str, fits: FitStates) -> Iterator[SelfCheck]:
-    """Yield the check of the worst fit among some spots: its chi-square over its limit."""
+    """Yield the check of the worst fit among some spots: its chi-square divided by the limit."""
     ratio = np.fmax(fits.whole / fits.whole_limit, fits.core / fits.core_limit)
     if np.any(np.isfinite(ratio) & (ratio > 0.0)):
         meaning = (
@@ -383,7 +388,7 @@ def worst_checks(readings: Iterable[MonitorReading]) -> tuple[SelfCheck, ...]:
 SHARE_DECIMALS, OFF_DECIMALS = 3, 1
 """Decimals of shares, and of linearity errors in sigmas: rounding errors seldom change numbers rounded so."""
 READING_DECIMALS = 6
-"""Decimals of an estimated change in files, counted in units of its sigma."""
+"""Number of decimals to which files give an estimated change divided by its sigma."""
 _TEST_KEYS: Mapping[str, Callable[[Consistency], Any]] = {
     "chi_square": lambda test: _to_digits(test.chi_square),
     "chi_square_sigma_noise": lambda test: test.sigma_noise,
@@ -406,15 +411,15 @@ def _to_digits(value: float) -> float:
 
 
 def stated(readings: Mapping[str, Any]) -> dict[str, Any]:
-    """Round readings for files: each to a millionth of its sigma, the sigmas to eight digits.
+    """Round estimated changes for files: each to a millionth of its sigma, the sigmas to eight digits.
 
     Further digits carry no information and differ between processors, with the order in which linear algebra sums.
 
     Parameters
     ----------
     readings : Mapping[str, Any]
-        Nested readings; the sigma of ``x`` is ``x_sigma_noise`` or ``x_sigma`` beside it, the first that is there.
-        Other numbers are not rounded.
+        Nested estimates; the sigma of ``x`` is ``x_sigma_noise`` or ``x_sigma`` beside it, the first that exists. Other
+        numbers are not rounded.
     """
     out: dict[str, Any] = {}
     for key, value in readings.items():

@@ -58,7 +58,7 @@ class JobRun:
     Attributes
     ----------
     resolved : ResolvedJob
-        Job with everything it names.
+        Job with the contents of all files that it names.
     experiment : MonitorExperiment
         Instrument, with the calibration of its monitor if it has one.
     state : State
@@ -70,9 +70,9 @@ class JobRun:
     warnings : tuple of str
         Warnings to the user.
     targets : TargetRun or None
-        Test targets on the line CCDs, None if not asked for.
+        Test targets on the line CCDs, None if not requested.
     quality : ImageQuality or None
-        Image quality of the nominal and the perturbed state, None if not asked for.
+        Image quality of the nominal and the perturbed state, None if not requested.
     """
 
     resolved: ResolvedJob
@@ -198,7 +198,10 @@ class RenderRun(JobRun):
 
     @property
     def gains(self) -> dict[str, np.ndarray]:
-        """Estimator -> gain matrix, (4 x cameras, 2 x spots): camera parameters (rad or m) per pixel of spot shift."""
+        """Estimator -> its linear map from spot shifts (px) to camera parameters (rad or m).
+
+        Each is a (4 x cameras, 2 x spots) array.
+        """
         return self.reading.gains
 
     @property

@@ -1,4 +1,4 @@
-"""Report sections on set-up, result, time series, spots and residuals of the main job."""
+"""Report sections on set-up, results, time series, spots, and the errors of the estimates of the main job."""
 
 from __future__ import annotations
 
@@ -48,7 +48,23 @@ _ANGLE_TITLE = "Angle between the cameras"
 def figure(
     drawn: Mapping[str, str], name: str, caption: str, title: str = "", full: Table | None = None, count: int = 0
 ) -> SvgFigure:
-    """Return a drawing of the run as a figure of the page, the ``count``-th of its kind."""
+    """Return a drawing of the run as a figure of the report page.
+
+    Parameters
+    ----------
+    drawn : Mapping[str, str]
+        Name -> <svg> element of each drawing.
+    name : str
+        Name of the drawing.
+    caption : str
+        Text below the figure.
+    title : str
+        Title of the figure.
+    full : Table or None
+        Table with all numbers of the figure.
+    count : int
+        Number of this figure among several of its kind.
+    """
     file_name = name.partition(" ")[0] + f"-{count}" * (" " in name)
     return SvgFigure(file_name, title, caption, drawn[name], within=IN_PAGE, full=full)
 
@@ -353,7 +369,7 @@ def _with_sigma(value: float, sigma: float, sign: bool = False) -> str:
 
 
 def residual_section(run: RenderRun, drawn: Mapping[str, str]) -> Section:
-    """Return the section with the errors of all estimators and the part of them that the crosstalk table explains.
+    """Return the section with the errors of all estimators and how much of them the crosstalk table explains.
 
     The unexplained part of the error of the estimator that the verdict uses is compared with the noise alone.
     """
@@ -466,7 +482,7 @@ def facts(run: JobRun) -> tuple[tuple[str, str], ...]:
 
 
 def _all(values: list[float]) -> str:
-    """Return the distinct values among those of all channels, as text: ``50``, or ``34, 24``."""
+    """Return the distinct values in a list of all channels' values, as text: ``50``, or ``34, 24``."""
     return ", ".join(dict.fromkeys(plain(value) for value in values))
 
 
@@ -551,7 +567,7 @@ def _prior_table(run: JobRun) -> Table:
 
 
 def done_table(run: JobRun) -> Table:
-    """Return the table of the motions and temperatures that the job gives to each body at the time shown.
+    """Return the table of the motions and temperatures that the job applies to each body at the time shown.
 
     Bodies that only move because another body carries them are omitted.
     """

@@ -1,4 +1,4 @@
-"""Systematic errors of the estimators from crosstalk tables, and what the sigmas include, and what limits them."""
+"""Systematic errors of the estimators, predicted from crosstalk tables; what sigmas include and what limits them."""
 
 from __future__ import annotations
 
@@ -27,9 +27,9 @@ from twin.monitor.time_series import SmoothedCourse
 from twin.uncertainty.monitor_limits import short_text, unit_text
 
 _FAMILY = 4
-"""Number of the first motions of a crosstalk table that the estimators of paper 001 assume to be the only ones."""
+"""Number of motions of a camera that the estimators of paper 001 assume; they come first in a crosstalk table."""
 SHOWN = 1e-3
-"""Smallest amount of a motion, in its table unit, that is reported."""
+"""Smallest amount of a motion, in its table unit (arcsec, um, ppm or nm), that is reported."""
 
 
 HEAT = "temperatures (expansion, bending, change of index)"
@@ -77,7 +77,10 @@ def systematics(run: RenderRun, camera: str) -> Systematics:
 
 
 def _parts(run: RenderRun, camera: str, amounts: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Return motion -> error that it causes, for motions that the estimator of the verdict does not model."""
+    """Return motion -> error that it causes, for motions that the verdict's estimator does not model.
+
+    ``amounts`` holds the amounts of the motions in the run's state.
+    """
     names = list(run.crosstalk)
     k = names.index(camera)
     gain = rows_of(run.reading.cameras[camera]) @ run.gains[run.judged][4 * k : 4 * k + 4]
@@ -222,7 +225,19 @@ def unobserved_perturbations(run: RenderRun) -> tuple[str, ...]:
 
 
 def _sigmas(rows: np.ndarray, prior: Disturbances | None, noise: np.ndarray, gain: np.ndarray) -> np.ndarray:
-    """Return the (Q,) standard deviations of the estimates of Q quantities, due to noise and the prior."""
+    """Return the standard deviations of the estimates of Q quantities, (Q,), due to noise and the prior.
+
+    Parameters
+    ----------
+    rows : ndarray
+        Coefficients of the Q quantities on the parameters of all cameras.
+    prior : Disturbances or None
+        Prior; None if there is none.
+    noise : ndarray
+        Covariance of the spot shifts, px^2.
+    gain : ndarray
+        Linear map of the estimator from spot shifts to camera parameters.
+    """
     if prior is not None:
         return split(rows, prior, noise, gain).sigma
     return np.sqrt(np.einsum("qd,de,qe->q", rows @ gain, noise, rows @ gain))
@@ -231,7 +246,7 @@ def _sigmas(rows: np.ndarray, prior: Disturbances | None, noise: np.ndarray, gai
 _NOISE_ALONE = "There is no prior on disturbances: σ contains the noise of the images only"
 """Sentence, without a full stop, for runs without a prior."""
 NOISE = "the noise of the images"
-"""Name of the part of the variance that more frames reduce: the noise of the images."""
+"""Name, among the contributions to the variance, of the noise of the images, which more frames reduce."""
 
 
 def assumed(reading: MonitorReading) -> str:
@@ -248,7 +263,7 @@ def assumed(reading: MonitorReading) -> str:
 
 
 def _prior_share_text(reading: MonitorReading) -> str:
-    """Return the range of the shares of the posterior's variances that are due to the prior, as text."""
+    """Return which fractions of the posterior variances are due to the prior, as a range in text."""
     shares = [share for group in reading.from_statement.values() for share in group.values() if share is not None]
     if not shares:
         return ""
@@ -269,7 +284,10 @@ def contradiction(run: RenderRun) -> tuple[str, ...]:
 
 
 def doubted(run: RenderRun) -> tuple[str, ...]:
-    """Return warnings of spots unlike their calibration and of nonlinear estimates, for a series at its worst time."""
+    """Return warnings about spots unlike their calibration and about nonlinear estimates.
+
+    For a time series they are those of its worst time.
+    """
     if run.series is None:
         return (*run.reading.doubts, *run.reading.notes)
     return run.series.doubts(["/".join(channel) for channel in run.reading.channels])
@@ -318,14 +336,14 @@ def _series_agrees(together: SmoothedCourse, times: np.ndarray) -> str:
 
 
 def combination(reading: MonitorReading, group: str, key: str) -> np.ndarray:
-    """Return the factors that form a change from all cameras' parameters, to first order, and its unit in SI.
+    """Return the coefficients of a change on the parameters of all cameras, (4 x cameras,), and its unit in SI.
 
-    The factors are a (4 x cameras,) array.
+    The change is a linear combination of the parameters, to first order.
 
     Parameters
     ----------
     reading : MonitorReading
-        Reading of the instrument.
+        Estimated changes of the instrument.
     group : str
         Camera of the change, or the group of a quantity of two cameras.
     key : str
@@ -336,12 +354,12 @@ def combination(reading: MonitorReading, group: str, key: str) -> np.ndarray:
 
 
 def limits(reading: MonitorReading, change: Reading) -> tuple[str, float]:
-    """Return the largest source of a change's error variance (a body, or NOISE) and its share.
+    """Return the largest source of a change's error variance (a body, or NOISE) and its fraction of the variance.
 
     Parameters
     ----------
     reading : MonitorReading
-        Reading of the instrument, with a prior.
+        Estimated changes of the instrument, with a prior.
     change : Reading
         The change, as estimated by the estimator that the verdict uses.
     """
@@ -357,5 +375,5 @@ def limits(reading: MonitorReading, change: Reading) -> tuple[str, float]:
 
 
 def share_text(share: float) -> str:
-    """Return a share in per cent, as text for sentences."""
+    """Return a fraction as text in per cent, for sentences."""
     return f"{plain(round(100.0 * share), 3)} %"
