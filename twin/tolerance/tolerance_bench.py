@@ -36,10 +36,10 @@ from twin.tolerance.variations import VariedParameter, compensator_parameters, s
 
 
 def residual_change(slopes: np.ndarray, change: np.ndarray) -> np.ndarray:
-    """Return the linear change (S, R) of the wavefront residuals due to a change of the compensator moves (S, C).
+    """Return the linear change of the wavefront residuals due to a change of the compensator moves, (S, R).
 
-    ``slopes`` (S, R, C) are the derivatives of the residuals with respect to the moves. Array dimensions: S cameras, R
-    residuals, C compensators.
+    ``change`` (S, C) is the change of the moves and ``slopes`` (S, R, C) are the derivatives of the residuals with
+    respect to them, for S cameras, R residuals and C compensators.
     """
     return np.asarray((slopes @ change[..., None])[..., 0])
 
@@ -53,11 +53,11 @@ class Adjustments:
     Attributes
     ----------
     ranges : (C,) ndarray
-        Largest moves in either direction, SI; zero fixes a compensator.
+        Largest moves in either direction, SI units; zero fixes a compensator.
     steps : (C,) ndarray
-        Step sizes of the moves, SI; 0 for continuous moves.
+        Step sizes of the moves, SI units; 0 for continuous moves.
     accuracies : (C,) ndarray
-        Standard deviations of the moves, SI.
+        Standard deviations of the moves, SI units.
     slope : (R, C) ndarray
         Derivatives of the nominal camera's residuals with respect to the moves, waves per SI unit; 0 where the range is
         zero.
@@ -140,7 +140,7 @@ class Adjustments:
     def made(self, slopes: np.ndarray, residuals: np.ndarray, moves: np.ndarray, errors: np.ndarray) -> np.ndarray:
         """Return the moves as executed one after the other, in whole steps and with errors.
 
-        The later ones compensate the errors of the earlier.
+        Each move compensates the errors of those before it.
 
         Array dimensions: S cameras, R residuals, C compensators.
 
@@ -151,7 +151,7 @@ class Adjustments:
         residuals : (S, R) ndarray
             Wavefront residuals at ``moves``, waves.
         moves : (S, C) ndarray
-            Ideal moves, SI.
+            Ideal moves, SI units.
         errors : (S, C) ndarray
             Errors of the executed moves, in standard deviations.
         """
@@ -172,8 +172,7 @@ class Adjustments:
 
 
 SETTLED = 1e-3
-"""Rms wavefront error, waves, that a further step of the adjustments may still change in a camera that counts as
-converged.
+"""Largest change of a camera's rms wavefront error by a further adjustment step, waves, for it to count as converged.
 """
 MOST_STEPS = 12
 """Largest number of steps of the adjustments, three times as many as any camera of the library has needed."""
@@ -181,9 +180,9 @@ MOST_STEPS = 12
 FIRST_RULE, LARGEST_RULE = 3, 17
 """Wavelengths of the first and of the last rule over a spectrum."""
 EVERY = 4
-"""Spacing, in points of the line, of those at which distortion is evaluated."""
+"""Distortion is evaluated at every ``EVERY``-th of the points along the line."""
 _MOVE = 1e-3
-"""Step of the numerical derivatives with respect to compensators, as a share of their range."""
+"""Step of the numerical derivatives with respect to a compensator, as a fraction of its range."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -228,9 +227,9 @@ class AdjustedCameras:
 
 
 class ToleranceBench:
-    """Camera with its varied parameters, compensators and merits.
+    """Nominal camera of a tolerance budget, with its varied parameters, compensators and merits.
 
-    Array dimensions: F fields, C wavelengths.
+    It traces and adjusts perturbed cameras. Array dimensions: F fields, C wavelengths.
 
     Parameters
     ----------
@@ -307,7 +306,7 @@ class ToleranceBench:
         return test.camera or names[0]
 
     def _adjusts_before_stop(self) -> bool:
-        """Return True if adjustments move the light at the stop, so that rays have to be aimed again."""
+        """Return True if adjustments change the light before the stop, so that rays must be aimed at the stop again."""
         path = self.optics.path
         chain = [path.assembly.elements[name] for name in path.assembly.sequences[f"{path.name}/to_stop"]]
         bodies = {body for element in chain for body in (element.body, element.solid) if body is not None}
@@ -341,9 +340,7 @@ class ToleranceBench:
         return np.concatenate([np.sqrt(squares), mtfs])
 
     def _prepare_in(self, colours: np.ndarray, shares: np.ndarray) -> None:
-        """Compute what all cameras share, for given wavelengths.
-
-        Array dimensions: C wavelengths.
+        """Compute the data that all perturbed cameras share, for C wavelengths.
 
         Parameters
         ----------
@@ -464,7 +461,10 @@ class ToleranceBench:
         light = self.beams.light(states)
 
         def again(moved: Sequence[State], rows: np.ndarray) -> BeamLight:
-            """Trace adjusted cameras; rays keep their starting points unless an adjustment moves the stop's beam."""
+            """Trace cameras once more after an adjustment.
+
+            Rays keep their starting points unless the adjustment moves the beam at the stop.
+            """
             return self.beams.light(moved, None if self._moves_stop else light.aimed[rows])
 
         if np.any(self.ranges > 0.0):
@@ -604,7 +604,10 @@ class ToleranceBench:
         return out
 
     def _change(self, merit: Merit, line: dict[str, np.ndarray], light: BeamLight | None) -> np.ndarray:
-        """Return the parts of a merit that is a change from the nominal camera, of the line of sight or chief rays."""
+        """Return the parts of a merit that is a change of the line of sight or of chief rays.
+
+        The change is that from the nominal camera.
+        """
         if merit.spec.kind != "chief_ray":
             return line[merit.spec.kind]
         assert light is not None
@@ -668,9 +671,9 @@ class ToleranceBench:
 
     @cached_property
     def sizes(self) -> np.ndarray:
-        """SI amount of one unit of every varied parameter, (K,).
+        """SI amount of one unit of each of the K varied parameters, (K,).
 
-        Array dimensions: K varied parameters.
+        The unit is the limit of a tolerance, or the standard deviation of a figure term.
         """
         return np.array([number.size for number in self.numbers])
 
@@ -682,11 +685,9 @@ class ToleranceBench:
         return np.stack([merit.values(parts) for merit in self.merits], axis=-1)
 
     def worst_margins(self, values: np.ndarray) -> np.ndarray:
-        """Return the worst margin of each camera, (S,), from merits (S, M); infinite without light.
+        """Return the worst margin of each of S cameras, (S,), from M merits, (S, M); infinite without light.
 
-        A margin is the excess over the requirement in units of it, negative where it is met.
-
-        Array dimensions: S cameras, M merits.
+        A margin is the excess of a merit over its requirement, relative to the requirement; negative where it is met.
         """
         margins = np.stack([merit.margin(values[:, k]) for k, merit in enumerate(self.merits)])
         return np.asarray(np.where(np.isnan(margins), np.inf, margins).max(axis=0))

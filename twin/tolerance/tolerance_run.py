@@ -34,11 +34,11 @@ CONFIDENCE = 0.95
 WORST = 10
 """Number of the worst cameras that are written as jobs."""
 LEVELS = (0.5, 0.9, 0.95)
-"""Shares of cameras at which the quantiles of a merit are reported."""
+"""Fractions of cameras for which the quantiles of a merit are reported."""
 _MORE = 7919
 """Number added to the seed for the independent cameras that validate an allocation."""
 _NOTHING = 1e-15
-"""Size of a motion, in metres or radians, below which it is rounding error."""
+"""Amplitude of a motion, in metres or radians, below which it is rounding error."""
 EXACT = 4
 """Number of cameras in which the monitor's derivatives are traced exactly, to check the interpolated ones."""
 NEAR_MODEL = 0.05
@@ -51,7 +51,7 @@ number that varies, of a merit or compensator in the tables, and of a merit of t
 
 @dataclass(frozen=True)
 class Yield:
-    """Share of cameras that pass, with its confidence interval.
+    """Yield: fraction of cameras that pass, with its confidence interval.
 
     Attributes
     ----------
@@ -60,7 +60,7 @@ class Yield:
     of : int
         Number of all cameras.
     low, high : float
-        Clopper-Pearson limits of the share, at ``CONFIDENCE``.
+        Clopper-Pearson limits of the fraction, at ``CONFIDENCE``.
     """
 
     passed: int
@@ -70,10 +70,7 @@ class Yield:
 
     @classmethod
     def count(cls, passing: np.ndarray) -> Yield:
-        """Return the yield from whether each camera passes, (S,).
-
-        Array dimensions: S cameras.
-        """
+        """Return the yield of S cameras; ``passing`` (S,) is True for each that passes."""
         passed, total = int(np.sum(passing)), len(passing)
         return cls(passed, total, *proportion_interval(passed, total, CONFIDENCE))
 
@@ -89,26 +86,26 @@ class Yield:
 
 @dataclass(frozen=True, eq=False)
 class MeritResult:
-    """Distribution of a merit over all cameras.
+    """Distribution of a merit over all Monte Carlo cameras.
 
     Attributes
     ----------
     merit : Merit
         Merit whose distribution it is.
     nominal : float
-        Value of the nominal camera, adjusted, SI.
+        Value of the nominal camera, adjusted, SI units.
     mean, deviation : float
-        Mean and standard deviation over the cameras, SI.
+        Mean and standard deviation over the cameras, SI units.
     levels : tuple of float
-        Values that shares ``LEVELS`` of the cameras do not exceed (for an MTF: exceed), SI.
+        Values that the fractions ``LEVELS`` of the cameras do not exceed (for an MTF: exceed), SI units.
     linear, quadratic : tuple of float
-        Quantiles at ``LEVELS`` by the first-order and by the second-order model, SI.
+        Quantiles at ``LEVELS`` by the first-order and by the second-order model, SI units.
     passing : Yield
-        Share of cameras that meet the requirement.
+        Fraction of cameras that meet the requirement.
     model_passing : tuple of float
-        Share of cameras that meet the requirement, by the first-order and by the second-order model.
+        Fraction of cameras that meet the requirement, by the first-order and by the second-order model.
     shares : dict
-        Tolerance -> share of the merit's variance that vanishes without it, by the second-order model.
+        Tolerance -> fraction of the merit's variance that vanishes without it, by the second-order model.
     """
 
     merit: Merit
@@ -252,9 +249,9 @@ def run_tolerance(
 
 
 def _amounts(bench: ToleranceBench, samples: Samples, rows: np.ndarray) -> np.ndarray:
-    """Return the amounts of the parameters and the compensators of selected cameras, SI, (W, K).
+    """Return the amounts of the K parameters and compensators of W selected cameras, (W, K), SI units.
 
-    Array dimensions: W selected cameras, K varied parameters.
+    ``rows`` selects the cameras.
     """
     return np.concatenate([samples.x[rows] * bench.sizes, np.nan_to_num(samples.moves[rows])], axis=1)
 
@@ -291,7 +288,7 @@ def _require_light(setup: ToleranceSetup, sensitivity: Sensitivities) -> None:
 
 
 def with_limits(setup: ToleranceSetup, limits: Mapping[str, str | float]) -> ToleranceSetup:
-    """Return the budget with the given limits, by tolerance, instead of its own."""
+    """Return a budget with new tolerance limits, given by name, instead of its own."""
     entries = {
         name: tolerance.model_copy(update={"limit": limits.get(name, tolerance.limit)})
         for name, tolerance in setup.test.tolerances.items()
@@ -302,7 +299,7 @@ def with_limits(setup: ToleranceSetup, limits: Mapping[str, str | float]) -> Tol
 def _validated_yield(
     setup: ToleranceSetup, backend: Backend, allocation: Allocation, seed: int, force: Workforce, advance: Advance
 ) -> Yield:
-    """Return the yield of the allocated limits over independent cameras."""
+    """Return the yield of the allocated limits over new random cameras, independent of those of the allocation."""
     other = with_limits(setup, allocation.limits)
     bench = ToleranceBench(other, backend)
     drawn = draw_samples(other, bench, backend, setup.test.samples, seed + _MORE, force, "allocated", advance)

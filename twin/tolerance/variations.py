@@ -72,8 +72,8 @@ class VariedParameter:
     kind : str
         Kind of the motion.
     size : float
-        SI amount of one unit: the limit of a tolerance, 1 for a compensator, the standard deviation for a term of a
-        figure error.
+        Amount of one unit, in SI units: the limit of a tolerance, 1 for a compensator, the standard deviation for a
+        term of a figure error.
     moves : FrozenMap
         Path of a body -> its motion.
     """
@@ -206,7 +206,10 @@ class _Maker:
         return self.instrument.assembly.tree[path]
 
     def _heat(self, body: str, kind: str, axis: str, key: KeyPath, limit: float) -> FrozenMap[str, BodyMove]:
-        """Return each body's motion due to a change of temperature, per kelvin or K/m, between zero and the limit."""
+        """Return body -> its motion per kelvin or K/m of a temperature change.
+
+        It is the mean slope between zero and ``limit``.
+        """
         try:
             return heat_moves(self.thermal, self.instrument, body, kind, AXES.get(axis, 0), limit)
         except TemperatureError as error:
