@@ -1,6 +1,6 @@
 """Readings and events from tables, row by row, and from run folders.
 
-Readings that cannot be true are refused with a reason.
+Implausible readings are refused with a reason.
 """
 
 from __future__ import annotations
@@ -86,7 +86,7 @@ def run_entries(place: Path, kind: str, moment: int, history: History, assume_in
     history : History
         Record of the instrument in operation.
     assume_instrument : bool
-        Assume that a run which does not name its instrument is of the record's instrument.
+        True to assume that a run which does not name its instrument is of the record's instrument.
     """
     folder = place.parent if place.name in RESULTS.values() else place
     kind = kind or kind_of_run(folder)
@@ -166,7 +166,7 @@ def _run_readings(kind: str, data: Any, start: int, digest: str, frames: Mapping
 
 
 def _entry(kind: str, moment: int, content: Mapping[str, Any], origin: str) -> Entry:
-    """Return a reading whose size and numbers a record can hold. Raise Problem otherwise."""
+    """Return a reading as an entry; raise Problem if it is too large or has numbers that a record cannot store."""
     try:
         text = canonical(content)
     except ValueError:
@@ -181,7 +181,7 @@ LARGEST = 1 << 28
 MOST_DEPARTURE = 100.0
 """Largest plausible difference of a body's temperature from the instrument's, in kelvin.
 
-A job's changes of temperature have the same limit.
+It is also the limit for temperature changes in a job.
 """
 QUATERNION_TOLERANCE = 1e-3
 """Largest difference between a quaternion's length and 1 with which it is accepted."""
@@ -195,7 +195,7 @@ def read_telemetry(path: Path, history: History) -> TelemetrySpec:
     path : Path
         The YAML file.
     history : History
-        Record, for whose instrument the tables have to be.
+        Record; the tables must be for its instrument.
 
     Raises
     ------
@@ -321,7 +321,7 @@ def _keyword_items(
 
 
 def _entry_or_refusal(make: Callable[..., Entry], *of: Any) -> Entry | Refusal:
-    """Return the entry that a function makes, or its Problem as a refusal; the last argument is the line."""
+    """Return the entry that a function makes, or a refusal if it raises Problem; the last argument is the line."""
     try:
         return make(*of)
     except Problem as problem:
