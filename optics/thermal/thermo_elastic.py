@@ -313,9 +313,10 @@ class Kinematic:
         object.__setattr__(self, "points", points)
 
     def released(self, motion: np.ndarray) -> np.ndarray:
-        """Return the six components of displacement that this support holds at 0, metres, (6,).
+        """Return the six displacement components that the support holds at zero, metres, from those of its points.
 
-        ``motion`` (3, 3) are the displacements of its three points, metres.
+        They are those of point 0 in all directions, of point 1 perpendicular to the line from 0 to 1, and of point 2
+        perpendicular to the plane; ``motion`` (3, 3) are the displacements of the three points, metres.
         """
         along = self.points[1] - self.points[0]
         along = along / np.linalg.norm(along)

@@ -37,7 +37,9 @@ from optics.numerics.array_math import PhysicalError
 from optics.numerics.backend import cores, one_blas_thread
 
 MAX_POINTS = 256
-"""Largest number of grid points for one set of samples; longer grids are divided, since the work grows with the cube.
+"""Largest number of grid points whose field is interpolated from one set of samples; longer grids are divided.
+
+The work of computing the samples grows with the cube of the number of points.
 """
 
 _BEYOND, _BEYOND_IF_LOOSE = 4.0, 3.0
@@ -59,10 +61,13 @@ _BAND_RATIO = 1.1
 """Ratio of one bandwidth to the next in the geometric series of bandwidths for which sets of samples are computed."""
 
 _MAX_RATIO = 0.8
-"""Ratio of samples to points above which all points are used instead."""
+"""Ratio of samples to grid points above which the field is computed at all points instead."""
 
 _MAX_BAND = 2.5
-"""Largest band, radians from one point to the next; beyond it the points undersample the field."""
+"""Largest phase of the field's waves, radians from one grid point to the next, for which samples are used.
+
+Beyond it, the points undersample the field.
+"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,7 +87,7 @@ class FieldSamples:
 
     @property
     def count(self) -> int:
-        """Number of samples."""
+        """Number M of samples."""
         return self.weights.shape[1]
 
     @classmethod
@@ -157,7 +162,7 @@ class PupilField:
     wavelength: float
 
     def __getitem__(self, piece: slice) -> PupilField:
-        """Return the field of some of the images."""
+        """Return the field of some of the images, selected by a slice."""
         return PupilField(self.u[piece], self.v[piece], self.eikonal[piece], self.amplitude[piece], self.wavelength)
 
     def scaled_by(self, size: np.ndarray) -> PupilField:
@@ -378,13 +383,13 @@ _BLOCK_IMAGES = 2
 """Number of images whose wave tables are processed together: the tables should stay in the processor's cache."""
 
 _TABLES = 1 << 21
-"""Size of the wave tables of a block of nodes: memory does not grow with the number of nodes.
+"""Size, in numbers, of the tables of waves of a block of nodes, so that memory does not grow with the number of nodes.
 
 The order of the sums does not depend on it.
 """
 
 _NODES = 4096
-"""Number of nodes per block where the field is sampled."""
+"""Number of nodes of the pupil that are processed in one block where the field is computed at samples."""
 
 _BLOCK_SUM = 160
 """Number of nodes that are added up in one partial sum; the partial sums are then added.
@@ -457,10 +462,13 @@ def airy(radius: ArrayLike, wavelength: float, f_number: float, obscuration: flo
 
 
 FIT_ERROR = 1e-6
-"""Largest error of the matched transfer function; the kernel is enlarged until it is reached."""
+"""Largest accepted error of the kernel's transfer function; the kernel is enlarged until it is below."""
 
 MAX_REACH = 10
-"""Largest half-width of a kernel, in pixels: enough for three quarters of what pixels can sample."""
+"""Largest half-width of the pixel filter's kernel, in pixels.
+
+It suffices for images with frequencies up to three quarters of what the pixels can sample.
+"""
 
 
 class UnsampledImageError(PhysicalError, ValueError):

@@ -48,7 +48,7 @@ MOST_PIECES = 160
 """Largest number of polygons of a shadow: the time of a transfer function grows with the square of their number."""
 
 _WINDOW, _WINDOW_SIDES = 1.2, 16
-"""Radius and number of sides of the polygon about the unit disk to which outlines are clipped before projection."""
+"""Radius and number of corners of the polygon about the unit disk to which outlines are clipped, on the stop."""
 
 _STEPS, _CLOSE = 12, 1e-9
 """Largest number of Newton steps for a corner, and tolerance of its position in radii of the stop."""
@@ -73,7 +73,7 @@ class StopOutlines:
     blocked: tuple[np.ndarray, ...] = ()
 
     def __add__(self, other: StopOutlines) -> StopOutlines:
-        """Return the outlines of both together, as of the edges of two surfaces."""
+        """Return the outlines of both objects together, such as those of the edges of two surfaces."""
         return StopOutlines(self.clear + other.clear, self.blocked + other.blocked)
 
     def take(self, images: np.ndarray | slice) -> StopOutlines:
@@ -296,14 +296,16 @@ def _passes_all(edge: Edge, around: np.ndarray, bright: np.ndarray) -> bool:
 
 
 _BEAM_MARGIN = 1.1
-"""Scale of the beam about its middle within which a clear edge may block something: nodes do not reach the beam's edge.
+"""Factor by which the beam is enlarged about its middle to test whether an edge blocks some of it.
+
+The quadrature nodes that represent the beam do not reach its rim.
 """
 
 
 def _covers(edge: Edge, ring: Circle, terms: np.ndarray) -> bool:
-    """Return True when the disk within a ring's outer edge contains all of the stop in every image.
+    """Return True when the disk inside a ring's outer edge contains the whole beam in every image.
 
-    ``terms`` are the coefficients of the polynomials that map the stop to the surface.
+    ``terms`` are the coefficients of the polynomials that map a point of the stop to its ray's point on the surface.
     """
     disk = Edge(replace(ring, inner=0.0), edge.blocks, edge.rotation)
     (outline,), _ = next(_outlines(disk, ROUND_SIDES[0]))
@@ -392,7 +394,7 @@ def _divided(corners: np.ndarray) -> np.ndarray:
 
 
 _PARTS = 8
-"""Number of parts into which each side of a rectangle is divided."""
+"""Number of parts into which each side of a rectangle is divided, as it may be curved when projected onto the stop."""
 
 
 def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
@@ -486,7 +488,7 @@ def _outside(clear: list[np.ndarray], count: int) -> list[np.ndarray]:
 
 @dataclass(frozen=True, eq=False)
 class SurfaceEdges:
-    """Edges of a camera's surfaces as B images see them.
+    """Edges of a camera's surfaces, and where the rays of B images meet these surfaces.
 
     Attributes
     ----------
@@ -504,7 +506,7 @@ class SurfaceEdges:
 
     @cached_property
     def passed(self) -> list[np.ndarray]:
-        """Masks of the N rays of B images that come through all surfaces up to each one, (B, N) per surface."""
+        """Masks of the rays that no edge up to and including each surface blocks, (B, N) for N rays of B images."""
         through = [
             np.all([edge.passes(place[..., 0], place[..., 1]) for edge in self.edges[name]], axis=0)
             for name, place in self.places.items()

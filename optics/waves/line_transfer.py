@@ -37,19 +37,18 @@ from optics.waves.pupil_stack import EVEN_WEIGHT, PupilFunction
 from optics.waves.pupil_terms import polynomials, products, smooth_terms
 
 RIM_SIDES = 2048
-"""Number of sides of the polygon of equal area that represents the pupil's edge: within 4e-7 of it, inside and outside.
-"""
+"""Number of sides of the polygon of equal area that represents a pupil's own edge: within 4e-7 of it."""
 
 LINE_SIDES = 192
-"""Number of sides of the polygon of equal area that represents a round edge: within 1e-4 of its radius, on both sides.
-"""
+"""Number of sides of the polygon of equal area that represents another round edge: within 1e-4 of its radius."""
 
 LINES = (400, 720, 1440, 3240)
-"""Numbers of lines across the pupil, tried in this order until the error is small enough."""
+"""Numbers of lines across the pupil that are tried in turn until the transfer function's error is small enough."""
 
 CONVERGED = 1e-4
-"""Change of a transfer function from a third of the lines below which there are enough: the error is then a tenth of
-it.
+"""Largest change of a transfer function, if only a third of the lines is used, with which there are enough lines.
+
+Its error with all lines is then about a tenth of this change.
 """
 
 FEW_OUTLINES = 2
@@ -59,15 +58,16 @@ _MIN_LINES = 9
 """Smallest number of lines between two positions where outlines begin or end."""
 
 _CORNER = 0.3
-"""Smallest change of direction of an outline at a corner, radians; that of a round outline from side to side is
-smaller.
+"""Smallest change of direction between two sides of an outline that counts as a corner, radians.
+
+In polygons that represent round outlines it is smaller.
 """
 
 _SHORT_CELLS = 0.005, 0.04
 """Largest lengths of a cell, in radii of the pupil, with which one and two nodes suffice; longer cells get three."""
 
 _TURNS = 0.2
-"""Largest change of phase over a cell, radians, with which it gets no further node.
+"""Largest change of phase over a cell, radians, for which the cell gets no additional node.
 
 Near the cut-off there are few cells without an edge.
 """
@@ -76,11 +76,12 @@ _BLOCK_NODES = 2**14
 """Number of nodes processed in one block: some arrays of 200 kB that stay in the cache."""
 
 _APART = 1e-6
-"""Smallest distance of two positions between which there are lines, in radii of the pupil."""
+"""Smallest distance, in radii of the pupil, between two positions across the pupil for lines to be put between them."""
 
 _LONGEST_CELL = 0.06
-"""Largest length of a cell, in radii of the pupil: longer steps of a shift are several cells, so that the last one ends
-little beyond the pupil.
+"""Largest length of a cell, in radii of the pupil.
+
+A longer step of the shift is divided into several cells, so that the last cell ends little beyond the pupil.
 """
 
 
@@ -165,7 +166,10 @@ def vignetted_pupils(
 
 
 def unvignetted_at(cut: VignettedPupil, points: np.ndarray) -> np.ndarray:
-    """Return the mask of N points of the normalised pupil, complex (N,), that no edge except the pupil's own blocks."""
+    """Return the mask (N,) of N pupil points, complex, that no edge except the pupil's own blocks.
+
+    Points are in normalised coordinates, in which the pupil's edge is near the unit circle.
+    """
     out = np.ones(len(points), bool)
     for polygons, clear in ((cut.clear, True), (cut.blocked, False)):
         for polygon in polygons:
@@ -619,9 +623,9 @@ def _rest(position: np.ndarray, polynomials_of_rest: np.ndarray) -> np.ndarray:
 
 
 def _same_rows(row: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return all ordered pairs of items that have the same value in ``row``, as two arrays of indices.
+    """Return all ordered pairs of items with the same value in ``row``, as two arrays of item indices.
 
-    ``row`` (P,) is ascending, for P items.
+    ``row`` (P,) is ascending, for P items; an item is also paired with itself.
     """
     counts = np.bincount(row)
     start = np.cumsum(counts) - counts

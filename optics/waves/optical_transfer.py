@@ -145,7 +145,7 @@ def _band(wavelengths: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np.
 
 
 LEAST_ALONG = 8
-"""Number of nodes on the chords for a constant phase: the amplitude is nearly uniform."""
+"""Number of nodes along a chord of the overlap for a constant phase; it is small, as the amplitude is even."""
 
 MOST_NODES = 2**20
 """Largest number of nodes for one frequency.
@@ -155,7 +155,10 @@ merit of a few such frequencies would take a quarter of an hour.
 """
 
 LEAST_ACROSS = 13
-"""Number of nodes across the chords for a constant phase: their length varies like half a period of a sine."""
+"""Number of nodes across the chords of the overlap for a constant phase.
+
+The chords' length varies across them like half a period of a sine.
+"""
 
 
 def _correlate(
@@ -516,7 +519,7 @@ def _about(
 ) -> np.ndarray:
     """Return the transfer function at K wavelengths and normalised shifts of any shape, (K, *shape).
 
-    The phase of the image's centroid is removed; ``part`` selects the clear pupil or the shadow.
+    The phase due to the position of the image's centroid is removed; ``part`` selects the clear pupil or the shadow.
     """
     repeated = np.repeat(wavelengths, shift.size)
     values = _correlate(pupil, np.tile(shift.ravel(), len(wavelengths)), repeated, np.array([defocus]), part)

@@ -156,12 +156,12 @@ class CameraOptics:
 
     @property
     def model(self) -> CameraModel:
-        """Quantities derived from the prescription."""
+        """Quantities that the prescription implies, such as poses of surfaces and directions of fields."""
         return self.path.model
 
     @property
     def assembly(self) -> Assembly:
-        """Assembly that holds the camera."""
+        """Assembly of bodies and optical elements that contains the camera, for ray tracing."""
         return self.path.assembly
 
     @cached_property

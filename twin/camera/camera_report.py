@@ -26,7 +26,7 @@ _TABLE_TERMS = 15
 
 
 def camera_report(run: CameraRun) -> Report:
-    """Build the report of a camera analysis."""
+    """Build the report of a camera analysis: verdict, first-order data, layout, image quality over the field."""
     texts = refocus_text(run), built_text(run), perturbed_text(run)
     verdict_text, more = answer(*verdict(run), "see the wavefronts and the layout")
     sections = [
@@ -55,13 +55,13 @@ def _new_name(run: CameraRun) -> str:
 
 
 def _figure(name: str, title: str, caption: str, draw: Callable[..., Figure], *drawn: Any) -> SvgFigure:
-    """Draw a figure as SVG."""
+    """Return a figure of the report as SVG; the function ``draw`` draws it from the arguments ``drawn``."""
     with look(name):
         return SvgFigure(name, title, caption, to_svg(draw(*drawn)))
 
 
 def _first_order_text(run: CameraRun) -> str:
-    """Summarise the first-order data and the obscuration."""
+    """Return a sentence on focal length, F-number and other first-order data, and on the obscuration."""
     n, d = FIRST_ORDER(run.first_order), run.distortion
     blocked = ", ".join(f"{body} {100 * share:.1f}%" for body, share in n["obscuration"].items())
     unmodelled = unmodelled_obscuration(run.optics.model, run.first_order.obscuration)
@@ -75,7 +75,7 @@ def _first_order_text(run: CameraRun) -> str:
 
 
 def _facts(run: CameraRun) -> tuple[tuple[str, str], ...]:
-    """Return the facts about the camera for the head of the report, as pairs of label and text."""
+    """Return the head of the report as pairs of label and text: camera, description, mirrors, wavelength, fields."""
     spec = run.camera
     facts = [("Camera", spec.name)]
     if spec.description:

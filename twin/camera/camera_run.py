@@ -48,16 +48,16 @@ GRID: tuple[Field, ...] = tuple((x, y) for y in (1.0, 0.0, -1.0) for x in (-1.0,
 """Fields of wavefront maps and spot diagrams, row by row, as fractions of the half fields along line and track."""
 
 MTF_FIELDS: tuple[Field, ...] = ((0.0, 0.0), (0.7, 0.0), (1.0, 0.0), (1.0, 1.0), (1.0, -1.0))
-"""Fields at which MTF curves and the image quality through focus are computed."""
+"""Fields, in fractions of the half fields along line and track, of MTF curves and of image quality through focus."""
 
 ERROR_GRID = (25, 9)
-"""Number of fields along the line and along the track of the map of wavefront errors."""
+"""Number of fields along the line and along the track at which the map of rms wavefront errors is computed."""
 
 MAP_POINTS = 129
 """Number of points of a wavefront map along each axis of the stop."""
 
 QUALITY_FIELDS = (-1.0, 0.0, 1.0)
-"""Fractions of half the line at which obscuration by bodies of an instrument is computed."""
+"""Fields along the line, in fractions of half the line, at which obscuration by bodies of an instrument is computed."""
 
 
 @shows("errors_before [waves]", "errors_after [waves]", "tilt")
@@ -377,7 +377,7 @@ def perturbed_text(run: CameraRun) -> str:
 
 
 _LONG = re.compile(r"-?\d+\.\d{3,}(e-?\d+)?")
-"""Pattern of numbers with more digits than a sentence should have."""
+"""Pattern of numbers with three or more decimals, which are rounded in sentences."""
 _OF_THE_DRAWING = "First-order data refer to this state; layout and obscuration to the nominal camera."
 
 

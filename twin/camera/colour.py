@@ -34,10 +34,10 @@ FIRST_RULE = 5
 """Number of wavelengths of the first quadrature over the spectrum, which is refined if the MTF changes."""
 
 CURVE_POINTS = 21
-"""Number of wavelengths of curves over the spectrum, odd."""
+"""Number of wavelengths, odd, at which lateral and axial colour are computed over a band."""
 
 FOCUS_RINGS = 6
-"""Rings of the quadrature over the stop by which a focus is found."""
+"""Number of rings of the quadrature over the stop with which the best focus of a wavelength is found."""
 
 WINDOW, PSF_POINTS = 24.0, 129
 """Smallest side of a point image's window, in units of the longest wavelength times the F-number, and samples per side.
@@ -292,7 +292,7 @@ def spectral_psfs(
 
 
 def _sampled(pupil: PupilFunction, wavelength: float, half: float) -> PupilField:
-    """Sample a pupil as finely as its image up to ``half`` metres from the middle needs, without its shadows."""
+    """Sample a pupil, without shadows, densely enough for its image up to ``half`` metres from the middle."""
     aperture = 0.5 * float(np.max(pupil.cutoff(np.eye(2), 1.0)))
     nothing = np.zeros(1, complex)
     right, left, _ = pupil.edge.corners(nothing)

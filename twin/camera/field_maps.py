@@ -15,16 +15,16 @@ from twin.camera.camera_optics import CameraOptics, rim
 from twin.camera.camera_results import Field
 
 LINE_POINTS = 41
-"""Number of points along the line at which distortion is computed, as many as in the truth of the main job."""
+"""Number of points along the line CCD at which distortion is computed, as in the results of the main job."""
 
 GRID = (11, 5)
 """Number of fields along the line and along the track of distortion maps."""
 
 FOCUS_STEPS = 41
-"""Number of positions through focus, odd."""
+"""Number of positions of the detector through focus, odd."""
 
 FOCUS_DEPTHS = 3.0
-"""Range through focus to either side, in depths of focus 2 lambda F^2."""
+"""Largest defocus, to either side, in units of the depth of focus 2 lambda F^2."""
 
 
 @shows("distance [m]", "rms [um]", "largest [um]", "line_distance [m]", "line_largest [um]")

@@ -117,7 +117,7 @@ def _view(axes: Axes, model: CameraModel, backend: Backend, axis: int, first: fl
 
 
 def _label(axes: Axes, model: CameraModel, name: str, drawn: np.ndarray, axis: int) -> None:
-    """Write the name of a surface beside it."""
+    """Write the name of a surface beside its drawing."""
     text = "focal plane" if name == IMAGE else f"{name}, stop" if name == model.spec.stop else name
     # beyond the end that is farther from the axis; in the top view all ends are alike, and neighbours alternate
     turn = name == IMAGE or model.mirrors.index(name) == 0

@@ -35,19 +35,21 @@ AIM_TOLERANCE = 1e-8
 waves.
 """
 GRIDS = ((5, 8), (7, 10), (10, 14))
-"""Rings of the stop's quadrature and degree of the polynomials for the wavefront, the coarsest first."""
+"""Pairs of the number of quadrature rings of the stop and the degree of the wavefront's polynomials, the coarsest
+first.
+"""
 RESIDUAL = 1e-3
 """Largest accepted rms of a wavefront minus the polynomials fitted to it, waves."""
 
 
 class VignettedBeamError(UnphysicalError):
-    """Beams are vignetted by a surface that is neither the stop nor has edges."""
+    """Error: a beam is vignetted by a surface that is neither the stop nor has edges in its file."""
 
     allowed = "fields whose light is not vignetted"
 
 
 class RoughWavefrontError(UnphysicalError):
-    """Polynomials cannot represent the wavefronts."""
+    """Error: wavefronts are too irregular to be represented by polynomials over the pupil."""
 
     allowed = "a sharper camera, or fields where it is sharp"
 
@@ -142,7 +144,7 @@ class VariedBeams:
 
     @one_blas_thread()
     def _prepare(self) -> None:
-        """Trace the nominal camera with the coarsest grid whose polynomials represent its wavefronts."""
+        """Trace the nominal camera with the coarsest of ``GRIDS`` whose polynomials represent its wavefronts."""
         self.directions = self.optics.directions(self.fields)
         for rings, degree in GRIDS:
             self.nodes, self.degree = quadrature.disk(rings), degree
@@ -168,7 +170,7 @@ class VariedBeams:
         self.pieces = self.optics.path.shadows_on_stop({}, self.directions)[0]
 
     def _aim_nominal(self) -> None:
-        """Aim the rays of the nominal camera, from which all others are aimed."""
+        """Aim the rays of the nominal camera at the points of the stop; rays of other states start from these."""
         path = self.optics.path
         self.start = np.asarray(
             path.assembly.nominal_pose(f"{path.root}/{path.model.mirrors[0]}").translation
@@ -240,7 +242,7 @@ class VariedBeams:
         return np.repeat(np.arange(count * len(self._glass)), len(self.fields))
 
     def _fan_for(self, count: int) -> RayFan:
-        """Return the ray fan of all beams of ``count`` states."""
+        """Return the rays of all beams of ``count`` states with the two parameters by which each can be aimed."""
         times = count * len(self._glass)
 
         def tiled(array: np.ndarray) -> np.ndarray:

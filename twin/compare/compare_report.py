@@ -21,9 +21,9 @@ from twin.framework.run_folder import Manifest, finished_manifest
 from twin.framework.svg import BLUE, GREY, look, new_figure, plain_axes, signed_map, to_png, to_svg
 
 MOST_BARS = 30
-"""Largest number of changes in the figure, the most significant ones."""
+"""Largest number of changes in the bar chart, which shows the most significant ones."""
 _MOST_IMAGES = 8
-"""Largest number of images shown."""
+"""Largest number of differing images that the report shows."""
 
 
 def compare_report(comparison: Comparison) -> Report:
@@ -326,7 +326,10 @@ def _same_input(here: Leaf, there: Leaf) -> bool:
 
 
 def _same_number(one: NumberDifference, rtol: float, sigmas: float | None) -> bool:
-    """Return whether two results are equal within the tolerances."""
+    """Return whether two results are equal within a relative tolerance or within ``sigmas`` times their sigma.
+
+    With ``sigmas``, standard deviations themselves always count as equal.
+    """
     if sigmas is not None and is_sigma(one.key):
         return True
     if one.difference is None:  # if both are None, one file lacks the key
@@ -337,7 +340,7 @@ def _same_number(one: NumberDifference, rtol: float, sigmas: float | None) -> bo
 
 
 def _same_array(one: ArrayDifference, rtol: float) -> bool:
-    """Return whether two arrays are equal within the tolerance."""
+    """Return whether two arrays differ by at most ``rtol`` times the largest absolute value of the reference."""
     return one.finite and (one.largest or 0.0) <= rtol * (one.peak or 0.0)
 
 

@@ -48,7 +48,7 @@ The first key is used that all entries have with different values.
 NOISE = "noise"
 """Source of a sigma that is due to the images' noise alone, which more frames reduce."""
 _ARRAY_LENGTH = 12
-"""Length above which a list of numbers is compared as an array."""
+"""Number of entries above which a list of numbers is compared as an array and not number by number."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -159,7 +159,7 @@ class ArrayDifference:
 
     @property
     def finite(self) -> bool:
-        """True if the element that differs most is finite in both arrays."""
+        """True if the element that differs most has finite values in both arrays."""
         return self.largest is not None and math.isfinite(float(self.other or 0) - float(self.reference or 0))
 
 
@@ -348,9 +348,10 @@ def sigma_of(reference: Mapping[str, Leaf], other: Mapping[str, Leaf], key: str)
 
 
 def _quantity_kind(key: str) -> str:
-    """Return the name that all numbers of one kind share, such as all values of a table's column.
+    """Return the name that all numbers of one kind share, by which their common scale is found.
 
-    It is a table's column, or the last part of a key that is an identifier, such as ``zernike_waves`` of Zernike terms.
+    It is a table's column, or the last part of a key that is an identifier, such as ``zernike_waves`` for the Zernike
+    terms of a list.
     """
     if key.startswith("row "):
         return key.partition(", ")[2]
@@ -359,7 +360,7 @@ def _quantity_kind(key: str) -> str:
 
 
 _PLACE = re.compile(r"\[(?:\[[^\]]*\]|[^\[\]])*\]")
-"""Pattern of an index in a key after a list's name: the number of an entry, or its distinguishing name."""
+"""Pattern of an index in a key after a list's name: an entry's number in brackets, or the name that identifies it."""
 
 
 def _scales(*contents: Mapping[str, Leaf]) -> dict[str, float]:

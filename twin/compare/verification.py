@@ -79,9 +79,12 @@ PIXEL_SHARE, GREY_LEVELS = 1e-4, 2
 The expected photons of these pixels lie, within rounding, where the random number of photons changes by one.
 """
 PICTURE_LEVELS = 4
-"""Largest difference of drawn pictures, in grey levels of 255: edges are drawn by partly covered pixels."""
+"""Largest difference of rendered figures that counts as rounding, in grey levels of 255.
+
+Partly covered pixels along drawn edges may differ by so much.
+"""
 RELATIVE_OF_GEOMETRY = 1e-6
-"""Largest difference, relative to the peak, of geometry in single precision."""
+"""Largest difference of 3-D geometry in single precision that counts as rounding, relative to its largest value."""
 
 
 @dataclass(frozen=True)
@@ -242,7 +245,7 @@ def _short(value: Any) -> Leaf:
 
 
 class CannotRepeat(Exception):
-    """A run that cannot be repeated; the message gives the reason."""
+    """Error: a run cannot be repeated; the message gives the reason."""
 
 
 @dataclass(frozen=True)
@@ -274,7 +277,7 @@ class Repetition:
 
 
 def obstacle(state: FolderState) -> str:
-    """Return why a run cannot be repeated from its folder; empty if it can."""
+    """Return the reason why a run cannot be repeated from its folder; empty if it can be."""
     manifest = state.manifest
     if not manifest.again:
         return "it holds measurements that a test exported beside its run (--export); verify the run folder of the test"
@@ -504,7 +507,7 @@ class Verification:
         return out
 
     def numbers(self) -> dict[str, Any]:
-        """Return the verification as plain data, for ``--json``."""
+        """Return the verification as plain data, for the command's option ``--json``."""
         state, repetition = self.state, self.repetition
         manifest = state.manifest
         return {
@@ -558,7 +561,7 @@ class Verification:
 
 
 def _largest(files: Sequence[FileState]) -> str:
-    """Return the largest differences of numbers, relative and in sigma, in words."""
+    """Return a text with the largest differences of numbers, relative to their size and in sigmas."""
     numbers = [quantity for file in files if not file.drawn for quantity in file.quantities]
     relative = max((one.relative or 0.0 for one in numbers), default=0.0)
     in_sigma = max((one.in_sigma or 0.0 for one in numbers), default=0.0)

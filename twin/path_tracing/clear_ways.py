@@ -213,9 +213,9 @@ class ClearSegments:
 
 
 def _shortest(choices: Sequence[Sequence[Patch]]) -> list[Patch]:
-    """Choose one aperture of each event so that the line through their middles is shortest, as light does.
+    """Choose one clear aperture for each event of a path so that the line through the apertures' middles is shortest.
 
-    Return an empty list where an event has no aperture.
+    By Fermat's principle it is then the nominal path. The result is empty where an event has no aperture.
     """
     if not all(choices):
         return []
@@ -298,9 +298,10 @@ class _Obstacles:
         self.solids = [s.solid for s in surfaces]
 
     def leave_clear(self, start: Patch, end: Patch) -> bool:
-        """Return True if no other surface extends into the convex hull of two apertures' boxes.
+        """Return True if no other surface extends into the convex hull of the boxes about two apertures.
 
-        A convex glass body lies behind each of its faces, and the segment before it.
+        Faces of the glass bodies of the two apertures do not count: a convex body lies behind each of its faces, and so
+        does the segment if it is inside.
         """
         planes = ConvexHull(np.vstack([start.corners, end.corners])).equations
         away = self.corners @ planes[:, :3].T + planes[:, 3]
@@ -312,7 +313,7 @@ class _Obstacles:
 
 
 def _reaches(triangles: np.ndarray, planes: np.ndarray, margin: float) -> bool:
-    """Return True if any triangle comes closer than ``margin`` to the region inside all planes."""
+    """Return True if any triangle comes closer than ``margin`` metres to the convex region inside all planes."""
     away = triangles @ planes[:, :3].T + planes[:, 3] - margin
     for corners, levels in zip(triangles, away, strict=True):
         if np.any(np.min(levels, axis=0) > 0.0):

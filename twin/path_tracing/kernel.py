@@ -25,7 +25,7 @@ from twin.path_tracing.path_result import Accumulators, Arrival, record
 from twin.path_tracing.surface_intersection import Flight, Intersection, locate, next_surface
 
 STEP_BACK = 1e-5
-"""Distance behind a skipped triangle at which the search continues, in metres."""
+"""Distance behind a triangle hit by rounding only at which the search for the next surface continues, in metres."""
 
 STRAY, UNLIKELY, GONE = 1, 2, 8
 """Bits of a path's history, which tell whether it still behaves like its neighbours; a path with none of them does.

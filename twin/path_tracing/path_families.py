@@ -12,15 +12,18 @@ from scenes.models.scenery import Scenery
 
 
 class Event(IntEnum):
-    """Kind of event of a path at a surface; values from ``DIFFUSE`` on are stray light."""
+    """Kind of event of a path at a surface, such as reflected or scattered.
+
+    Values from ``DIFFUSE`` on are stray light.
+    """
 
     REFLECT = 0
     TRANSMIT = 1
     DIFFUSE = 2
     SCATTER = 3
-    """Scattered into the lobe around the reflected direction."""
+    """Path scattered into the lobe around the reflected direction."""
     SCATTER_THROUGH = 4
-    """Scattered into the lobe around the refracted direction."""
+    """Path scattered into the lobe around the refracted direction."""
 
 
 OUTSIDE = 8
@@ -58,12 +61,12 @@ def signature(codes: Iterable[int]) -> int:
 
 
 MARKS = {Event.REFLECT: "", Event.TRANSMIT: ">", Event.DIFFUSE: "~", Event.SCATTER: "*", Event.SCATTER_THROUGH: ">*"}
-"""Kind of event -> character after a surface's name in the text of a family; a reflection has none."""
+"""Kind of event -> character that follows a surface's name in the text of a path; a reflection has none."""
 
 
 @dataclass(frozen=True)
 class SurfaceEvent:
-    """Event of a family: the surface's name, the kind of event, and True if outside the surface's clear apertures."""
+    """Event of a path: name of the surface, kind of event, and True if outside the surface's clear apertures."""
 
     part: str
     event: Event
@@ -75,7 +78,7 @@ class SurfaceEvent:
 
 
 def nominal_codes(scenery: Scenery, assembly: Assembly, sequence: str) -> tuple[int, ...]:
-    """Return the codes of the events along a sequence of the assembly, up to the detector at its end.
+    """Return the events of light along a sequence of elements, up to the detector at its end, as numbers of ``code``.
 
     Elements that only mark a position are omitted.
 

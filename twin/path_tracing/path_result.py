@@ -58,7 +58,7 @@ class Accumulators:
 
     @property
     def arrays(self) -> list[Any]:
-        """All arrays that a launch writes to."""
+        """All arrays that a launch (group of paths traced together) writes to."""
         out = [self.absorbed, self.left, self.sums, self.images, self.counter, *self.records.values()]
         return out if self.log is None else [*out, self.log]
 
@@ -197,7 +197,7 @@ class Family:
 
     @property
     def text(self) -> str:
-        """Events of the family in one line."""
+        """Events of the family in one line: names of surfaces with a character for the kind of event."""
         return " ".join(str(t) for t in self.surface_events) or "(not identified)"
 
 
@@ -230,7 +230,10 @@ class Balance:
 
     @property
     def error(self) -> float:
-        """Missing power relative to the emitted power; 0 up to rounding unless roulette or floors are used."""
+        """Missing power relative to the emitted power.
+
+        It is 0 up to rounding, unless roulette or smallest probabilities of directions are used.
+        """
         total = sum(self.absorbed.values()) + sum(self.detected.values()) + self.escaped + self.under_way
         return float(total / self.emitted - 1.0)
 
@@ -291,11 +294,11 @@ class PathResult:
     detections: Detections
 
     def of(self, detector: str, kind: str) -> tuple[Family, ...]:
-        """Return the families of one kind at one detector, the strongest first."""
+        """Return the path families of one kind (nominal, ghost or stray) at one detector, the strongest first."""
         return tuple(f for f in self.families if f.detector == detector and f.kind == kind)
 
     def nominal(self, detector: str) -> Family:
-        """Return the nominal family of a detector.
+        """Return the nominal family of a detector: the paths that met the surfaces of nominal light in its order.
 
         Raises
         ------

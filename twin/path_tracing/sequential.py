@@ -100,7 +100,7 @@ class Step:
 
     @property
     def total(self) -> bool:
-        """True where light must be reflected totally in order to continue."""
+        """True where nominal light must be totally reflected to continue."""
         return self.event == Event.REFLECT and self.body > 0 and (self.finish.bare or self.finish.transmission > 0.0)
 
     @property
@@ -112,14 +112,14 @@ class Step:
 
     @property
     def absorbed(self) -> float:
-        """Share of the light that is absorbed, where it does not depend on the angle; shares below rounding are 0."""
+        """Fraction of the light that the surface absorbs, if it does not depend on the angle; 0 below rounding."""
         f = self.finish
         share = 0.0 if f.bare else 1.0 - f.reflectance - f.transmission - f.diffuse
         return share if share > 1e-15 else 0.0
 
     @property
     def ends(self) -> bool:
-        """True where all light is absorbed, so that every path ends."""
+        """True where the surface absorbs all light, so that every path ends there."""
         return self.absorbed == 1.0
 
     @property
@@ -198,7 +198,7 @@ class NominalPart:
 
     @property
     def arrays(self) -> list[Any]:
-        """All arrays to be evaluated."""
+        """All arrays of the paths, which Dr.Jit has to evaluate."""
         at = self.launch
         return [at.position, at.direction, at.weight, at.length, at.rng, self.passed, self.reason]
 
@@ -413,7 +413,7 @@ class OneSurface:
         return self._numbers(self.prepared.tables.rows, layout.ROW * surface + layout.CLEARANCE, 1)[0]
 
     def finish(self, row: Any, active: Any) -> list[Any]:
-        """Return reflectance, transmission, diffuse share and share of the lobe of the surface's finish.
+        """Return reflectance, transmission, and shares of diffused and of scattered light, of the surface's finish.
 
         Shares of 0 or 1 are constants of the kernel's code.
         """

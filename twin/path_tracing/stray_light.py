@@ -150,7 +150,7 @@ def pinhole(
 
 
 def _nominal_rays(instrument: Instrument, backend: Backend) -> AimedRays:
-    """Return the rays from every pinhole to its return face in the unperturbed instrument."""
+    """Return the rays from every pinhole to its return face (mirror that sends the light back), nominal instrument."""
     return MonitorPath(instrument, backend, quadrature.disk(AIM_RINGS)).nominal
 
 
@@ -245,10 +245,10 @@ def trace_stray(
 
 
 SPREAD_PX = 88
-"""Half-width of the diffraction image with which stray light is convolved, in pixels."""
+"""Half-width, in pixels, of the spot's diffraction image with which stray light is convolved."""
 
 FAMILIES = 20
-"""Number of families that are listed for each source, the strongest first."""
+"""Number of path families (paths with the same events) that are listed for each source, the strongest first."""
 
 GHOSTS = 1e-3
 """Ratio of ghost to spot light on a monitor's area CCD above which a warning is given.

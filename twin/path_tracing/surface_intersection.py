@@ -123,9 +123,9 @@ def next_surface(backend: Backend, mi: Any, scene: Any, tables: layout.SceneTabl
 
 
 def _end(backend: Backend, tables: layout.SceneTables, flight: Flight) -> tuple[Any, Any, list[Any]]:
-    """Return the distance to the ends of clear segments, a mask of the paths that can meet them, and the segments.
+    """Return approximate distances to the ends of clear segments, which paths can meet them, and the segments.
 
-    The distance is approximate, in metres.
+    A clear segment is a stretch of path with no surface in between. Distances are in metres.
     """
     import drjit as dr
 

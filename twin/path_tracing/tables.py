@@ -69,9 +69,10 @@ class FinishTables:
         return [self._get(self.marks, row * MARKS + k, active) for k in range(MARKS - 1)]
 
     def shares(self, marks: Sequence[Any], cosine: Any, active: Any) -> tuple[Any, Any]:
-        """Return reflectance and transmittance of the coatings that paths meet.
+        """Return reflectance and transmittance of the measured coatings that paths meet.
 
-        ``cosine`` is that of the angle between path and normal on the side of air.
+        ``marks`` are the numbers of their tables, and ``cosine`` is that of the angle between path and normal on the
+        side of air.
         """
         number, k, w = self._place(marks[0], cosine, fresnel_scatter.COATING_STEPS)
         first = 2 * ((fresnel_scatter.COATING_STEPS + 1) * number + k)
@@ -80,7 +81,7 @@ class FinishTables:
         return (1.0 - w) * low[0] + w * high[0], (1.0 - w) * low[1] + w * high[1]
 
     def total(self, marks: Sequence[Any], cosine: Any, active: Any) -> Any:
-        """Return the total integrated scatter of the tables, for paths that have one."""
+        """Return the total integrated scatter at each path's angle of incidence, for paths with a scatter table."""
         number, k, w = self._place(marks[1], cosine, fresnel_scatter.STEPS)
         has = active & (marks[1] > 0.5)
         first = self._uint(self._get(self.headers, _HEADER * number + 2, has)) + k
@@ -226,7 +227,7 @@ segment for each way of leaving the surface, 0 if there is none.
 
 CLEARANCE, INDEX, PART, INVERSE, APERTURES, KIND, SEGMENTS = 12, 13, 14, 15, 16, 26, 28
 KINDS = (20, 25, KIND)
-"""Positions in a surface's geometry numbers of those that encode a kind (of aperture, of surface)."""
+"""Positions, in a surface's row of the geometry table, of numbers that encode a kind (of aperture or of surface)."""
 
 CURVES = 2
 """Number of memory blocks that describe a curved surface: curvature, conic, and aspheric terms A4, A6, A8."""
@@ -253,7 +254,7 @@ ROWS_PER_SURFACE = 3
 """Number of finishes of a surface: met from +z, met from -z, outside its clear apertures."""
 
 SEGMENT = 8
-"""Count of numbers of a clear segment."""
+"""Count of numbers by which a clear segment is described, see ``segment_table``."""
 
 MOST_EVEN = 3
 MOST_BODIES = 255
@@ -264,7 +265,10 @@ NOMINAL_SUMS = 8
 
 
 class Kind:
-    """Bits of the number that encodes a surface's kind."""
+    """Bits of the number that describes a surface: face of a glass solid, ends at its clear apertures, curved.
+
+    Further bits hold the numbers of its glass body and of its detector.
+    """
 
     SOLID = 1
     ENDS = 2
@@ -302,7 +306,7 @@ class SurfaceForm:
 
     @classmethod
     def of(cls, surfaces: Sequence[SceneSurface]) -> SurfaceForm:
-        """Return the components that some surfaces need together."""
+        """Return the components of shape that at least one of the surfaces has."""
         shapes = [s.surface for s in surfaces]
         order = max((f.order for s in shapes if (f := s.zernike_figure) is not None), default=-1)
         grid = any(s.grid_figure is not None for s in shapes)
@@ -366,7 +370,7 @@ class SceneTables:
     measured: FinishTables | None = None
 
     def geometry(self, surface: Any, active: Any) -> list[Any]:
-        """Return the geometry of the surface that each path meets, ``ROW`` numbers."""
+        """Return the ``ROW`` numbers (pose, apertures, kind) of the surface that each path meets."""
         return self._row(self.rows, surface, BLOCKS, active)
 
     def surface(self, number: Any, form: SurfaceForm, active: Any) -> SurfaceNumbers:

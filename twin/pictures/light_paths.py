@@ -53,7 +53,7 @@ class Beam:
 
     @property
     def is_monitor(self) -> bool:
-        """True for a beam of the monitor."""
+        """True for a beam of the autocollimation monitor, False for an imaging beam."""
         return self.name.startswith("monitor/")
 
 
@@ -119,7 +119,7 @@ def _circle(radius: float) -> np.ndarray:
 
 
 def _radius(aperture: Aperture | None) -> float:
-    """Return the radius of the circle inscribed in an aperture, metres."""
+    """Return the radius of the largest circle inside an aperture about its centre, metres."""
     assert aperture is not None
     return aperture.inscribed
 

@@ -31,11 +31,11 @@ from twin.pictures.scene_file import build_scene
 VARIANTS = {"llvm": "llvm_ad_rgb", "cuda": "cuda_ad_rgb"}
 """Backend -> the colour variant of Mitsuba that its machine can run."""
 AT_ONCE = 4_000_000
-"""Number of paths per launch, between which the program can be interrupted."""
+"""Number of light paths that are traced at once; between these calls the program can be interrupted."""
 BRIGHTEST = 4.0
 """Radiance at which samples are clipped, so that single paths to a lamp through glass leave no white dots."""
 DEPTH = 14
-"""Largest number of path segments: light crosses two prisms and more."""
+"""Largest number of segments of a light path: light may cross two prisms and be reflected several times."""
 SOFT = 0.75
 """Half-width of the tent-shaped weight with which samples around a pixel's middle are averaged, in pixels."""
 
@@ -248,7 +248,10 @@ def displayed(light: np.ndarray) -> np.ndarray:
 
 
 def _patches(part: np.ndarray, normal: np.ndarray) -> np.ndarray:
-    """Return a number for every combination of part and surface direction, float32 (H, W); exact up to 16 000 parts."""
+    """Return a number for each pixel (H, W) that tells its part of the scene and its surface direction, float32.
+
+    Numbers are exact up to 16 000 parts.
+    """
     steps = np.rint(4.0 * normal).astype(int) + 5
     return (part * 1000 + steps @ np.array([1, 10, 100])).astype(np.float32)
 

@@ -69,7 +69,10 @@ class View:
 
 
 def looking(azimuth: float, elevation: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return forward, right and up of a camera at an azimuth (from +X toward +Y) and elevation, degrees."""
+    """Return the forward, right and up vectors of a camera that looks at the scene from a given direction.
+
+    ``azimuth`` is from +X toward +Y and ``elevation`` toward +Z, both in degrees.
+    """
     a, e = np.radians([azimuth, elevation])
     forward = -np.array([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)])
     right = np.cross(forward, [0.0, 0.0, 1.0])
@@ -113,7 +116,7 @@ def framed(
 
 
 SMOOTH = 0.35
-"""Angle below which an edge is a facet boundary of a curved surface, radians."""
+"""Angle between two facets, radians, below which their common edge is not drawn, as they belong to a curved surface."""
 BEAM_PIXELS, EDGE_PIXELS = 1.0, 0.55
 """Radius of drawn light beams and of drawn edges of glass, in picture pixels at the middle of the instrument."""
 GLOW = 1.3

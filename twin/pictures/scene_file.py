@@ -245,7 +245,7 @@ def _box(size: tuple[float, float, float], z: float) -> trimesh.Trimesh:
 
 
 def _painted(mesh: trimesh.Trimesh, material: PBRMaterial) -> trimesh.Trimesh:
-    """Return the mesh with a material."""
+    """Return the mesh, drawn with the given glTF material."""
     mesh.visual = trimesh.visual.TextureVisuals(material=material)
     return mesh
 

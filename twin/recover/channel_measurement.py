@@ -1,4 +1,4 @@
-"""Measurement of one channel: its frames are searched for artefacts and its spot is located in every state."""
+"""Measurement of one monitor channel: its frames are searched for artefacts, and its spot is located in every state."""
 
 from __future__ import annotations
 
@@ -38,7 +38,9 @@ from twin.framework.frame_store import mean_of, release_memory
 from twin.recover.measured_frames import ChannelFrames, StateFrames, cannot_measure
 
 _MOST_GROWTH = 4.0
-"""Factor by which missing pixels may increase the position's sigma before a spot counts as lost."""
+"""Largest factor by which missing pixels may increase the sigma of a spot's position; beyond it the spot counts as
+lost.
+"""
 _REMEDIES = (
     ("(saturation", "frames with less light or a shorter exposure"),
     (
@@ -115,7 +117,7 @@ class ChannelResult:
     after: tuple[SpotResult, ...]
 
     def states(self) -> tuple[tuple[str, SpotResult], ...]:
-        """Return name and result of each state; the name is before, after, or after with its number."""
+        """Return name and measured spot of each state: "before" and "after", or "after" with a number in a series."""
         many = len(self.after) > 1
         return (
             ("before", self.before),
@@ -181,7 +183,10 @@ class ChannelMeasurement:
         return self._templates[state.shape]
 
     def search(self) -> list[Issue]:
-        """Compare frames with each other and images with the spot's shape; return issues that forbid a measurement."""
+        """Search the frames for artefacts, by comparison with each other and with the spot's shape.
+
+        The result is the issues that make a measurement impossible.
+        """
         issues: list[Issue] = []
         try:
             self._show_level()
@@ -254,7 +259,7 @@ class ChannelMeasurement:
             self._noisy = True
 
     def _lost(self, state: StateFrames, error: SpotError, saturation: str = "") -> Issue:
-        """Return the issue of a spot that cannot be measured; saturated pixels are named first."""
+        """Return the issue of a spot that cannot be measured; if pixels are saturated, ``saturation`` says so first."""
         reason = "; ".join(error.reasons.values())
         if saturation:
             reason = f"too much of the spot is missing (saturation: {saturation}): {reason}"
@@ -416,7 +421,10 @@ class ChannelMeasurement:
         return self._centroid(screened.mean[None], screened.frames, self.channel.noise, state)
 
     def _repaired(self, examined: Examined, state: StateFrames) -> tuple[SpotPositions, float]:
-        """Return positions by a centroid that uses no shape, and the relative increase of sigma due to corrections."""
+        """Return positions by a centroid without a spot shape, and the relative increase of sigma due to corrections.
+
+        It is used for images whose artefacts were corrected.
+        """
         screened, noise, template = examined.screened, self.channel.noise, self._template(state)
 
         def measure(image: np.ndarray, own: NoiseModel) -> SpotPositions:

@@ -1,4 +1,4 @@
-"""Files of a measurement: reading the frames of every channel in every state, and checks of them."""
+"""Files of a measurement: reading and checking the frames of every monitor channel in every state."""
 
 from __future__ import annotations
 
@@ -214,7 +214,7 @@ class ChannelFrames:
 
     @property
     def states(self) -> tuple[StateFrames, ...]:
-        """The state before, then all states after."""
+        """Frames of the state before, then of all states after."""
         return (self.before, *self.after)
 
 
@@ -370,7 +370,7 @@ def _stacked(test: Spec, files: tuple[str, ...], key: KeyPath) -> np.ndarray:
 
 
 def _opened(test: Spec, file: str, key: KeyPath) -> ImageFile:
-    """Open an image file and read its header; only raw frames are allowed."""
+    """Open an image file and read its header; raise InputError unless it has raw grey values."""
     with _readable(test, file, key):
         image = ImageFile.open(Path(file), choose="")
         if image.header.orientation:
@@ -381,7 +381,7 @@ def _opened(test: Spec, file: str, key: KeyPath) -> ImageFile:
 
 
 def _pages(test: Spec, file: str, image: ImageFile, key: KeyPath) -> Iterator[np.ndarray]:
-    """Yield the frames of a file, and check that their grey values are in the range of a converter."""
+    """Yield the frames of an image file; raise InputError if grey values are beyond the range of any converter."""
     largest = 0.0
     with _readable(test, file, key):
         for page in image.pages():
@@ -457,7 +457,10 @@ def _check_values(test: Spec, state: StateFrames, detector: DetectorSpec) -> Non
 
 
 def _maps(test: MeasurementSpec, what: str, name: str, ccd: Shape, before: StateFrames) -> np.ndarray | None:
-    """Return dark or flat frames of a channel, of the whole CCD or of the part that the frames before show."""
+    """Return the dark or flat frames of a channel, for the whole CCD or the part that the frames before show.
+
+    ``what`` tells which of the two; the result is None if the measurement has none.
+    """
     given: Any = getattr(test, what)
     files = per_channel(given, name)
     if not files:

@@ -127,7 +127,7 @@ def _frames_text(run: RecoverRun) -> str:
 
 
 def _summary(run: RecoverRun) -> Table:
-    """Return the table of the changes by every estimator, with the sigma of the one that the verdict uses."""
+    """Return the table of the cameras' changes by every estimator, with the sigma of the one that the verdict uses."""
     reading = run.last
     heads = ["camera", "change", *(one.title for one in reading.estimators.values()), "σ", "σ of noise", "in σ"]
     rows: list[list[Cell]] = []
@@ -145,7 +145,7 @@ def _summary(run: RecoverRun) -> Table:
 
 
 def _spots(run: RecoverRun) -> Section:
-    """Return the section with artefacts, spot positions and figures."""
+    """Return the report's section with the frames' artefacts, the spots' positions and figures."""
     heads = ["channel", "state", "frames", "row [px]", "column [px]", "σ [px]", "artefacts", "increase of σ [%]"]
     rows: list[list[Cell]] = []
     for i, result in enumerate(run.channels):

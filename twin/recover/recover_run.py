@@ -86,7 +86,7 @@ class RecoverRun:
 
     @cached_property
     def worst(self) -> tuple[int, Consistency] | None:
-        """Index of the state whose spot shifts agree least with the prior, and its chi-square test.
+        """Number (from 0) of the state whose spot shifts agree least with the prior, and its chi-square test.
 
         None without a prior.
         """
@@ -128,7 +128,7 @@ class _Calibrated:
 
     @property
     def motions(self) -> Mapping[str, MotionModel] | None:
-        """Estimator -> motions of bodies that it estimates; None without a model of the instrument."""
+        """Estimator -> motions of bodies that it estimates; None for an instrument without an optical model."""
         return None if self.experiment is None else self.experiment.motion_models
 
     def crosstalk(self, recovery: Recovery) -> Mapping[str, CameraCrosstalk]:
@@ -278,7 +278,7 @@ def _measured(
 def _recover_clean(
     setup: MeasurementSetup, bench: _Calibrated, calibration: MonitorCalibration, channels: Sequence[ChannelFrames]
 ) -> tuple[list[Recovery], SmoothedCourse | None]:
-    """Estimate the changes from frames without artefacts, with the same computation and batches as the main job."""
+    """Estimate the changes from frames without artefacts, by the same computation in the same batches as the main job."""
     states, count = len(channels[0].after), len(channels[0].after[0].frames)
     centroid = setup.test.analysis.centroid
 

@@ -134,7 +134,7 @@ class _Bench:
         return MonitorExperiment(self._resolved, self.backend)
 
     def stating(self, resolved: ResolvedJob) -> _Bench:
-        """Return the model of the same instrument with another disturbance prior."""
+        """Return the model of the same instrument with the disturbance prior of the job ``resolved``."""
         return _Bench(resolved, self._name, self)
 
 
@@ -496,7 +496,7 @@ def load(
 
 
 def _load(what: str | Path, backend: str) -> InstrumentTwin:
-    """Load an instrument with the disturbance prior that its own file names."""
+    """Load an instrument with the disturbance prior that its file names."""
     text = str(what)
     if text not in library_names(INSTRUMENTS) or isinstance(what, Path):
         data = read_yaml(what).data if isinstance(what, Path) or "/" in text or text.endswith((".yaml", ".yml")) else {}

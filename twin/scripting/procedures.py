@@ -55,7 +55,7 @@ class TestResult:
 
     @property
     def summary(self) -> pd.DataFrame:
-        """Main table of the report, as a data frame."""
+        """Main table of the test's report, as a data frame."""
         table = self.report.summary
         return pd.DataFrame([[cell_text(cell) for cell in row] for row in table.shown()], columns=list(table.heads))
 

@@ -235,7 +235,7 @@ class Found:
         return table
 
     def _row(self, true: float, readings: xr.DataArray, sigma: xr.DataArray, noise: xr.DataArray) -> dict[str, float]:
-        """Return one row of ``compare``: true value, readings, sigmas, error and error in sigmas of one quantity."""
+        """Return one row of ``compare``: true value, estimates, sigmas, and error of one quantity also in sigmas."""
         values = {str(name): float(readings.sel(estimator=name)) for name in readings.estimator.values}
         spread, error = float(sigma.sel(estimator=self.judged)), values[self.judged] - true
         noise_sigma = float(noise.sel(estimator=self.judged))
@@ -308,7 +308,7 @@ def shot_of(run: JobRun, backend: Backend, started: float) -> Shot:
 
 
 def _truth(run: JobRun) -> xr.Dataset:
-    """Return the true changes of the cameras in a run, as the dataset ``Shot.truth``."""
+    """Return the true changes of the cameras in a run as a data set, the content of ``Shot.truth``."""
     truth = run.truth_dict()
     cameras = truth["cameras"]
     keys = list(next(iter(cameras.values())))
@@ -360,7 +360,7 @@ def found_table(reading: MonitorReading, warnings: Sequence[str] = ()) -> Found:
         return xr.DataArray(np.array(blocks), dims=(*dims, "parameter_2"), coords=both)
 
     def by_estimator(group: str) -> xr.Dataset:
-        """Return the quantities of a group ("angle" or "ground") with their sigmas, by estimator."""
+        """Return the quantities of a group ("angle" or "ground") with their sigmas, for each estimator."""
         data: dict[str, list[float]] = {}
         for row in table:
             if row.group == group:

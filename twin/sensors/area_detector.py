@@ -43,7 +43,7 @@ from twin.sensors.poisson_numbers import poisson_pieces
 
 
 class NoiseTerm(FurtherNoise, Protocol):
-    """Noise term added to the electrons of a pixel after clipping at the well and before digitisation.
+    """Interface of noise added to the electrons of a pixel after clipping at the full well and before digitisation.
 
     It is independent from pixel to pixel and has mean zero; its variances are those of ``FurtherNoise``.
     """
@@ -271,7 +271,7 @@ class EmvaDetector:
 
     @cached_property
     def _sheet(self) -> DetectorSpec:
-        """Data sheet with this detector's numbers, which checks their limits and derives further numbers."""
+        """Data sheet with this detector's numbers, which checks their limits and derives others from them."""
         return DetectorSpec.model_validate({"name": "detector", **self._numbers()})
 
     def _numbers(self) -> dict[str, Any]:
@@ -290,7 +290,7 @@ class EmvaDetector:
         return self._sheet.saturation_dn
 
     def noise_model(self, exposure_s: float) -> NoiseModel:
-        """Return the noise model for the analysis, for frames of exposure_s seconds."""
+        """Return the model of noise as a function of signal, for the analysis of frames of ``exposure_s`` seconds."""
         return NoiseModel(
             gain_dn_per_e=self.system_gain_dn_per_e,
             dark_noise_e=self.dark_noise_e,
@@ -507,7 +507,7 @@ class EmvaDetector:
 
 
 def _streams(seed: Seed | Sequence[Seed], lead: tuple[int, ...]) -> list[np.random.SeedSequence]:
-    """Return the random stream of each image; ``lead`` is the shape of the array of images."""
+    """Return the random stream of each image in an array of images with the shape ``lead``."""
     if not isinstance(seed, Sequence):
         root = _sequence(seed)
         return [stream(root, number) for number in range(math.prod(lead))]
@@ -517,7 +517,7 @@ def _streams(seed: Seed | Sequence[Seed], lead: tuple[int, ...]) -> list[np.rand
 
 
 def _sequence(seed: Seed) -> np.random.SeedSequence:
-    """Return a seed as a SeedSequence, or raise ValueError."""
+    """Return a seed as NumPy's SeedSequence; raise ValueError if it is not a seed."""
     if isinstance(seed, np.random.SeedSequence):
         return seed
     if isinstance(seed, bool) or not isinstance(seed, (int, np.integer)) or seed < 0:
@@ -526,14 +526,17 @@ def _sequence(seed: Seed) -> np.random.SeedSequence:
 
 
 def _exposure(exposure_s: float) -> float:
-    """Return an exposure time, or raise ValueError if it is out of range."""
+    """Return an exposure time in seconds; raise ValueError if it is outside 0 to 1e6 s."""
     if not (math.isfinite(exposure_s) and 0 <= exposure_s <= 1e6):
         raise ValueError(f"detector: exposure_s must be in [0, 1e6] s, found {exposure_s!r}")
     return float(exposure_s)
 
 
 def _photons(photons: ArrayLike) -> NDArray[np.float64]:
-    """Return photons as float64, or raise ValueError or UnphysicalError if they are out of range."""
+    """Return expected photons as float64; raise an error if they are negative, not finite or too many.
+
+    The error is UnphysicalError for too many photons, else ValueError.
+    """
     light = np.asarray(photons, dtype=np.float64)
     if light.ndim < 2 or light.size == 0:
         raise ValueError(f"detector: photons must be (..., H, W), found shape {light.shape}")

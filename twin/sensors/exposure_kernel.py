@@ -47,8 +47,9 @@ For fewer, the transfer to the kernels takes as long as the work without them.
 """
 
 _TOGETHER = 1 << 20
-"""Random numbers drawn and read out at once; their words and normal numbers take 16 MiB, and as much again while the
-next ones are drawn.
+"""Count of random numbers that are drawn and read out at once.
+
+Their words and normal numbers take 16 MiB, and as much again while the next ones are drawn.
 """
 
 _MOST_KEPT = 1 << 22
@@ -196,7 +197,10 @@ class _Numbers:
 
     @classmethod
     def room(cls, frames: int, pixels: int, noisy: bool) -> _Numbers:
-        """Allocate memory for the random numbers of a number of frames of all pixels of a group."""
+        """Return memory for the random numbers of ``frames`` frames of ``pixels`` pixels.
+
+        ``noisy`` is True if there is read noise, for which normal numbers are needed.
+        """
         lanes = -(-pixels // _LANES) * _LANES
         mean, shift = _aligned(np.float64, 2, lanes)
         normals = _aligned(np.float64, frames, lanes) if noisy else None
@@ -255,7 +259,7 @@ _Key = tuple[str, tuple[int, ...], int]
 
 
 def _key(stream: np.random.SeedSequence) -> _Key:
-    """Return a key that is equal for streams with the same numbers."""
+    """Return a key that is equal for random streams that give the same numbers."""
     return str(stream.entropy), tuple(stream.spawn_key), stream.pool_size
 
 
@@ -269,7 +273,7 @@ def _shared_numbers(streams: Sequence[np.random.SeedSequence], most: int) -> dic
 
 
 class _Group:
-    """Images whose frames are drawn together, with their streams."""
+    """Group of images whose frames are exposed together by one call of a kernel, with their random streams."""
 
     def __init__(
         self,
@@ -308,12 +312,13 @@ class _Group:
     def _drawn(
         self, numbers: _Numbers, image: int, count: int, before: Future[np.ndarray | None] | None
     ) -> np.ndarray | None:
-        """Draw the random numbers of an image.
+        """Draw the random numbers of an image for ``count`` frames, after those of ``before``.
 
         Returns
         -------
         (count, huge) ndarray | None
-            Poisson numbers of huge means; None if there are none.
+            Poisson numbers of the pixels with means from ``poisson_numbers.SERIES_END`` on, which kernels do not
+            compute; None if there are none.
         """
         if before is not None:
             before.result()  # another thread may still draw the image's previous frames from the same streams
@@ -371,7 +376,10 @@ class _Drawn:
                 self._put(frame, image * group.pixels + which[lane], huge_numbers.astype(np.float64).reshape(-1))
 
     def _put(self, frame: np.ndarray, lane: np.ndarray, electrons: np.ndarray) -> None:
-        """Convert electrons to grey values and write them into some pixels of some frames."""
+        """Write the grey values of given electrons into some pixels of some frames.
+
+        ``frame`` and ``lane`` are the frame, and the entry of the kernels' arrays, of each pixel.
+        """
         numbers, how = self.numbers, self.group.how
         noise = [] if numbers.normals is None else [numbers.normals[frame, lane] * how.sigma_e]
         image, pixel = np.divmod(lane, self.group.pixels)
@@ -563,9 +571,9 @@ def _compared(
 
 
 def _by_series(mean: Any, word: Any) -> tuple[Any, Any]:
-    """Return Poisson quantiles of means from ``TABLE_END`` on, and whether each is uncertain.
+    """Return Poisson quantiles of means from ``TABLE_END`` on by Giles' expansion, and whether each is uncertain.
 
-    The method is Giles' expansion of the quantile for large means.
+    A quantile is uncertain if a whole number lies within the error bound of the expansion.
     """
     import drjit as dr
     from drjit.llvm import Float32, Float64

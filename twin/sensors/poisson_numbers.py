@@ -31,17 +31,17 @@ import numpy as np
 from scipy.special import gammainc, gammaincc, ndtri
 
 TABLE_END = 32.0
-"""Smallest mean for which no table of quantiles is used."""
+"""Mean below which Poisson quantiles are taken from a table."""
 SERIES_END = 65536.0
-"""Smallest mean for which NumPy's own generator is used.
+"""Mean below which Poisson quantiles are computed by Giles' expansion; above, NumPy's generator draws the numbers.
 
 SciPy's incomplete gamma functions keep full precision in the tails up to means of 1e5.
 """
 
 CELLS_PER_UNIT = 32
-"""Cells of the table per unit of the mean, in electrons."""
+"""Number of cells of the table of quantiles per unit of the mean (one electron)."""
 TABLE_BITS = 10
-"""Number of bits of u that select a cell of the table."""
+"""Number of bits of the uniform number u that select a cell of the table of quantiles."""
 _SHIFT = np.uint64(64 - TABLE_BITS)
 MOST_IN_TABLE = 120
 """Count of whole numbers, from 0, for which the table has the distribution function.
@@ -297,7 +297,9 @@ class _Plan:
         return cls(mean, row, np.flatnonzero((mean >= TABLE_END) & (mean < SERIES_END)))
 
     def fill(self, out: np.ndarray, word: np.ndarray) -> None:
-        """Write quantiles of words (K, N) into ``out``; entries of means beyond ``SERIES_END`` are meaningless.
+        """Write the Poisson quantiles of random words (K, N) into ``out``.
+
+        Entries of means from ``SERIES_END`` on are meaningless.
 
         Dimensions: K draws, N means.
         """

@@ -43,7 +43,7 @@ WORST_CHANGE = 5e-4
 """Largest accepted change of an MTF when more wavelengths are used in the quadrature over the band."""
 
 LARGEST_RULE = 65
-"""Number of wavelengths of the finest quadrature rule over a band; if the MTF still changes there, it is an error."""
+"""Number of wavelengths of the finest quadrature over a band; an MTF that still changes there raises an error."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -154,7 +154,7 @@ EDGE_RUNS: Mapping[str, Literal["x", "y"]] = {ALONG: "y", TRACK: "x"}
 """Direction in which the MTF is measured -> axis of the image (x or y) along which the measured knife edge runs."""
 
 FREQUENCIES = 97
-"""Number of samples of a transfer function from frequency 0 to the cut-off."""
+"""Number of frequencies, from 0 to the cut-off, at which the transfer function along an edge's normal is sampled."""
 
 DEFOCUS_STEP = 25e-6
 """Step in defocus of the table of transfer functions, in metres.
@@ -164,7 +164,7 @@ ten samples per cycle are accurate to 2e-4.
 """
 
 TABLE_REACH = 0.6e-3
-"""Largest absolute defocus of the table of transfer functions, in metres; images beyond it are computed singly."""
+"""Largest absolute defocus of the table of transfer functions, in metres; beyond it they are computed one by one."""
 
 
 def knife_edge(direction: str, angle: float) -> HalfPlane:
@@ -251,9 +251,15 @@ def _samples(light: BandPupils, normal: np.ndarray, cutoff: float, defocus: np.n
 
 
 _ROUND_CUTOFF = 10e3
-"""Step to which cut-off frequencies are rounded up, in cycles/m."""
+"""Step, in cycles/m, to which cut-off frequencies are rounded up.
+
+All positions in a band's field then share one sampling of the edge profile.
+"""
 _ROUND_REACH = 4.0
-"""Step to which the extents of computed images are rounded up, in pixels."""
+"""Step, in pixels, to which the extents of edge profiles are rounded up.
+
+All positions in a band's field then share one sampling of the edge profile.
+"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -275,7 +281,10 @@ class EdgeImager:
     region: int
 
     def transfer(self, defocus: float, frequency: np.ndarray) -> np.ndarray:
-        """Return the complex transfer function of optics, pixel, diffusion and TDI along the edge's normal."""
+        """Return the complex transfer function of optics, pixel, charge diffusion and TDI along the edge's normal.
+
+        ``defocus`` is in metres and ``frequency`` in cycles/m.
+        """
         x, y = self.optics.normal
         return self.optics.at(defocus, frequency) * self.ccd.transfer(frequency * x, frequency * y)
 
@@ -323,7 +332,7 @@ pixels.
 """
 
 BAR_SHARE = 0.45
-"""Side of the bar group, as a fraction of the region's side."""
+"""Side of the bar group's image relative to the side of the window."""
 
 CLEARANCE = 6.0
 """Margin between the border of the bar group and the part of it that is measured, in pixels."""
@@ -460,7 +469,7 @@ class BarDesign:
         return cls(target, frequency, nominal, (sides, sides))
 
     def seen(self, view: View) -> np.ndarray:
-        """Return the bars' frequency vector (along, across) in the image of a view, in cycles/m."""
+        """Return the frequency vector (along, across) that the bars have in the image of a view, in cycles/m."""
         return np.asarray(np.linalg.solve(view.local.jacobian.T, self.frequency))
 
     @property
@@ -507,7 +516,7 @@ class TargetCamera:
         self.directions = path.directions(self.places)
 
     def views(self, state: State) -> dict[str, View]:
-        """Return the view of every position on the line (left, centre, right) in a state of the camera.
+        """Return name of each position on the line (left, centre, right) -> its view in a state of the camera.
 
         Raises
         ------
@@ -524,9 +533,9 @@ class TargetCamera:
         return {name: self._view(name, hits[i], self.places[i], lights[i], maps[i]) for i, name in enumerate(PLACES)}
 
     def _lights(self, state: State, hits: np.ndarray, count: int | None = None) -> list[BandPupils]:
-        """Return the pupils of every position in the band's light.
+        """Return the pupil functions of every position on the line at the wavelengths of the camera's band.
 
-        With lenses there is one pupil for each of ``count`` wavelengths, or of the number that the MTF needs.
+        With lenses there is one pupil for each of ``count`` wavelengths, or of as many as the MTF needs.
         """
         band = self.ccd.band
         if not lenses(self.path.model.spec):

@@ -192,7 +192,10 @@ class TargetRun:
     obstruction: bool = True
 
     def images(self) -> Iterator[tuple[str, str, np.ndarray, FrameFacts]]:
-        """Yield every image: stem of its file, name, N frames (N, H, W) and their description."""
+        """Yield every image: its file name without suffix, target, N frames (N, H, W) and description.
+
+        Frames have H rows and W columns.
+        """
         for camera, targets_of_camera in self.cameras.items():
             for place, targets in targets_of_camera.places.items():
                 for when, shots in targets.shots.items():
@@ -206,7 +209,7 @@ class TargetRun:
 
     @property
     def has_edges(self) -> bool:
-        """True if there are MTF curves of knife edges."""
+        """True if knife edges were rendered, so that there are MTF curves."""
         return any(place.before.edges for camera in self.cameras.values() for place in camera.places.values())
 
     @property
@@ -312,7 +315,7 @@ _PATTERN, _EXPOSURE = 3, 4
 
 
 def target_pixels(resolved: ResolvedJob) -> int:
-    """Return the number of pixels of all frames of a job's test targets, before and after.
+    """Return the number of pixels of all frames of a job's test targets, before and after the perturbation.
 
     Parameters
     ----------
@@ -440,7 +443,7 @@ def render_targets(
 
 
 class _TargetRecorder:
-    """Recorder of the images of all targets at one position."""
+    """Renders, exposes and measures all test targets at one position on a line CCD."""
 
     def __init__(
         self, settings: TargetsSpec, frames: int, images: tuple[str, ...], nominal: View, pattern: FixedPattern

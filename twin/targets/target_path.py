@@ -43,8 +43,7 @@ Integrals are exact for wavefronts to degree 55, far beyond those of mirrors and
 """
 
 MORE_RINGS = 28
-"""Number of rings of the quadrature for a vignetted pupil whose wavefront is not described by polynomials fitted to
-fewer rays.
+"""Number of rings of the pupil's quadrature if polynomials fitted to fewer rays do not describe a vignetted wavefront.
 """
 
 SMOOTH = 1e-6
@@ -117,7 +116,7 @@ class LineRays:
 
 
 def _monomials(q: np.ndarray) -> np.ndarray:
-    """Return the monomials of two scaled target coordinates, of which the local mapping is a polynomial."""
+    """Return all monomials, to the degree ``MAP_ORDER``, of two scaled target coordinates, for the local mapping."""
     powers = [(a - b, b) for a in range(MAP_ORDER + 1) for b in range(a + 1)]
     return np.stack([q[..., 0] ** a * q[..., 1] ** b for a, b in powers], axis=-1)
 
@@ -168,10 +167,10 @@ class TargetPath:
 
     @property
     def target_distance(self) -> float:
-        """Distance that converts target coordinates to angles, in metres.
+        """Distance by which target coordinates are divided to obtain tangents of angles, in metres.
 
-        It is the collimator's focal length, or the principal distance of the camera along its line, so that a distant
-        target is measured on the image.
+        It is the collimator's focal length. Without a collimator it is the principal distance of the camera along its
+        line, so that coordinates of a distant target are those of its nominal image.
         """
         return self.model.line_principal_distance if self.collimator is None else self.collimator.focal_length
 
