@@ -86,7 +86,8 @@ class PupilShadow:
         polygons : (B, K, V, 2) ndarray
             K polygons of V corners in the pupil planes, which do not overlap.
         harmonics : (2H + 1, B) ndarray
-            Complex harmonics, of orders -H to H, of the pupils' edges.
+            Complex coefficients c_n, n = -H to H, of the edges' points sum c_n exp(i n a), with a the angle on the
+            stop's rim.
         rim_sides : int
             Number of sides of the polygon that represents an edge.
         """
@@ -377,8 +378,8 @@ def tiled(pieces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def edge_radius(harmonics: np.ndarray) -> np.ndarray:
     """Return the K Fourier terms (B, K) of the radius of B edges, as a function of the angle about the origin.
 
-    The radius is the real part of the sum of c_k exp(i k angle) with these terms c_k; ``harmonics`` are those of the
-    edges.
+    The radius is the real part of the sum of c_k exp(i k angle) with these terms c_k. ``harmonics`` (2H + 1, B) are the
+    coefficients d_n, n = -H to H, of the edges' points sum d_n exp(i n a), with a the angle on the stop's rim.
     """
     last = len(harmonics) // 2
     order = np.abs(np.arange(-last, last + 1))

@@ -110,7 +110,8 @@ class PupilStack:
     axes : (B, 2, 2) ndarray
         Derivatives of (u, v) with respect to (x, y).
     harmonics : (2H + 1, B) ndarray
-        Complex harmonics, of orders -H to H, of the edges in p.
+        Complex coefficients c_n, n = -H to H, of the edges' points p = sum c_n exp(i n a), with a the angle on the
+        stop's rim.
     eikonal_terms, amplitude_terms : (B, D + 1, D + 1) ndarray
         Coefficients of the products T_i(x) T_j(y) of Chebyshev polynomials to degree D: of the eikonal, metres, and of
         the amplitude density (unit power: its square integrates to 1 over du dv).
@@ -266,8 +267,8 @@ class PupilStack:
     def bend(self) -> np.ndarray:
         """Departure of each of B edges from an ellipse, (B,), in units of the pupil's radius.
 
-        It is the sum of the moduli of the edge's harmonics, each times the square of its order. ``transfer`` allows at
-        most ``optics.waves.pupil_terms.WORST_BEND``.
+        It is the sum of n^2 |c_n| over the edge's harmonics c_n, n their order. ``transfer`` allows at most
+        ``optics.waves.pupil_terms.WORST_BEND``.
         """
         last = len(self.harmonics) // 2
         return np.asarray(np.arange(-last, last + 1) ** 2 @ np.abs(self.harmonics) - 1.0)
@@ -466,7 +467,8 @@ def clear_power(harmonics: np.ndarray, amplitude_terms: np.ndarray) -> np.ndarra
     Parameters
     ----------
     harmonics : (2H + 1, B) ndarray
-        Complex harmonics, of orders -H to H, of their edges.
+        Complex coefficients c_n, n = -H to H, of the edges' points sum c_n exp(i n a), with a the angle on the stop's
+        rim.
     amplitude_terms : (B, D + 1, D + 1) ndarray
         Coefficients of the products T_i(x) T_j(y) of Chebyshev polynomials to degree D, of the amplitude density.
     """
@@ -481,7 +483,8 @@ def _edges(terms: np.ndarray, degree: int) -> tuple[np.ndarray, np.ndarray, np.n
     """Return centres (B, 2), axes (B, 2, 2) and harmonics (2H + 1, B) of the edges of B pupils.
 
     The edges are the images of the unit circle under polynomial maps with K coefficients per coordinate, ``terms`` (B,
-    2, K). Harmonics have the orders -H to H.
+    2, K). Harmonics are the coefficients c_n, n = -H to H, of the edges' points sum c_n exp(i n a), with a the angle on
+    the unit circle.
     """
     samples = 4 * degree
     angle = 2.0 * np.pi * np.arange(samples) / samples

@@ -183,7 +183,8 @@ class PupilEdge:
     Attributes
     ----------
     harmonics : (2H + 1,) or (2H + 1, S) ndarray
-        Complex harmonics of the orders -H to H; that of order 1 is 1, those of the orders 0 and -1 are 0.
+        Complex coefficients c_n, n = -H to H, of the edge's points sum c_n exp(i n a), with a the angle on the stop's
+        rim; c_1 is 1, c_0 and c_-1 are 0.
 
     Raises
     ------

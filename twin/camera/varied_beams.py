@@ -82,37 +82,37 @@ class VariedBeams:
 
     Parameters
     ----------
-    optics
+    optics : CameraOptics
         Camera in its nominal state.
-    fields
-        Fractions of the half field, (F, 2).
-    colours
-        Wavelengths that are traced, metres, (K,); by default that of the design.
-    shares
-        Weights of the wavelengths, which sum to 1, (K,); by default equal.
-    planes
-        Compute eikonals as well.
+    fields : (F, 2) ndarray
+        Positions in the field, as fractions of the half fields along the line and along the track.
+    colours : (K,) ndarray, optional
+        Wavelengths that are traced, metres; by default that of the design.
+    shares : (K,) ndarray, optional
+        Weights of the wavelengths, which sum to 1; by default equal.
+    planes : bool
+        True to compute optical paths to plane waves (eikonals) as well, for transfer functions.
 
     Attributes
     ----------
-    directions
-        Directions of the light in the world frame, (F, 3).
-    start
-        Starting points of the nominal camera's chief rays in the world frame, metres, (F, 3).
-    nodes
+    directions : (F, 3) ndarray
+        Directions of the light in the world frame.
+    start : (F, 3) ndarray
+        Starting points of the nominal camera's chief rays in the world frame, metres.
+    nodes : PupilNodes
         Quadrature nodes of the stop.
-    degree
-        Degree of the polynomials in the pupil that represent wavefronts.
-    solve
-        Matrix from values at the N nodes to T polynomial coefficients, (T, N).
-    designed
-        Light of the nominal camera, of one state.
-    cosines
-        Direction cosines (row, column) of its rays at the line CCD, (K, F, N, 2).
-    residual
-        Rms of its wavefronts minus the polynomials fitted to them, waves.
-    pieces
-        Polygons on the stop's unit disk where its beams are shadowed, (F, P, V, 2): P polygons of V corners per field.
+    degree : int
+        Degree of the polynomials over the pupil that represent wavefronts.
+    solve : (T, N) ndarray
+        Matrix from values at the N nodes to T polynomial coefficients.
+    designed : BeamLight
+        Light of the nominal camera, as of one state.
+    cosines : (K, F, N, 2) ndarray
+        Direction cosines (along rows, along columns) of the nominal camera's rays at the line CCD.
+    residual : float
+        Rms of the nominal wavefronts minus the polynomials fitted to them, waves.
+    pieces : (F, P, V, 2) ndarray
+        Parts of the stop's unit disk that are shadowed in the nominal beams: P polygons of V corners per field.
 
     Raises
     ------

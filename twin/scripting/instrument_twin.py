@@ -414,7 +414,7 @@ class InstrumentTwin:
         )
 
     def camera(self, name: str = "", obstruction: bool = True) -> CameraTwin:
-        """Return one of its cameras in this state, with the methods of an optical designer.
+        """Return one of the instrument's cameras in this state, for analysis as optical designers do.
 
         Parameters
         ----------
@@ -509,7 +509,7 @@ def _load(what: str | Path, backend: str) -> InstrumentTwin:
 
 
 def load_camera(what: str | Path, backend: str = "llvm") -> CameraTwin:
-    """Load a single camera, with the methods of an optical designer; its ``perturbed`` moves and heats its parts.
+    """Load a single camera for analysis as optical designers do; its method ``perturbed`` moves and heats its parts.
 
     Parameters
     ----------
