@@ -101,10 +101,10 @@ class PupilShadow:
 
     @cached_property
     def least_nodes(self) -> int:
-        """Number of nodes on each side of a region's box for the wavefronts of cameras near their focus.
+        """Number of quadrature nodes on each side of the box about a region of a shadow, for cameras near their focus.
 
-        In corners of the box a wavefront is extrapolated beyond the pupil. Together with the nodes that the phase needs
-        (``quadrature.nodes_for``) the transfer function is accurate to 1e-5, also with 0.06 waves of spherical
+        The wavefront is extrapolated beyond the pupil in corners of the box. With the nodes that its phase needs in
+        addition (``quadrature.nodes_for``) the transfer function is accurate to 1e-5, also with 0.06 waves of spherical
         aberration and astigmatism.
         """
         return 1 + int(np.ceil(8.0 * float(np.max(np.ptp(self.pieces, axis=-2), initial=0.0))))

@@ -88,7 +88,7 @@ class Patch:
 
 @dataclass(frozen=True, eq=False)
 class Segment:
-    """Clear path segment from an aperture to the next one that a family of paths meets.
+    """Clear path segment, with no surface in between, from an aperture to the next one that nominal light meets.
 
     Attributes
     ----------
@@ -112,7 +112,7 @@ class Segment:
 
 
 class ClearSegments:
-    """Clear segments of the nominal light paths to the detectors.
+    """Clear segments (path segments with no surface in between) of the nominal light paths to the detectors.
 
     A family of paths is all paths that meet the same surfaces in the same order; there is one nominal family per
     detector.

@@ -299,7 +299,7 @@ class PathHistory:
         True where the path left the nominal path at a surface; False where it missed the next one or reached the
         detector.
     steps : (N,) ndarray
-        Number of surfaces met after that.
+        Number of surfaces that the path met after it left the nominal path.
     """
 
     passed: np.ndarray

@@ -134,7 +134,7 @@ class Step:
 def make_steps(
     scenery: Scenery, line: Sequence[tuple[int, Patch]], codes: Sequence[int], source: np.ndarray
 ) -> tuple[Step, ...]:
-    """Return the surfaces of the nominal path that all paths can pass in the same way.
+    """Return the surfaces of the nominal path, as far as all paths can be traced through them with the same numbers.
 
     Parameters
     ----------
