@@ -51,7 +51,7 @@ _MOST_ERROR_BARS = 60
 _LIMIT_EXTENTS = 3.0
 """Largest ratio of a requirement's limit to the range of the time series for which the limit is drawn.
 
-With a larger limit the curve would look flat.
+If a larger limit were drawn, the curve would look flat.
 """
 
 
@@ -124,7 +124,7 @@ def _course(axes: Axes, overview: Overview, trend: Trend, quantity: Quantity) ->
 
 
 def _points(axes: Axes, trend: Trend, q: int) -> None:
-    """Draw the single readings of a quantity."""
+    """Draw the values of a quantity from single readings of the monitor, with error bars if there are few."""
     points = trend.points
     known = np.isfinite(points.values[:, q])
     if not known.any():

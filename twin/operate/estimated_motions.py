@@ -32,7 +32,7 @@ from scenes.yaml.yaml_file import dump_yaml
 UNSUPPORTED = ("index_gradient",)
 """Kinds of disturbance components for which the key `perturb` of a job has no equivalent."""
 PIVOTED = ("rotate", "scale")
-"""Kinds of disturbance components whose effect depends on a pivot."""
+"""Kinds of disturbance components whose effect depends on a pivot point."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -274,8 +274,8 @@ def prior_files(
 ) -> Prior:
     """Write the covariance of the estimated motions as the section `joint` of a file of disturbances.
 
-    A file holds at most `MOST_JOINT` components. If there are more, those that alone would contribute the largest share
-    to the variance of some spot or parameter are selected.
+    A file holds at most `MOST_JOINT` components. If there are more, those are selected that contribute the largest
+    share of the variance of any spot or camera parameter.
 
     Parameters
     ----------

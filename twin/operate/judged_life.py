@@ -346,7 +346,7 @@ def judged_numbers(life: JudgedLife) -> dict[str, Any]:
 
 
 def _error_summary(error: Any, sigma: Any) -> dict[str, Any]:
-    """Return the RMS of errors and the shares of them within one and two sigmas, ignoring NaN."""
+    """Return the RMS of errors and their shares within one and two sigmas as plain data, ignoring NaN."""
     value = rms(error)
     out: dict[str, Any] = {"rms": value if math.isfinite(value) else None}
     out |= {"errors": _rounded(error), "sigmas": _rounded(sigma)}

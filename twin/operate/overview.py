@@ -88,7 +88,7 @@ def readings(history: History, begin: int, end: int, most: int) -> list[dict[str
 DAY = 86_400 * MICRO
 """One day, in microseconds."""
 CONFIDENCE = 0.95
-"""Confidence level of the intervals of the shares of predictions."""
+"""Confidence level of the intervals given for the shares of readings within multiples of sigma."""
 WITHIN: Mapping[int, float] = FrozenMap({k: float(2.0 * norm.cdf(k) - 1.0) for k in (1, 2)})
 """Multiple of sigma -> expected share of normally distributed components within it."""
 _ESTIMATORS = ("posterior", "model")
@@ -296,7 +296,7 @@ class Overview:
         return (coverage(1, scores.within_one, scores.components), coverage(2, scores.within_two, scores.components))
 
     def occurrences(self) -> Iterator[Occurrence]:
-        """Yield all occurrences, unordered; a jump counts at the time of its detection."""
+        """Yield all occurrences (jumps, events, alarms and others), unordered; a jump at the time of its detection."""
         result = self.filter_result
         for jump in result.jumps:
             label, unit, size, sigma = best_known_motion(jump)
@@ -376,7 +376,7 @@ class Overview:
         ]
 
     def score_sentence(self) -> str:
-        """Return the sentence on the share of readings within one and two sigmas of their predictions."""
+        """Return the sentence on the shares of readings within one and two sigmas of their predictions."""
         one, two = self.coverages
         if not one.count:
             return "No reading has been predicted yet"

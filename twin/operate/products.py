@@ -199,7 +199,7 @@ def _limits_of_validity(
 
 
 STATE, PRIOR = "state", "prior"
-"""Names of the files of the state and of the prior."""
+"""Names, without ending, of the files of the instrument's estimated state and of its prior."""
 APART = 60 * MICRO
 """Difference between the times of the scene and of the estimate that gives a warning, in microseconds."""
 

@@ -40,7 +40,9 @@ from twin.operate.record.telemetry import CONFIG, RESULTS
 Moments = NDArray[np.int64]
 
 _MOTIONS, _JUMPS, _EVENTS, _DATES, _COEFFICIENTS = 10, 11, 12, 13, 14
-"""Random streams of a seed; the detectors' exposures use the first ones (`MonitorExperiment.frames_after`)."""
+"""Numbers of the random streams of a seed: motions, jumps, steps at events, dates of events, errors of thermal
+coefficients. The detectors' exposures use smaller numbers (`MonitorExperiment.frames_after`).
+"""
 _MARGIN = 0.1
 """Share of a life's duration, at its beginning and at its end, in which no random dates of events are drawn.
 
@@ -375,7 +377,7 @@ def simulate_record(
 def _readings(
     experiment: MonitorExperiment, observation: Observation, frames: int, suspects: Mapping[str, CameraCrosstalk]
 ) -> Iterator[dict[str, Any]]:
-    """Yield the recovered values of the monitor for each state, as the content of recovered.json."""
+    """Yield the monitor's results for each simulated state, as the content of recovered.json."""
     channels = tuple((channel.camera, channel.name) for channel in experiment.path.channels)
     common = channels, experiment.cameras, experiment.ground, experiment.disturbances
     centroid = experiment.resolved.job.analysis.centroid

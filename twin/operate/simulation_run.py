@@ -32,7 +32,7 @@ from twin.operate.terminal import input_errors, utc_option
 PROGRAM = "twin.operate"
 CALIBRATE, INGEST = "calibrate", "ingest into the record"
 NO_TRUTH = "none"
-"""Value of --truth for which no truth is written."""
+"""Value of the option --truth for which no file of the truth is written."""
 MOST = 100_000
 """Largest number of monitor readings in one simulated life: so many take some hours, and a gigabyte of results."""
 _READING = 2e5
@@ -265,7 +265,7 @@ def _require_empty(history: History) -> None:
 
 
 def _require_known_sensors(experiment: MonitorExperiment, what: Simulation) -> None:
-    """Raise InputErrorText for a sensor on a body without a temperature in the prior, or a faulty one not simulated."""
+    """Raise InputErrorText for a sensor on a body without a prior temperature, or a faulty one not simulated."""
     assert experiment.stated is not None  # a plan states something
     warm = {component.body for component in experiment.stated.components if component.kind == "temperature"}
     for body in what.sensors or ():

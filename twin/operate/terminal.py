@@ -108,7 +108,7 @@ def print_result(errors: Console, options: cli.Options, data: Any, show: Callabl
 
 
 def print_line(console: Console, text: str) -> None:
-    """Print a line without markup."""
+    """Print a line of text as it is, without interpreting markup."""
     console.print(text, markup=False, highlight=False, soft_wrap=True)
 
 

@@ -79,7 +79,7 @@ def adjust(
     ] = None,
     scheduler: cli.Scheduler = None,
 ) -> None:
-    """Adjust a block of scenes; the text of the command's help comes from the table of tests."""
+    """Run the command `adjust`: block adjustment of scenes from many passes."""
     procedure = PROCEDURES["orbit adjust"]
 
     def reduced() -> AnyAdjust:
@@ -244,7 +244,7 @@ def export(
 
 
 def _sigma(name: str, text: str | float) -> float:
-    """Return the standard deviation that an option gives, in SI units; pixels stay pixels.
+    """Return the standard deviation that an option gives, in SI units or, if given in pixels, in pixels.
 
     Raises
     ------
@@ -289,7 +289,7 @@ def _ground(lowest: str | None, highest: str | None) -> tuple[float, float] | No
 
 
 _DEEPEST, _TOP = -500.0, 9000.0
-"""Lowest and highest ground that the options accept, in metres above the ellipsoid: the range of land."""
+"""Lowest and highest ground height that the options accept, in metres above the ellipsoid: the range of land."""
 
 
 if __name__ == "__main__":

@@ -96,7 +96,7 @@ stores.
 OUTLIER_SIGMAS = 6.0
 """Residual of a sensor's reading, in standard deviations, beyond which the reading is not used."""
 SENSOR_WINDOW = 10
-"""Number of a sensor's latest readings from which its condition is judged."""
+"""Number of a sensor's latest readings from which its condition (ok, stuck, doubtful) is determined."""
 INFLATION_SIGMAS = 3.0
 """Residual of a temperature reading, in standard deviations, above which the prior sigmas of temperatures are enlarged.
 

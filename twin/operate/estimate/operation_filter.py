@@ -60,7 +60,7 @@ HEAD_READINGS = 16
 Filtering so many readings again takes as long as saving the state.
 """
 _MODEL, _HEAD = -1, 0
-"""Numbers of the checkpoints that hold the traced model, and the newest state of the estimator."""
+"""Numbers of the checkpoints that contain the traced model, and the newest state of the estimator."""
 
 
 class Operation:
@@ -129,7 +129,7 @@ class Operation:
                 self._previous, self._saved = (known.get("estimator_state"), previous._newest), previous._saved
 
     def updated(self) -> Operation:
-        """Return the same estimate with the newest readings of the record; faster than a new one."""
+        """Continue the estimate with the newest readings of the record, which is faster than a new estimate."""
         return Operation(self.history, self.plan, self._advance, self)
 
     @cached_property
@@ -226,7 +226,7 @@ class Operation:
     def _rewind(self, state: EstimatorState) -> EstimatorState | None:
         """Return the newest checkpoint before a sensor got stuck; None if there is none.
 
-        Filtering continues from there without the readings of this sensor.
+        Filtering continues from there without the readings of this sensor since it got stuck.
         """
         self._stuck_sensors = (*state.stuck_sensors, *state.newly_stuck)
         since = min(time for _, time in state.newly_stuck)
@@ -336,7 +336,7 @@ class Operation:
         )
 
     def _requirement_status(self) -> tuple[RequirementStatus, ...]:
-        """Return the status of every requirement of the plan, now and within the horizon."""
+        """Return the status of every requirement of the plan, now and within the horizon of the forecast."""
         operation, start = self.plan.operation, self.estimator_state.time
         if not operation.requirements:
             return ()

@@ -189,7 +189,7 @@ class RequirementStatus(_Dated):
     limit : float
         Limit of the absolute change.
     probability : float
-        Required probability that the limit is kept.
+        Required probability that the change is within the limit.
     chance_now : float
         Probability that the limit is exceeded now.
     holds_now : bool
@@ -397,11 +397,13 @@ def inflation_factors(
 
 
 AGAIN = 30 * 86_400 * MICRO
-"""Time after the acknowledgement of an alarm from which a continuing condition raises it again, in microseconds."""
+"""Time after an acknowledged alarm from which a continuing condition raises it again, in microseconds."""
 LEAST = 1e-6
 """Probability below which reports print "less than" and this bound instead of a number."""
 _CLOSE = 3.0
-"""Difference of log likelihood ratios (a factor of 20) below which another body explains a jump nearly as well."""
+"""Difference of log likelihood ratios below which another body explains a jump nearly as well: a likelihood ratio of
+20.
+"""
 BROKEN, BREAKS, JUMP, SENSOR, CONTRADICTION = "broken", "breaks", "jump", "sensor", "contradiction"
 Row = Mapping[str, Any]
 
@@ -446,7 +448,11 @@ def alarms_of(plan: OperationSpec, result: FilterResult) -> Iterator[Alarm]:
 
 
 def _is_repeated(alarm: Alarm, before: Sequence[Row]) -> bool:
-    """Return whether an alarm repeats an earlier one that is open or was acknowledged less than `AGAIN` ago."""
+    """Return whether an alarm repeats an earlier one of the same kind and subject.
+
+    An earlier alarm counts while it is open and, in general, within the time `AGAIN` of it. A jump is repeated if the
+    times in which it may have occurred overlap; a contradiction is not, since each reading can raise one.
+    """
     same = [one for one in before if (one["kind"], one["subject"]) == (alarm.kind, alarm.subject)]
     if alarm.kind == JUMP:  # later readings determine the time of a jump better
         began, ended = alarm.content["after_us"], alarm.content["until_us"]
@@ -482,7 +488,7 @@ def percent(chance: float) -> str:
 
 
 def _of_requirement(requirement: RequirementStatus, time: int, quantities: Sequence[Quantity]) -> Alarm:
-    """Return the alarm of a requirement that is violated or will be."""
+    """Return the alarm of a requirement that is violated or is expected to be."""
     name, allowed = name_of(requirement.quantity, quantities), percent(1.0 - requirement.probability)
     limit = f"{plain(requirement.limit)} {requirement.unit}"
     if not requirement.holds_now:

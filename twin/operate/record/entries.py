@@ -122,7 +122,7 @@ class Alarm:
 
     @property
     def digest(self) -> str:
-        """SHA-256 that identifies the alarm by its kind, subject and time, whatever its numbers."""
+        """SHA-256 that identifies the alarm by its kind, subject and time, independent of its numbers."""
         return digest_of_data([self.kind, self.subject, self.time])
 
 

@@ -239,12 +239,12 @@ class History:
             return [dict(row) for row in connection.execute(query.order_by(REFUSED.c.id)).mappings()]
 
     def status(self, check_all_entries: bool = False) -> dict[str, Any]:
-        """Return the numbers of readings, events and refusals of the record, as plain data.
+        """Return a summary of the record as plain data: instrument, entries by kind and subject, checks, refusals.
 
         Parameters
         ----------
         check_all_entries : bool
-            Check the digests of all entries, instead of the newest ones only.
+            True to check the digests of all entries, instead of the newest ones only.
         """
         with self.reading() as connection:
             streams = [
@@ -309,7 +309,7 @@ class History:
         return None if row is None else {**row, "content": content_of(dict(row))}
 
     def first(self, kind: str) -> dict[str, Any] | None:
-        """Return the earliest entry of a kind, with the keys that `entries` yields; None if there is none."""
+        """Return the earliest entry of a kind, as a mapping like those of `entries`; None if there is none."""
         c = ENTRY.c
         with self.reading() as connection:
             # query each subject by the index, which orders by subject before time

@@ -64,7 +64,7 @@ SCHEMA = _table(
     Column("made_utc", String(32), nullable=False),
     Column("program", Text, nullable=False),
 )
-"""One row for each version that the record has had."""
+"""Table of the versions of the database tables, one row for each version that the record has had."""
 INSTRUMENT = _table(
     "instrument",
     Column("name", Text, nullable=False),

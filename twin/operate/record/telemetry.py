@@ -117,7 +117,7 @@ def _image_digests(manifest: Manifest) -> dict[str, str]:
 
 
 def _require_unchanged(folder: Path, file: Path, digest: str, manifest: Manifest) -> None:
-    """Raise Problem if the results are not those that the run wrote."""
+    """Raise Problem if the results of a run have been altered since it wrote them."""
     known = {file.name: digest}
     known |= {CONFIG: digest_of(folder / CONFIG)} if is_file(folder / CONFIG) else {}
     changed = [name for name, own in known.items() if manifest.sha256.get(name) != own]
@@ -434,13 +434,13 @@ class Sources:
     Attributes
     ----------
     places : Sequence[Path]
-        YAML files, run folders, and folders with some of these.
+        Paths of YAML files, run folders, and folders that contain such files and folders.
     moment : int | None
         Time of the run folders named directly, in microseconds of TAI since 2000; None if their names contain it.
     assume_instrument : bool
-        Assume that run folders which do not name their instrument are of the record's instrument.
+        True to assume that run folders which do not name their instrument are of the record's instrument.
     watching : bool
-        Whether the sources are polled repeatedly, reading only what has changed.
+        True if the sources are checked repeatedly and only changed ones are read.
     seen : dict[str, State]
         Path -> modification time and size when it was read.
     """
@@ -515,7 +515,7 @@ class Sources:
 
 
 def _runs_named(table: ReadingTableSpec, path: Path) -> list[Path]:
-    """Return the manifests of the finished run folders that a table names."""
+    """Return the paths of the manifests of the finished run folders that a table names."""
     try:
         heads, *rows = [cells for _, cells in rows_apart(path, LARGEST) if not isinstance(cells, str)]
         column = [head.strip() for head in heads].index(str(table.name))

@@ -127,8 +127,7 @@ def _changed_state(spec: OrbitAngleSpec, instrument: Instrument) -> State:
 
 
 _LINE_TIME = 1e-3
-"""Time per image line, in seconds; all points are seen in the middle of a single line, so that its value has no effect.
-"""
+"""Time per image line, in seconds; points are seen in the middle of a single line, so that its value hardly matters."""
 LEAST_SIGMA = 1e-3
 """Sigma assumed for points that are simulated without errors, in metres, because an adjustment needs weights."""
 _LEAST_CONVERGENCE = np.radians(1.0)

@@ -29,11 +29,11 @@ METHOD_NAMES = {
     "corrected": "planes, eq. 5 with the right sign",
     "tls": "planes, total least squares",
 }
-"""Name in reports of each method of fitting planes."""
+"""Names in reports of the methods of fitting planes to station and ground points, by key."""
 EFFECT_NAMES = {"light_time": "light time", "all": "all three", "datum": "shift of all points"}
 """Names in reports of the effects on the light (light time, aberration, refraction) whose key is not their name."""
 _FALSE_ALARM = 1e-4
-"""Probability that a plane whose points are correct raises a warning."""
+"""Probability of a false alarm: a plane whose points are correct raises a warning."""
 _GREEK = {"alpha": "α", "beta": "β", "gamma": "γ", "delta": "δ"}
 COLOURS = (svg.BLUE, svg.GREEN, svg.VERMILION, svg.ORANGE, svg.PURPLE, svg.SKY)
 """Colours of the camera's lines in figures, in the order of the lines."""
@@ -82,7 +82,7 @@ def angle_report(run: AngleRun) -> Report:
 
 
 def _simulated_verdict(run: SimulatedAngleRun) -> tuple[list[str], tuple[str, ...]]:
-    """Return the sentences of a simulated test: angles against their truth, and planes against resection."""
+    """Return the verdict of a simulated test: angles compared with the truth, and planes with the resection."""
     names, flight, narrow = greek_names(run.names), run.flight, run.narrow
     tls, along = run.estimate.angles["tls"], run.estimate.along
     truth = np.where(narrow, values_of(flight.along_track), values_of(flight.dihedral))

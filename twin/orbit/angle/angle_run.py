@@ -49,7 +49,7 @@ if TYPE_CHECKING:
     from scenes.specs.orbit.setup import AngleSetup, AnyAngle
 
 EFFECTS = ("light_time", "aberration", "refraction")
-"""Names of the effects on the light, as attributes of `LightEffects`."""
+"""Names of the effects on the light, which are attributes of `LightEffects`."""
 BEND = 0.01 * ARCSEC
 """Standard deviation of the angle by which a line's ends have bent since the laboratory, in radians. A micrometre's
 shift of a mirror bends the line of `gf7` by 1e-5 arcsec, and a rotation of its focal plane by 2 arcsec about the
@@ -432,7 +432,15 @@ def _resected_angles(measurement: Measurement, section: Resection) -> AlongTrack
 
 
 def reduce_to_station(measurement: Measurement, section: Resection) -> Measurement:
-    """Return the measurement as it would be with all projection centres at the station."""
+    """Move the ground points to where they would lie if all lines had their projection centres at the station.
+
+    Parameters
+    ----------
+    measurement : Measurement
+        Measured station and points.
+    section : Resection
+        Space resection of the measurement, which gives the attitude.
+    """
     strips = dict(measurement.strips)
     for name, offset in measurement.offset.items():
         if np.any(offset):
@@ -579,7 +587,7 @@ PASS: Record[PassAngles] = Record(
     Quantity("resection_agrees", lambda p: p.estimate.resection.p_value >= UNLIKELY, "true if the resection fits"),
 )
 UNLIKELY = 1e-3
-"""p-value of chi-square below which a resection is reported not to fit."""
+"""p-value of chi-square below which a resection is reported as inconsistent with its sigmas."""
 TRUTH: Record[SimulatedAngleRun] = Record(
     "Angles of the true camera, by each definition.",
     Quantity("look", lambda run: _degrees(run.names, run.flight.look.values()), "between the lines of sight"),

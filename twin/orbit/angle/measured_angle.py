@@ -205,11 +205,11 @@ def _strip(
 
 
 def _shared(offset: np.ndarray, path: TabulatedTrajectory, errors: ReadingErrorsSpec) -> tuple[np.ndarray, np.ndarray]:
-    """Return each point's variances of attitude, in rad^2, and station, in m^2, relative to the moment of the angles.
+    """Return each point's variances of attitude (rad^2) and station (m^2), relative to the moment of the angles.
 
-    Points whose attitude or station comes from the same reading of the orbit or attitude share its error: each of n
-    such points is given n times the variance, so that their mean has the right one. A point of the moment's own reading
-    shares the error of the moment, which does not change the angles.
+    Points whose attitude or station comes from the same reading of orbit or attitude share its error: each of n such
+    points gets n times the variance, so that their mean has the correct one. Points that share the reading at the
+    moment of the angles have the error of that moment, which does not change the angles.
 
     Parameters
     ----------
@@ -243,7 +243,9 @@ _LINE_TIME = 1e-3
 lines before and after it only define the time scale.
 """
 _SPAN, _READINGS = 20.0, 41
-"""Time exported before and after the moment, in seconds, and number of readings in it; one reading is at the moment."""
+"""Time for which orbit and attitude are exported before and after the moment of the angles, in seconds, and number of
+readings in it; one reading is at the moment.
+"""
 _IMAGE_SIGMA = 1e-6
 """Sigma of exported image points, in pixels, nearly zero: the ground points carry the errors, but a table's sigmas must
 be positive.

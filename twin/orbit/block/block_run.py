@@ -36,13 +36,13 @@ if TYPE_CHECKING:
 _LEAST_CHECK = 2
 """Smallest number of check points from which errors are computed."""
 _OBSERVED = 3e3
-"""Memory that an image point of a simulated block needs in simulation and adjustment, in bytes."""
+"""Memory per image point for simulation and adjustment of a block, in bytes."""
 Rejected = tuple[tuple[str, str], ...]
 """Point and scene of each image point that was rejected as a gross error."""
 DATUM_ALARM = 1e-3
 """p-value below which a common shift of the control points is reported."""
 ALL = "all"
-"""Name, in the table of sensors, of the adjustment with all sensors."""
+"""Name, in the table of contributions of the sensors, of the adjustment with all sensors."""
 TIES_ALONE = "ties alone"
 """Name, in the table of sensors, of the adjustment with tie points (image points of unknown ground points) only,
 besides the priors of the orbit and attitude readings and of the cameras.
@@ -293,7 +293,7 @@ def _check(adjustment: BlockAdjustment, reference: _Reference) -> tuple[np.ndarr
 def _contributions(
     accepted: Block, adjustment: BlockAdjustment, reference: _Reference, advance: Advance, pool: Pool | None
 ) -> FrozenMap[str, SensorContribution]:
-    """Return the errors at check points with all sensors, without each, and with tie points alone."""
+    """Return the errors at check points with all sensors, without each one in turn, and with tie points alone."""
     sensors = [name for name in accepted.sensors if name != "ties"]
     # without ties only check points show the errors
     enough = int(np.sum(accepted.points.role == "check")) >= _LEAST_CHECK

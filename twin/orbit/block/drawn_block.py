@@ -45,8 +45,8 @@ from twin.orbit.measured.pass_measurements import ImagePoints, point_names
 Course = Callable[[np.ndarray], np.ndarray]
 Monitored = dict[str, model.CameraPrior] | model.JointCameraPrior
 _BEYOND = 30
-"""Number of readings drawn beyond the ends of a time series of errors: the influence of the ends on a cubic spline
-falls by a factor of 0.27 per reading.
+"""Number of readings simulated beyond both ends of a time series of errors, because the influence of the ends on a
+cubic spline decreases by a factor of 0.27 per reading.
 """
 _SPARE = 4.0
 """Number of candidate ground points drawn per required point; those that fewer than two scenes see are dropped."""
@@ -54,7 +54,9 @@ _DAY = 86400.0
 _MOST_STEPS = 1e5
 """Largest number of values in the simulated time series of one noise model of the file."""
 _PLACES, _IMAGES, _LASER, _TERRAIN, _CONTROL, _COURSES, _CAMERAS, _GROSS = range(8)
-"""Random streams of the seed."""
+"""Numbers of the random streams of a block's seed: ground points, image points, laser shots, terrain, control points,
+errors over time, cameras, gross errors.
+"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -213,9 +215,11 @@ def _summed(parts: list[Course]) -> Course:
 def _cameras(
     spec: OrbitAdjustSpec, days: np.ndarray, random: np.random.Generator, recorded: model.JointCameraPrior | None
 ) -> tuple[dict[str, np.ndarray], dict[str, model.CameraPrior], Monitored | None]:
-    """Draw the true changes of each line's camera, (T, 4) for T passes: d_alpha, d_beta, d_gamma, d_f.
+    """Draw the true changes of each line's camera, (T, 4) for T passes.
 
-    They are returned with the prior distributions of the changes before and after the monitor's readings.
+    The four changes are the rotations d_alpha, d_beta, d_gamma about the camera's Y, X and line of sight (rad), and the
+    change d_f of the principal distance (m). They are returned with their prior distributions before and after the
+    monitor's readings.
     """
     if recorded is not None:
         drawn = covariance_root(recorded.covariance) @ random.standard_normal(len(recorded.covariance))

@@ -55,7 +55,8 @@ def change_covariance(spec: CameraChangeSpec, days: np.ndarray) -> np.ndarray:
     Parameters
     ----------
     spec : CameraChangeSpec
-        Standard deviations of the changes d_alpha, d_beta, d_gamma (rad) and d_f (m), and their correlation in time.
+        Standard deviations of the rotations d_alpha, d_beta, d_gamma (rad) and of the change d_f of the principal
+        distance (m), and their correlation in time.
     days : (T,) ndarray
         Times of the passes after the first, in days.
     """

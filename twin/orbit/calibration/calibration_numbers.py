@@ -318,7 +318,7 @@ ATTITUDE_DRIFT: Record[AttitudeDrift] = Record(
     ),
 )
 UNLIKELY = 1e-3
-"""p-value of chi-square below which the adjustment is reported not to fit."""
+"""p-value of chi-square below which the adjustment is reported as inconsistent with its sigmas."""
 
 
 def _fits(run: CalibrationRun) -> bool | None:

@@ -15,8 +15,19 @@ from twin.orbit.calibration.schemes import RMS, FieldErrors, Monitoring, values_
 
 
 def _expected_height(run: CalibrationRun, study: Monitoring, factor: np.ndarray) -> np.ndarray:
-    """Return the expected height RMS without a monitor, in metres, for the file's drift times each of n factors.
+    """Return the expected RMS height error without a monitor, in metres, for n multiples of the file's drift.
 
+    Parameters
+    ----------
+    run : CalibrationRun
+        Results of the calibration.
+    study : Monitoring
+        Comparison of calibrations with and without the monitor.
+    factor : (n,) ndarray
+        Factors by which the file's drift is multiplied.
+
+    Notes
+    -----
     It is the expectation over many campaigns in which all fields are adjusted at once and the cameras' drift is
     constant within a field. The parameters absorb the mean over the fields of the outer lines' rotation d_alpha about
     the camera's Y, so that it is subtracted.

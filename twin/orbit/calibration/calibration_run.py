@@ -265,8 +265,8 @@ _NOISE_KEYS = {
     "slow attitude": ("errors", "star_tracker", "slow"),
     "station": ("errors", "gps", "noise"),
 }
-"""Source of noise -> its key in the file. Image and control points have keys of their own in a simulation, and sigmas
-in tables of measurements.
+"""Source of noise -> its key in the file. Image and control points are not included: they have separate keys in a
+simulation, and sigmas in tables of measurements.
 """
 
 
@@ -290,7 +290,7 @@ def _key_and_remedy(error: ValueError, measured: bool) -> tuple[tuple[str, ...],
 
 
 def _require_memory(setup: CalibrationSetup) -> None:
-    """Raise an error if the adjustments of all strips, which need the most memory, do not fit."""
+    """Raise an error if the adjustments of all strips, which need the most memory, do not fit into the memory."""
     test, strip = setup.test, setup.test.strip
     if strip is not None:
         each = len(setup.camera.lines) * len(test.fields) * _TIE
@@ -350,7 +350,7 @@ def _run(setup: AnyCalibration, seed: int, advance: Advance) -> CalibrationRun:
 
 
 def source_of(setup: AnyCalibration, seed: np.random.SeedSequence, advance: Advance = silent) -> Campaign:
-    """Return the campaign of a test: read from its files where it names measurements, else simulated.
+    """Return the campaign of a test: read from its files if it names measurements, otherwise simulated.
 
     Points measured in images are screened for gross errors.
 
@@ -402,7 +402,7 @@ def true_values(campaign: Campaign, names: tuple[str, ...]) -> np.ndarray:
 
 
 def third_differences(flight: FieldPass) -> tuple[ThirdDifference | None, ThirdDifference | None]:
-    """Return the third differences of orbit and attitude of a pass; None for fewer than five evenly spaced readings."""
+    """Return third differences of a pass's orbit and attitude readings; None for fewer than five even readings."""
     measured, table = flight.measured, flight.measured.table
     fixes, looks = _even(table.orbit_time), _even(table.attitude_time[measured.covers(table.attitude_time)])
     places = table.position[np.isin(table.orbit_time, fixes)]

@@ -47,7 +47,7 @@ if TYPE_CHECKING:
     from twin.orbit.images.patch import LineComparison, Patch
 
 EFFECTS = ("light_time", "aberration", "refraction")
-"""Names of the effects on the light, as attributes of `LightEffects`."""
+"""Names of the effects on the light, which are attributes of `LightEffects`."""
 _DISTORTION_STEPS = 8
 """Number of fixed-point steps that invert the lens distortion; each reduces the error by a factor of the relative
 distortion, 1e-3 or less.
@@ -242,9 +242,8 @@ class PassData:
         ----------
         images : Mapping[str, ImagePoints]
             Line -> image points.
-        ground : (m, 3) ndarray
-            Given coordinates, ITRS, in metres.
-        covariance : float, tuple of float, or (m, 3, 3) ndarray
+        ground : (m, 3) ndarray for m ground points Given coordinates, ITRS, in metres. covariance : float, tuple of
+        float, or (m, 3, 3) ndarray
             Covariances of the coordinates, in m^2 (not used for tie points); or one sigma of each coordinate; or one
             sigma of each axis in plan and one of the height, in metres.
         removed : LightEffects
@@ -501,8 +500,8 @@ class FieldPass:
     ties : Mapping[str, Rays]
         Line -> rays of the tie points that are reserved for the strip.
     readings : Mapping[str, ndarray]
-        Line -> (4,) change of its camera that the monitor measured, d_alpha, d_beta, d_gamma (radians) and d_f
-        (metres); empty without a monitor.
+        Line -> (4,) change of its camera that the monitor measured: rotations d_alpha, d_beta, d_gamma (radians) and
+        change d_f of the principal distance (metres); empty without a monitor.
     known_truth : PassTruth or None
         Truth of a simulated pass; None for a measured one.
     """
@@ -681,7 +680,7 @@ class Campaign:
 
     @property
     def effects(self) -> LightEffects:
-        """Effects on the light that the file switches on."""
+        """Effects on the light (light time, aberration, refraction) that the file switches on."""
         return light_effects(self.spec.effects)
 
     @property

@@ -287,7 +287,9 @@ def _middle(patch: PatchPlaceSpec, nadir: Sensor, height: float) -> tuple[float,
 
 
 _DRIFT, _READING = 6, 7
-"""Random streams of a field's seed for drift and monitor readings; its other draws do not change with them."""
+"""Numbers of the random streams of a field's seed for the cameras' drift and the monitor's readings, so that these do
+not change the other random numbers.
+"""
 
 
 def _sample_drift(spec: OrbitCalibrationSpec, seed: np.random.SeedSequence) -> FrozenMap[str, np.ndarray]:
@@ -315,7 +317,8 @@ def _sample_readings(
 ) -> FrozenMap[str, np.ndarray]:
     """Draw the monitor's noisy measurement (4,) of each line camera's change; empty without a monitor.
 
-    The elements are d_alpha, d_beta, d_gamma, in radians, and d_f, in metres.
+    The elements are the rotations d_alpha, d_beta, d_gamma, in radians, and the change d_f of the principal distance,
+    in metres.
     """
     if spec.monitor is None:
         return FrozenMap({})
@@ -325,9 +328,10 @@ def _sample_readings(
 
 
 def reading_sigma(spec: OrbitCalibrationSpec) -> np.ndarray:
-    """Return the (4,) standard deviations of the monitor's readings of a camera, in radians and metres.
+    """Return the (4,) standard deviations of the monitor's readings of a camera's change.
 
-    The test must have a monitor.
+    The elements belong to three rotations, in radians, and the principal distance, in metres. The test must have a
+    monitor.
     """
     assert spec.monitor is not None
     return np.array([*spec.monitor.angles, spec.monitor.principal_distance])

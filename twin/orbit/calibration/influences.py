@@ -262,7 +262,7 @@ def _warned(campaign: Campaign, change: Mapping[str, float], size: float) -> flo
     campaign : Campaign
         Measurements of the passes.
     change : Mapping[str, float]
-        Change of each unknown that the error causes at `size`.
+        Change of each unknown due to an error of this `size`.
     size : float
         Size of the error that was tested, in metres or seconds.
     """
@@ -340,7 +340,7 @@ class AttitudeDrift:
 
     @classmethod
     def of(cls, campaign: Campaign, fit: Adjustment) -> Self:
-        """Return the effect and the test of an attitude drift, from an adjustment of all fields."""
+        """Compute the effect of an attitude drift on the unknowns, and its test, from an adjustment of all fields."""
         seconds = float(np.mean([p.seconds_apart for p in campaign.passes]))
         effect = detectable = undetected = None
         rate_p_value = None
@@ -374,7 +374,7 @@ class AttitudeDrift:
 
 
 def drift_warnings(campaign: Campaign, drift: AttitudeDrift) -> list[str]:
-    """Return warnings of a detected drift, or of a file that ignores a drift too small to detect but significant."""
+    """Return warnings of a detected attitude drift, or of one that may be harmful without being detectable."""
     if drift.assumed is not None:
         rate = max(drift.assumed.rate) * drift.seconds / ARCSEC
         p_value = min(drift.course_p_value, 1.0 if drift.rate_p_value is None else drift.rate_p_value)
@@ -433,7 +433,7 @@ class ChipStep:
 
     @classmethod
     def of(cls, campaign: Campaign, together: Adjustment) -> tuple[Self, ...]:
-        """Return the tests of the steps of all lines of a campaign, from the adjustment of all fields."""
+        """Test the steps between the chips of all lines, with the residuals of the adjustment of all fields."""
         steps = Steps(_joints(campaign))
         test = together.omitted_terms_test(steps)
         limit = float(norm.isf(0.5 * _STEP_ALARM / max(steps.size, 1)))

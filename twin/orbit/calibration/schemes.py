@@ -47,7 +47,7 @@ if TYPE_CHECKING:
     from scenes.specs.orbit.setup import CalibrationSetup
 
 RMS = ("plan_rms", "height_rms")
-"""Attributes of `CheckErrors` and `FieldErrors` with the RMS error in plan and in height."""
+"""Names of the attributes of `CheckErrors` and `FieldErrors` with the RMS errors in plan and in height."""
 
 
 @dataclass(frozen=True)
@@ -67,7 +67,7 @@ class FieldErrors:
 
     @classmethod
     def pooled(cls, errors: Iterable[CheckErrors]) -> FieldErrors:
-        """Return the RMS errors over all check points, so that each field is weighted by the number of its points."""
+        """Return the RMS errors over the check points of all fields together, each point with equal weight."""
         rows = list(errors)
         count = [e.count for e in rows]
         plan, height = (np.average(np.square([getattr(e, what) for e in rows]), weights=count) for what in RMS)
@@ -173,8 +173,8 @@ def evaluate_schemes(
     alone : Mapping[str, Adjustment]
         Calibration of each field by itself, by field.
     test : callable
-        Function of a field's pass, the cameras and the bias (3,). Cameras and bias are means of the scheme's fields,
-        and the field's own in the last scheme.
+        Function of a field's pass, the cameras and the attitude bias (3,). Cameras and bias are means over the scheme's
+        fields; in the last scheme they are those of the tested field.
     """
     results = {}
     for k, scheme in enumerate((*campaign.spec.schemes, None)):
@@ -514,7 +514,7 @@ def study_monitoring(setup: CalibrationSetup, seed: np.random.SeedSequence, adva
 
 
 def fly_with_drift(setup: CalibrationSetup, factor: float, seed: np.random.SeedSequence) -> Campaign:
-    """Simulate the campaign with the file's drift times a factor, without correctable effects on the light.
+    """Simulate the campaign with the file's drift times a factor, without the effects on the light.
 
     All other random numbers are those of the campaign without drift; the object `seed` is not modified.
     """
@@ -585,7 +585,10 @@ def adjust_field_with_readings(campaign: Campaign, flight: FieldPass) -> Adjustm
 
 
 def height_per_arcsec(campaign: Campaign) -> float:
-    """Return the mean height error of the first field, in metres, for 1 arcsec of the forward line's d_alpha."""
+    """Return the mean height error of the first field, in metres, for a 1 arcsec pitch of the forward line camera.
+
+    The rotation is d_alpha, about the camera's Y axis.
+    """
     flight, cameras = campaign.passes[0], dict(campaign.truth)
     ground = [
         intersect(flight.check, {**cameras, "forward": turned}, campaign.noise, bias=flight.bias).ground

@@ -46,9 +46,10 @@ _FALSE_ALARM = 1e-4
 
 
 _FAR_SCATTERS, _FAR_SIGMAS = 10.0, 20.0
-"""Limits beyond which an image point does not belong to the ground point of its name: scatters of a line's image points
-about their common misclosure, and sigmas of an image point. The nearest of 100 points in a strip of 60 km lies 1000
-sigmas away in the median."""
+"""Limits of the distance of an image point from its expected position, beyond which it is taken to show another ground
+point than that of its name: in units of the scatter of the line's image points about their common misclosure, and in
+sigmas of an image point. The nearest of 100 points in a strip of 60 km is typically (median) 1000 sigmas away.
+"""
 _LEAST_OF_LINE = 8
 """Smallest number of control points in a line from which wrongly named points are searched for."""
 _SLOPE_POINTS = 500

@@ -145,7 +145,7 @@ CHECK: Record[Check] = Record(
 
 
 OTHER_READING, NO_READING = 3, 4
-"""Exit codes if another reading than the stated one explains the points, and if none does."""
+"""Exit codes if another interpretation of the files than the specified one explains the points, and if none does."""
 _LISTED = 12
 """Number of interpretations in the table of the report."""
 _NAMED = 6
@@ -194,7 +194,7 @@ def _verdict(run: Check) -> tuple[str, tuple[str, ...]]:
 
 
 def _undetermined(answers: tuple[ValueTest, ...]) -> bool:
-    """Return whether the points allow more than one value of a convention."""
+    """Return whether more than one value of a convention is consistent with the points."""
     return sum(test.possible for test in answers) > 1
 
 

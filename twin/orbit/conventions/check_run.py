@@ -51,8 +51,8 @@ The rejected one is then exp(-10) = 1/22 000 times as likely as the other. As a 
 in a hundred is wrong.
 """
 _FITS = 9.0
-"""Chi-square per degree of freedom up to which an interpretation explains the points: it allows sigmas three times too
-small.
+"""Chi-square per degree of freedom up to which an interpretation of the files explains the points: it allows for sigmas
+that are three times too small.
 """
 _ROUGH_POINTS = 8
 """Number of points of each line in the rough comparison that precedes the fits."""
@@ -232,7 +232,7 @@ def run_check(setup: CheckSetup, backend: Backend | None, seed: int, advance: Ad
 
 
 def _bench(setup: CheckSetup, readings: PassReadings, stated: PassConventions) -> PassBench:
-    """Return the object that fits interpretations to the points, with the image points reduced to the test's number."""
+    """Return the object that fits interpretations of the files to at most the test's number of image points."""
     cameras = line_cameras(setup.camera)
     images = {}
     for name, raw in readings.images.items():

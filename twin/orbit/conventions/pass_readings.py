@@ -224,7 +224,7 @@ def _scene_lines(spec: LineTimesFileSpec, cameras: tuple[str, ...], folder: Path
 def _image_points(
     spec: ImagePointsFileSpec, ground: GroundFile, lines: Mapping[str, LineClock], folder: Path
 ) -> Mapping[str, ImagePoints]:
-    """Read the table of image points."""
+    """Read the table of image points, with the line and pixel numbers of the file."""
     table = read_table(folder / spec.file, COLUMNS["image_points"])
     known = {str(name): k for k, name in enumerate(ground.points.ids)}
     names, cameras = table["point"].astype(str), table["camera"].astype(str)
@@ -428,13 +428,18 @@ def changed(stated: PassConventions, changes: Changes) -> PassConventions:
 
 
 _TURN, _SHIFT, _DELAY, _RISE = 1e-5, 10.0, 1e-3, 10.0
-"""Steps of the numerical derivatives: radians, metres, seconds, metres."""
+"""Steps of the numerical derivatives with respect to rotation (radians), shift (metres), delay (seconds) and height
+(metres).
+"""
 _TICKS = 1000
 """Number of lines of the auxiliary sensor; they only subdivide its time span."""
 
 
 class ImpossibleError(ValueError):
-    """Interpretation of the files under which the points cannot have been imaged; the message says why."""
+    """Error raised for an interpretation of the files under which the points cannot have been imaged.
+
+    The message gives the reason.
+    """
 
 
 @dataclass(frozen=True, eq=False)

@@ -435,10 +435,10 @@ class GroundSigma:
 
 
 def ground_rows(sensor: Sensor, calibrated: CalibratedLine, values: Array, height: float) -> Array:
-    """Return the derivatives of the ground position, east and north, with respect to the camera's change, (N, 2, 4).
+    """Return derivatives of N ground positions, east and north, with respect to a camera's change, (N, 2, 4).
 
-    For each of N points of a grid over the image: in metres per radian for d_alpha, d_beta and d_gamma, and in metres
-    per metre for the principal distance d_f.
+    The N points form a grid over the image. Derivatives are in metres per radian for the rotations d_alpha, d_beta and
+    d_gamma, and in metres per metre for the change d_f of the principal distance.
 
     Parameters
     ----------

@@ -30,7 +30,7 @@ from twin.orbit.flight.platform_table import continuous_quaternions
 from twin.orbit.flight.sensor import Sensor
 
 MODEL = "USGS_ASTRO_LINE_SCANNER_SENSOR_MODEL"
-"""Name of the sensor model."""
+"""Name of the community sensor model for line scanners that the files specify."""
 _TICK = 2.0**-20
 """Time unit of which times of nodes are whole multiples, in seconds. A float64 holds such ephemeris times (seconds
 since the year 2000) exactly, but decimal fractions only to 6e-8 s, a thousandth of a line.
@@ -407,7 +407,7 @@ def _isd(
     window: tuple[int, int],
     errors: tuple[ModelError, ...],
 ) -> dict[str, Any]:
-    """Return the content of the ISD file."""
+    """Return the content of the image support data (ISD) file, as plain data."""
     whole, fraction = _ephemeris_time(epoch)
     ends = sensor.time(np.array([-0.5, sensor.lines - 0.5]))
     # ephemeris times at whole ticks from a whole second are exact
@@ -485,9 +485,9 @@ def _rotation_record(number: int, nodes: list[float], quaternion: Array, rate: A
 
 
 def _angular_velocity(camera: EffectiveCamera) -> Array:
-    """Return the angular velocity of the camera's axes in the Earth-fixed frame at N nodes, (N, 3), in rad/s.
+    """Return the angular velocity of the camera relative to Earth-fixed axes, in these axes, (N, 3), in rad/s.
 
-    It is relative to the Earth-fixed axes.
+    It is computed at the N nodes of the trajectory.
     """
     step = camera.seconds[1] - camera.seconds[0]
     rate = (camera.rotation[1:] * camera.rotation[:-1].inv()).as_rotvec() / step

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 SPEED_OF_LIGHT = 299_792_458.0
 """Speed of light in vacuum, in m/s."""
 EARTH_RATE = 7.292115146706979e-5
-"""Rotation of the Earth, rad/s: derivative of the Earth rotation angle (IERS Conventions 2010, eq. 5.15)."""
+"""Rotation rate of the Earth, rad/s: derivative of the Earth rotation angle (IERS Conventions 2010, eq. 5.15)."""
 _FIXED_POINT_STEPS = 3
 
 

@@ -40,7 +40,7 @@ JITTER_STREAM = 2**31
 _RESOLVED = 10.0
 """Duration over which the single sinusoids that make up the noise of a band can be distinguished, in seconds."""
 _LEAST, _MOST = 64, 4096
-"""Smallest and largest number of sinusoids of a band."""
+"""Smallest and largest number of sinusoids that represent the noise of a frequency band."""
 _AT_ONCE = 4_000_000
 """Largest number of sine phases that are evaluated at a time, to limit memory."""
 _MOMENTS = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48)
@@ -174,7 +174,7 @@ class Attitude:
     Attributes
     ----------
     geodetic : bool
-        Z points along the ellipsoid's normal through the satellite; else to the Earth's centre.
+        Z points along the ellipsoid's normal through the satellite; otherwise it points to the Earth's centre.
     yaw_steering : bool
         X lies along the motion of the nadir point over the rotating Earth, so that the image of that point moves
         perpendicular to a line along Y; else along the inertial velocity.
@@ -249,10 +249,10 @@ TERMS = (
 """Names of the errors of measured orbit and attitude that can be switched on and off."""
 
 _SPARE_READINGS = 8
-"""Number of readings beyond either end of the span, so that the spline's ends do not matter."""
+"""Number of readings simulated beyond either end of the time span, so that end effects of the spline are negligible."""
 
 Series = Callable[[np.ndarray], np.ndarray]
-"""Function from times (...), seconds, to vectors (..., 3)."""
+"""Function of times (...), in seconds, that returns vectors (..., 3), such as errors of position or attitude."""
 
 
 def readings(first: float, last: float, interval: float) -> np.ndarray:

@@ -50,11 +50,11 @@ class GroundFrame:
         return float(normal * np.cos(self.latitude)), float(meridian)
 
     def itrs(self, east: Any, north: Any, height: Any) -> np.ndarray:
-        """Return the (..., 3) points in the ITRS, in metres, of coordinates (...), in metres."""
+        """Convert east, north and height (...), in metres, to points (..., 3) in the ITRS, in metres."""
         return _EARTH.ecef(*self.geographic(east, north), height)
 
     def local(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return east, north and height, in metres, (...) each, of points (..., 3) in the ITRS; NaN stays NaN."""
+        """Convert points (..., 3) in the ITRS to east, north and height (...), all in metres; NaN stays NaN."""
         longitude, latitude, height = _EARTH.geodetic(points)
         return *self.plane(longitude, latitude), height
 
@@ -309,7 +309,7 @@ class Terrain:
 
     @classmethod
     def flat(cls, height: float) -> Terrain:
-        """Return level ground of a height, in metres."""
+        """Return level ground of one height above the ellipsoid, in metres."""
         return cls(SplineGrid(np.full((2, 2), float(height)), (1e3, 1e3), (0.0, 0.0), "mirror"))
 
     @classmethod

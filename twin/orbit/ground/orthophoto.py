@@ -40,11 +40,11 @@ _LANE = 0.97
 _ROAD_WIDTH = 8.0
 """Width of a road, in metres."""
 _ROAD_BRIGHTNESS = 1.8
-"""Reflectance of a road relative to the mean."""
+"""Reflectance of a road, relative to the mean reflectance of the ground."""
 _SHIFT_BITS = 4
 """Number of fractional bits of polygon coordinates in OpenCV's drawing functions."""
 _ROWS = 512
-"""Number of rows of the ground's grid processed at a time, to bound memory."""
+"""Number of rows of the ground's grid processed at a time, to limit memory."""
 _SPARE = 4
 """Number of cells by which the drawn ground extends beyond the requested extent."""
 
@@ -238,7 +238,7 @@ SCALE = 10_000.0
 _PER_LENGTH = 8.0
 """Number of grid cells per correlation length for the smooth error in plan of the maps."""
 _ROWS_AT_ONCE = 256
-"""Number of rows of a map sampled at a time, to bound memory."""
+"""Number of rows of a map sampled at a time, to limit memory."""
 _MARGIN = 50.0
 """Margin, beyond the true ground, of the grid on which the smooth error in plan of the maps is drawn, in metres."""
 

@@ -446,8 +446,8 @@ def map_points(patch: ImagedGround, spec: ImagePointsSpec) -> MatchedPoints:
     Raises
     ------
     PointsError
-        A frame is too small for template and search range, every line sees no distinct points in common, or there are
-        too few matches.
+        A frame is too small for template and search range, there are no distinct points that every line sees, or there
+        are too few matches.
     """
     border = spec.template // 2 + spec.reach
     _require_room(patch, spec)
@@ -532,7 +532,7 @@ def tie_points(
 
 
 def _require_room(patch: ImagedGround, spec: ImagePointsSpec) -> None:
-    """Raise PointsError if a frame is too small for template and search range."""
+    """Raise PointsError if an image is too small for template and search range."""
     least = 2 * (spec.template // 2 + spec.reach) + 1
     for name, image in patch.images.items():
         if min(image.frame.shape) <= least:

@@ -288,7 +288,7 @@ def _eikonal(terms: dict[int, float]) -> np.ndarray | None:
 
 
 def _mean_of_steps(cycles: np.ndarray, count: int) -> np.ndarray:
-    """Return the mean of exp(2 pi i k cycles) over `count` equally spaced values of k, centred on 0."""
+    """Return the mean of exp(2 pi i k cycles) over `count` values of k in unit steps, centred on 0."""
     near = np.sinc(cycles)
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.where(np.abs(near) < 1e-9, 1.0, np.sinc(count * cycles) / near)

@@ -41,7 +41,7 @@ if TYPE_CHECKING:
 LARGEST_GROUND = 40_000.0
 """Largest accepted side of the ground of one patch, in metres, so that no input exceeds the memory."""
 _PIXEL, _SAMPLE = 150.0, 47.0
-"""Memory per pixel of the image of a line, and per sample of the ground's texture, in bytes."""
+"""Memory per pixel of a line's image, and per sample of the ground's texture, in bytes."""
 
 
 class PatchError(PhysicalError, ValueError):
@@ -339,9 +339,9 @@ def _recorded(
 
 
 WRONG_PIXELS, WRONG_SIGMAS, WRONG_FLOOR = 3.0, 5.0, 1.0
-"""Limits of the error of a right match: 3 pixels, and 5 of its sigmas plus 1 pixel."""
+"""Limits of the error of a correct match: 3 pixels, and 5 of its sigmas plus 1 pixel."""
 WRONG = f"more than {WRONG_PIXELS:g} px off, or more than {WRONG_SIGMAS:g} sigmas and {WRONG_FLOOR:g} px"
-"""Definition of a wrong match, as a text for reports."""
+"""Text for reports that defines a wrong match."""
 
 
 @dataclass(frozen=True, eq=False)

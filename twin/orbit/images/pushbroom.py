@@ -29,7 +29,8 @@ from twin.orbit.images.line_optics import ImageMotion, LineOptics, exposures, wi
 TOLERANCE = 2e-4
 """Largest interpolation error of a line of sight's position at a given height, in metres."""
 _COUNTS = (4, 6, 8, 12, 16, 24, 32, 48)
-"""Numbers of nodes along lines and pixels that are tried in turn."""
+"""Numbers of Chebyshev nodes along lines and along pixels that are tried in turn until the interpolation is accurate.
+"""
 _JITTERING = (96, 192, 384, 768, 1536)
 """Numbers of nodes along the image lines that are tried where the attitude varies faster than `_COUNTS` can resolve."""
 _HEIGHTS = 4
@@ -220,13 +221,13 @@ MARGIN = 24
 """Margin of ground about a window that its image depends on, in pixels and lines; the point spread function ends there.
 """
 LARGEST_ERROR = 0.002
-"""Largest error of interpolated positions relative to the rigorous sensor on the terrain, in pixels."""
+"""Largest accepted error of interpolated positions, relative to the rigorous sensor on the terrain, in pixels."""
 _NEAR = 2
 """Number of samples beyond the computed ones that cubic interpolation needs on each side."""
 BORDER = MARGIN + _NEAR + 1
 """Smallest number of lines and pixels between a window and the edges of an image."""
 _SAMPLES_AT_ONCE = 4_000_000
-"""Largest number of ground samples processed at a time, to bound memory."""
+"""Largest number of ground samples processed at a time, to limit memory."""
 _CHECKS = 400
 """Number of samples at which the interpolation of positions is compared with the rigorous sensor."""
 

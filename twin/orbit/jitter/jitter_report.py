@@ -17,9 +17,11 @@ from twin.framework.report import Report, Section, answer
 from twin.orbit.jitter.jitter_run import MULTIPLE, JitterRun, Oscillation, PassJitter, blind_multiples, transfers
 
 _MOST, _SIGMAS = 4000, 5.0
-"""Largest number of points drawn of a disparity, and half range of its axis in robust standard deviations."""
+"""Largest number of points drawn in a figure of disparities, and half range of its vertical axis in robust standard
+deviations.
+"""
 _COURSE, _ROWS = 0.02, 5000
-"""Least time between rows of the attitude table, in seconds, and largest number of its rows."""
+"""Smallest time between rows of the table of attitude over time, in seconds, and largest number of its rows."""
 _MOST_WRONG = 0.3
 """Share of rejected observations (gross errors) above which there is a warning."""
 _NAMED = 8

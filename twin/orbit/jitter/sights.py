@@ -34,7 +34,9 @@ from twin.orbit.flight.trajectory import Attitude
 from twin.orbit.measured.pass_measurements import PassMeasurements
 
 _ORBIT, _PER = 6, 60.0
-"""Degree of the polynomial of the orbit, and seconds per further degree: accurate to 0.1 mm."""
+"""Smallest degree of the polynomial of the orbit, and time span in seconds for which one more degree is added: the
+polynomial is accurate to 0.1 mm.
+"""
 _ATTITUDE = 4
 """Degree of the polynomial of the body's attitude relative to the orbital frame: without jitter the attitude changes
 slowly, and the trend that is fitted to each line absorbs the remainder.
@@ -143,7 +145,9 @@ _EXACT = 1e-3
 _LEAST_POINTS = 15
 """Smallest number of points that must be seen by at least two lines."""
 _NOISE, _ROUNDS = 4.0, 4
-"""Limit, in sigmas, within which a measured line's residual counts as noise, and rounds of rejecting the others."""
+"""Limit, in sigmas, up to which the residual of a measured line number counts as noise, and number of rounds of
+rejecting larger ones.
+"""
 _FAR = 200.0
 """Largest difference between measured and expected image positions, in pixels."""
 

@@ -29,7 +29,7 @@ SCALES = ("UTC", *TAI_MINUS)
 """Names of the time scales that can be read."""
 _MJD_ZERO = date(1858, 11, 17).toordinal()
 FIRST_DAY, LAST_DAY = date(1972, 1, 1).toordinal() - _MJD_ZERO, date(2100, 1, 1).toordinal() - _MJD_ZERO
-"""First and last modified Julian day of instants: UTC has whole leap seconds since the first."""
+"""First and last modified Julian day that is accepted; UTC has had whole leap seconds since the first."""
 _FORM = "a date and time such as 2011-03-05T03:05:00.25 or 2011-064T03:05:00.25, 1972 to 2099"
 
 
@@ -219,7 +219,7 @@ def single_reading(text: str) -> Readings:
 
 
 def known_scale(name: str) -> str:
-    """Return the time scale for a name as files spell it, such as GPST for GPS, and GLO and GLONASS for UTC.
+    """Return the time scale for a name as files spell it: GPS for GPST, UTC for GLO and GLONASS.
 
     Raises
     ------

@@ -225,7 +225,7 @@ def read_earth_orientation(path: str | Path) -> EarthOrientation:
 
 
 def _c04(file: str, rows: list[tuple[int, str]]) -> EarthOrientation:
-    """Parse the rows of a C04 table."""
+    """Parse the rows of an Earth orientation table of the IERS series C04."""
     cells = [line.split() for _, line in rows]
     lines = [k for k, _ in rows]
     columns = [4, 5, 6, 7, 8, 9] if len(cells[0]) == 21 else [3, 4, 5, 6, 8, 9]
@@ -250,7 +250,7 @@ _FINALS = {"MJD": (7, 15), "x": (18, 27), "y": (37, 46), "UT1-UTC": (58, 68), "d
 
 
 def _finals(file: str, rows: list[tuple[int, str]]) -> EarthOrientation:
-    """Parse the rows of a finals2000A table: values of Bulletin B where the file has them, else of Bulletin A.
+    """Parse the rows of a finals2000A table: values of Bulletin B if the file has them, otherwise of Bulletin A.
 
     Days without a prediction of pole and UT1 are omitted.
     """

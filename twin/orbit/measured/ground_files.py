@@ -157,7 +157,7 @@ def _role(file: str, role: str, line: int | None, key: tuple[str | int, ...] = (
 
 
 def _csv(path: Path, spec: GroundFileSpec) -> _Rows:
-    """Read the rows of a CSV file."""
+    """Read ground points from the rows of a CSV file."""
     table, file = read_table(path, _COLUMNS), str(path)
     sets = [names for names in _PLACES if all(name in table for name in names)]
     others = [n for names in _PLACES for n in names if n in table and not (sets and n in sets[0])]
@@ -201,7 +201,7 @@ def _fits(spec: GroundFileSpec, names: tuple[str, ...]) -> None:
 
 
 def _geojson(path: Path, spec: GroundFileSpec) -> _Rows:
-    """Read the point features of a GeoJSON file."""
+    """Read ground points from the point features of a GeoJSON file."""
     file, text = str(path), table_text(path, "a GeoJSON file")
     data = parse_json(text, file)
     features = data.get("features") if isinstance(data, dict) else None

@@ -381,7 +381,7 @@ class Datum:
 
 
 def _to_itrs(crs: pyproj.CRS) -> pyproj.Transformer:
-    """Return the transformation from a system to geocentric coordinates of the ITRS."""
+    """Return the transformation from a coordinate reference system to geocentric coordinates of the ITRS."""
     geodetic, target = crs.geodetic_crs, pyproj.CRS("EPSG:4978")
     if geodetic is not None and geodetic.datum is not None and geodetic.datum.name == CGCS2000:
         target = GeocentricCRS(datum=geodetic.datum)

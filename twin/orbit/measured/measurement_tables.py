@@ -38,7 +38,9 @@ from twin.orbit.measured.orbit_files import EARTH_FIXED_VELOCITY, INERTIAL_VELOC
 from twin.orbit.measured.pass_measurements import GroundPoints, ImagePoints, PassMeasurements
 
 _FAR, _FAST, _LATE, _MANY = 1e9, 1e5, 1e10, 1e9
-"""Limits of plausible input, in metres, m/s, seconds and lines; below them sums of squares do not overflow."""
+"""Largest accepted absolute values of coordinates (metres), velocities (m/s), times (seconds) and line numbers; sums of
+their squares do not overflow.
+"""
 _TIME = Column("time", TIME, least=-_LATE, most=_LATE)
 _PLACE = tuple(Column(axis, LENGTH, least=-_FAR, most=_FAR) for axis in "xyz")
 _SPEED = tuple(Column(f"v{axis}", SPEED, needed=False, least=-_FAST, most=_FAST) for axis in "xyz")
@@ -370,7 +372,7 @@ def image_covariance(table: Table, rows: NDArray[np.intp]) -> Array:
 
 
 def require_known(table: Table, column: str, names: tuple[str, ...]) -> None:
-    """Raise InputError unless every cell of a column is one of these names."""
+    """Raise InputError unless every cell of a table's column is one of the given names."""
     for row in np.flatnonzero(~np.isin(table[column].astype(str), names))[:1]:
         cell = str(table[column][row])
         raise table.error(int(row), column, f"no such {column}", shown(cell), names_text(names), nearest(cell, names))
@@ -396,7 +398,7 @@ CONVENTIONS: Mapping[str, Any] = {
     "first_pixel": 0,
     "first_pixel_sees": "right",
 }
-"""Conventions of the files that are written: the project's own."""
+"""Conventions (frames, quaternion order, pixel origin) of the files that are written, those of the project."""
 CAMERA_FILE = "camera.yaml"
 TEST_FILE = "calibrate.yaml"
 
@@ -504,11 +506,15 @@ def _csv(columns: Mapping[str, Any]) -> str:
 _LEAST_RADIUS, _MOST_RADIUS = 6.45e6, 5.0e7
 """Range of geocentric distances of mapping satellites, in metres."""
 _UNIT_TOLERANCE = 1e-3
-"""Largest departure of a quaternion's norm from 1."""
+"""Largest accepted deviation of a quaternion's norm from 1."""
 _FALL, _JUMP = 12.0, 0.05
-"""Largest acceleration, in m/s^2, and largest change of the velocity by noise of readings, as a share of the speed."""
+"""Largest accepted acceleration of a satellite, in m/s^2, and largest change of velocity that the noise of readings may
+cause, as a share of the speed.
+"""
 _LEAST_TURN, _FASTEST_TURN = np.radians(2.0), np.radians(10.0)
-"""Limit of the rotation between two readings, radians plus radians per second: more than that of agile satellites."""
+"""Limit of the rotation between two readings: a constant, in radians, plus a rate, in radians per second, which is
+higher than that of agile satellites.
+"""
 
 
 def platform_of(epoch: str, orbit: Table, attitude: Table, conventions: ConventionsSpec) -> PlatformTable:

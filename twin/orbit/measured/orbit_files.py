@@ -376,9 +376,9 @@ def _from_text(file: str, lines: list[str], kind: str) -> Iterator[_Segment]:
 
 
 _STATE = ("EPOCH", "X", "Y", "Z", "X_DOT", "Y_DOT", "Z_DOT")
-"""Elements of a state vector in XML."""
+"""Names of the elements of a state vector (position and velocity) in XML."""
 _TURN = {"LAST": ("EPOCH", "Q1", "Q2", "Q3", "QC"), "FIRST": ("EPOCH", "QC", "Q1", "Q2", "Q3")}
-"""Elements of an attitude state in XML, by QUATERNION_TYPE."""
+"""Names of the elements of an attitude state in XML, by QUATERNION_TYPE (position of the scalar)."""
 
 
 def _from_xml(file: str, text: str, kind: str) -> Iterator[_Segment]:
@@ -426,7 +426,7 @@ def _chosen(file: str, segments: list[_Segment], satellite: str | None) -> list[
 
 
 def _same(file: str, segments: list[_Segment], key: str, usual: str | None = None) -> tuple[str, int]:
-    """Return the value of a key that all segments share, and its line in the file."""
+    """Return the value of a key, which must be the same in all segments, and its line in the file."""
     entries = [s.keys.get(key) for s in segments]
     values = {None if value is None else value[0] for value in entries}
     if values == {None} and usual is not None:

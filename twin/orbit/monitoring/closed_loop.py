@@ -134,7 +134,7 @@ class LoopModel:
         return tuple(self.experiment.instrument.cameras)
 
     def row(self, camera: str, quantity: str) -> int:
-        """Return the index of a camera's quantity, such as d_alpha or defocus, among the P quantities."""
+        """Return the index of a camera's quantity, such as a rotation or the defocus, among the loop's P quantities."""
         return _row(self.cameras, camera, quantity)
 
     def unit(self, camera: str, quantity: str) -> np.ndarray:
@@ -375,7 +375,9 @@ def drifting_states(spec: OrbitMonitorSpec, experiment: MonitorExperiment, seed:
 
 
 Read: TypeAlias = Callable[[State, int], Recovery]
-"""Function of a state and the index of its moment that returns the spots' shifts since the nominal images."""
+"""Function of a state and the index of its moment that returns the measured shifts of the spots since the nominal
+images.
+"""
 
 
 def reader(model: LoopModel, spec: OrbitMonitorSpec, seed: int) -> Read:

@@ -202,8 +202,9 @@ def _optics(setup: MonitorSetup, name: str, defocus: float) -> LineOptics:
 _IMAGES = 100_000
 """Number of the random stream of line images; the streams of the check points have the indices of the readings."""
 GAIN_MARGIN, PHASE_MARGIN_DEG = 1.5, 30.0
-"""Margins below which a loop is barely stable: it amplifies what is near its crossover twice and more. Of an integrator
-with a delay the two are the same limit (Astrom, Hagglund, PID Controllers, 1995, sec. 4.4).
+"""Gain margin (a factor) and phase margin (degrees) below which a loop is barely stable: it amplifies disturbances near
+its crossover frequency by a factor of two or more. For an integrator with a delay, both margins are the same limit
+(Astrom, Hagglund, PID Controllers, 1995, sec. 4.4).
 """
 WORSE = 0.01
 """Relative increase of an error with the loop closed, for the same random errors, above which the loop is reported to
@@ -382,7 +383,7 @@ class LoopRun:
 
     @property
     def pair(self) -> tuple[str, str]:
-        """Names of the two cameras."""
+        """Names of the two cameras of the stereo pair."""
         return self.setup.pair
 
     @property

@@ -91,7 +91,8 @@ class Readings:
     cameras : tuple of str
         Names of the two cameras.
     values : (T, 8) ndarray
-        d_alpha, d_beta, d_gamma (rad) and d_f (m) of the first camera, then of the second.
+        Rotations d_alpha, d_beta, d_gamma (rad) and change d_f of the principal distance (m) of the first camera, then
+        of the second.
     noise : (T, 8, 8) ndarray
         Covariance of the errors of `values` due to the noise of the images.
     total : (T, 8, 8) ndarray or None
@@ -108,7 +109,7 @@ class Readings:
         return slice(at, at + 4)
 
     def __getitem__(self, camera: str) -> CameraParameters:
-        """Return the changes (T, 4) of one camera: d_alpha, d_beta, d_gamma (rad) and d_f (m) at T times."""
+        """Return the changes (T, 4) of one camera at T times: three rotations (rad) and principal distance (m)."""
         part = self._part(camera)
         total = None if self.total is None else self.total[:, part, part]
         return CameraParameters.from_vector(self.values[:, part], self.noise[:, part, part], total)
@@ -305,7 +306,8 @@ class MonitorSeries:
     def gains(self, measured: Measured, numbers: Sequence[int]) -> np.ndarray:
         """Return the estimator's gains for C spots in S states, (S, 8, 2 C), in rad or m per pixel of shift.
 
-        The 8 parameters are d_alpha, d_beta, d_gamma (rad) and d_f (m) of the first camera, then of the second.
+        The 8 parameters are the rotations d_alpha, d_beta, d_gamma (rad) and the change d_f of the principal distance
+        (m) of the first camera, then of the second.
 
         Parameters
         ----------
@@ -398,7 +400,7 @@ class MonitorSeries:
         return mean_frames(self.experiment.frames_after(photons, self.frames, seed, numbers))
 
     def _expected(self, photons: np.ndarray, numbers: np.ndarray) -> tuple[MeasuredSpots, np.ndarray]:
-        """Return the reference spots and expected images without noise, as other functions that record images do."""
+        """Return the reference spots and noise-free images, with the interface of a function that records images."""
         return self._clean_reference, self.experiment.expected_frames(photons)
 
     def _reference_spots(self, images: np.ndarray) -> MeasuredSpots:

@@ -49,7 +49,7 @@ _COLOURS = (svg.BLUE, svg.VERMILION, svg.GREEN, svg.PURPLE, svg.ORANGE, svg.SKY)
 _BESIDE = {"loc": "upper left", "bbox_to_anchor": (1.0, 1.0)}
 """Position of a legend beside the axes, where it does not hide curves."""
 _BODIES, _MOTIONS = 3, 3
-"""Bodies and motions of a mode that are named in words."""
+"""Largest numbers of bodies and of motions of an unobservable mode that the report names in its text."""
 _LEAST = 1e-6
 """Size below which values of an unobservable mode are rounding errors and are not reported."""
 
@@ -313,7 +313,7 @@ def _verdict(run: MonitorRun) -> tuple[str, tuple[str, ...]]:
 
 
 def _times(factor: float, less: str) -> str:
-    """Return the factor by which an error is smaller or larger, in words."""
+    """Return a text on the factor by which an error is smaller or larger."""
     if factor >= 1.0:
         return f"{factor:.2f} times {less}"
     return f"{1.0 / factor:.2f} times {'more' if less == 'less' else 'larger'}"
@@ -450,7 +450,7 @@ def _rest(run: MonitorRun) -> Section:
 
 
 def _worse(run: MonitorRun) -> tuple[str, ...]:
-    """Return a sentence naming the parameters that the monitor reads with errors larger than their true changes."""
+    """Return a sentence on the parameters for which the monitor's errors are larger than the true changes."""
     worse = []
     for name in run.pair:
         for k, key in enumerate(PARAMETERS):

@@ -100,7 +100,7 @@ class Conversion:
 
     @property
     def of_common(self) -> float:
-        """Height change for a common rotation of both cameras by 1 arcsec, in metres; the angle does not change."""
+        """Height change for a common rotation of both cameras by 1 arcsec, in metres; their angle does not change."""
         return float(sum(self.traced.values()))
 
 
@@ -255,7 +255,7 @@ class MonitorRun(PairFlight):
 
     @property
     def mask(self) -> np.ndarray:
-        """Mask (4,) of d_alpha, d_beta, d_gamma, d_f: 1 for parameters with which cameras are corrected, else 0."""
+        """Mask (4,) of a camera's three rotations and principal distance: 1 for those that are corrected, else 0."""
         return np.array([float(name in self.spec.apply) for name in PARAMETERS])
 
     def height(self, values: Mapping[str, np.ndarray]) -> np.ndarray:
@@ -354,7 +354,7 @@ class MonitorRun(PairFlight):
 
     @cached_property
     def parts(self) -> Mapping[str, np.ndarray]:
-        """Contributions to the corrected cameras' mean height error by cause: name -> (T,) values, in metres."""
+        """Contributions to the corrected cameras' mean height error at T times: cause -> (T,) values, in metres."""
 
         def applied(values: Callable[[str], np.ndarray]) -> np.ndarray:
             return self.height({name: self.mask * values(name) for name in self.pair})

@@ -205,7 +205,7 @@ class PairFlight:
         return FrozenMap({name: self._slopes(i) for i, name in enumerate(self.pair)})
 
     def _slopes(self, i: int) -> np.ndarray:
-        """Return derivatives (T, 4) of mean heights with respect to camera `i`'s correction, in m/rad and m/m."""
+        """Return derivatives (T, 4) of mean heights at T times to camera `i`'s correction, in m/rad and m/m."""
         table = np.empty((len(self.views), 4))
         for k, view in enumerate(self.views):
             for j, step in enumerate(_STEP):
