@@ -88,7 +88,7 @@ def _measured(result: CheckResult) -> str:
 
 
 def _limits(result: CheckResult) -> tuple[str, str, str]:
-    """Return tolerance with reason, the smallest error that would be found, and the alternative, as text."""
+    """Return tolerance with reason, smallest detectable error, and alternative statement, as text."""
     if result.power is None or result.tells is None:
         return ("", "", "")
     unit = "" if result.unit == "1" else f" {result.unit}"
@@ -111,7 +111,7 @@ def _chosen(validation: Validation) -> Iterator[str]:
 
 
 def _corrections(validation: Validation) -> Iterator[str]:
-    """Yield the lines that list all rows without agreement, with the reason."""
+    """Yield the lines that list all checks without agreement, with the reason."""
     results = [result for result in validation.results if result.verdict not in AGREED.values()]
     if not results:
         return
@@ -184,7 +184,7 @@ def verdict(validation: Validation) -> str:
 
 
 def _papers(validation: Validation) -> Iterator[Section]:
-    """Yield a section with all rows of each paper."""
+    """Yield a report section for each paper, with all its checks."""
     for number, title in PAPERS.items():
         results = [result for result in validation.results if result.paper == number]
         if results:
@@ -192,7 +192,7 @@ def _papers(validation: Validation) -> Iterator[Section]:
 
 
 def _paper_table(paper: str, results: Sequence[CheckResult]) -> Table:
-    """Return the table of a paper's rows; its downloadable form has all digits."""
+    """Return the table of a paper's checks; its downloadable form has all digits."""
     heads = ("id", "equation", "statement", "printed", "sides", "measured", "sigma", "unit", "verdict", "finds", "how")
     full = [
         (
@@ -255,12 +255,12 @@ def claim_text(result: CheckResult) -> str:
 
 
 def comparison_text(result: CheckResult) -> str:
-    """Return the sides on which a measurement can disagree with the claim; empty if nothing is compared."""
+    """Return on which sides of the paper's number a value disagrees, as text; empty if nothing is compared."""
     return result.comparison if result.power is not None else ""
 
 
 def power_text(result: CheckResult) -> str:
-    """Return the smallest error that the row would have found, in its unit and as a share of the claim."""
+    """Return the smallest error that the check would have detected, in its unit and relative to the paper's number."""
     if result.power is None:
         return "\N{EM DASH}"
     text = significant(result.power, 2, floor=0.0)
@@ -294,7 +294,7 @@ def _typeset(text: str) -> str:
 
 
 def _angles(page: str) -> str:
-    """Return a page with angles in the units of all reports.
+    """Return a report page with angles written in the unit symbols of all reports.
 
     The papers, and with them the checks, print 0.1 arcsec as 0.1″.
     """

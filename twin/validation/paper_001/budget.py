@@ -1,4 +1,8 @@
-"""Checks of paper 001's error budget: Tables 3 to 5, eq. (12) and section 3.2.3, with a figure."""
+"""Checks of paper 001's error budget: Tables 3 to 5, eq. (12) and section 3.2.3, with a figure.
+
+The budget converts errors of the monitor's spots, due to its thermal and mechanical causes, to errors of the cameras'
+parameters.
+"""
 
 from __future__ import annotations
 
@@ -37,7 +41,7 @@ FOCAL_PLANE, LONG_PRISM = "coordinate_thermal", "prism_180_thermal"
 FEW_DRAWS = (FOCAL_PLANE, "central_prism_thermal")
 """Causes with only two or three random numbers per state.
 
-They need more states than those of a prism in every channel.
+They need more random states than the causes that act on a prism in every channel.
 """
 ROLL = load_printed("001").number("table5.d_gamma_arcsec") * ARCSEC
 """Error of the roll d_gamma that Table 5 prints, radians."""
@@ -73,7 +77,7 @@ _PARAMETERS = {
 
 
 def frame_mean(error: float, frames: int = FRAMES) -> float:
-    """Return the random error of the mean of several frames from that of one frame, the first term of eq. (12)."""
+    """Return the random error of the mean of ``frames`` frames from that of one, the first term of eq. (12)."""
     return error / sqrt(frames)
 
 
@@ -94,7 +98,7 @@ def root_sum_of_squares(lines: Mapping[str, BudgetLine]) -> tuple[float, float]:
 
 
 def propagated(spot: float, geometry: MonitorGeometry, estimator: str = "paper_single") -> dict[str, float]:
-    """Return the errors of Table 5 from the error of one coordinate of one spot (Table 4), all independent.
+    """Return the errors of Table 5 from the error of one spot coordinate (Table 4); all coordinates are independent.
 
     Parameters
     ----------
@@ -191,7 +195,7 @@ def three_sigma(budget: ErrorBudget, cause: str) -> float:
 
 
 def more_trials(budget: ErrorBudget, factor: int) -> ErrorBudget:
-    """Return an error budget with ``factor`` times the trials for each cause."""
+    """Return an error budget with ``factor`` times as many random states for each cause."""
     other = copy(budget)
     other.spec = budget.spec.model_copy(update={"trials": factor * budget.spec.trials})
     return other
@@ -293,7 +297,10 @@ def run(context: Context) -> Iterator[CheckResult]:
 
 
 def _in_sum(images: BudgetImages, name: str, value: float) -> Chosen:
-    """Return the input of one cause, with the response of a root of a sum of squares to it."""
+    """Return the main input of one cause as a chosen input of a total error.
+
+    The total, a root of a sum of squares, depends on it through one term.
+    """
     line = images.lines[name]
     share = (frame_mean(1.0) if name == "centroid" else 1.0) * line.three_sigma / ARCSEC
 
@@ -346,7 +353,10 @@ def _show(context: Context, lines: Mapping[str, BudgetLine]) -> None:
 
 
 def _all_causes(value: float) -> list[Chosen]:
-    """Return all inputs together as a choice, to which every error is proportional."""
+    """Return the inputs of all causes, multiplied by one factor, as a chosen input.
+
+    Every error is proportional to that factor.
+    """
     return [Chosen.power("errors by all inputs of scenes/library/budgets/monitor_pair.yaml, times", 1.0, "1", value)]
 
 

@@ -1,7 +1,7 @@
 """Ranges of validity of the formulas of paper 001.
 
-Estimates from noise-free images are followed along single and joint changes, under defocus, and for other pupil
-offsets, fields and kinds of return reflector, up to where their errors exceed a tolerance.
+The errors of estimates from noise-free images are computed for increasing single and joint changes, under defocus, and
+for other pupil offsets, fields and kinds of return reflector, up to where they exceed a tolerance.
 """
 
 from __future__ import annotations
@@ -41,9 +41,9 @@ PRINTED, JOINT, CORRECTED, CALIBRATED = "printed", "Table 1", "corrected", "cali
 FORMS = (PRINTED, JOINT, CORRECTED, CALIBRATED)
 """Names of the four sets of formulas that are compared.
 
-They are eqs. (2), (3), (5), (7) with the arctangent; Table 1's joint forms; the same with f_x for d_alpha, half of
-d_gamma times f/f_x, no cos^2, and (7); those with the two calibrated gradients over the field as well. f and f_x are
-the focal lengths along and across the line.
+They are eqs. (2), (3), (5), (7) with the arctangent; Table 1's joint forms; the joint forms corrected: with f_x for
+d_alpha, half of d_gamma times f/f_x, no cos^2, and (7) for d_f; and the corrected forms with the two calibrated
+gradients over the field as well. f and f_x are the focal lengths along and across the line.
 """
 SHARE = 24
 """Number of images of 96 x 96 pixels that are rendered at once, to limit memory."""
@@ -51,7 +51,7 @@ ROUNDS, NEAR = 3, 1e-3
 """Refinement steps at most; and how near a point to a limit, relative to the size, makes another one needless."""
 
 Sample = Callable[[np.ndarray], Mapping[str, np.ndarray]]
-"""Function from N sizes of a change, (N,), to name -> (N,) errors as shares of the allowed one.
+"""Function from N sizes of a change, (N,), to name -> (N,) errors divided by the allowed error.
 
 The values are not negative; at 1 the limit is reached.
 """
@@ -65,10 +65,10 @@ class Bench:
     experiment
         Monitoring experiment with the instrument.
     like
-        Another bench with the same cameras whose geometry is used.
+        Another bench with the same cameras, whose geometry is used.
     shapes
-        True to use its spot shapes as well; needed for larger CCDs, of which only a window around each spot is read
-        out, as large as the CCDs of ``like``.
+        True to use the spot shapes of ``like`` as well; needed for larger CCDs, of which only a window around each spot
+        is read out, as large as the CCDs of ``like``.
     """
 
     def __init__(self, experiment: MonitorExperiment, like: Bench | None = None, shapes: bool = False) -> None:
@@ -108,9 +108,9 @@ class Bench:
         return out
 
     def traced(self, states: Sequence[State]) -> np.ndarray:
-        """Return the means of the traced rays over the return face, also for spots outside the CCD.
+        """Return the mean of each spot's traced rays, also for spots outside the CCD.
 
-        They are (S, C, 2) (row, column) for S states and C channels, in pixels from the CCD's middle.
+        The positions are (S, C, 2) (row, column) for S states and C channels, in pixels from the CCD's middle.
 
         Raises
         ------
@@ -128,9 +128,10 @@ class Bench:
         return np.moveaxis(known.centre, 0, 1)
 
     def readings(self, start: np.ndarray, end: np.ndarray) -> dict[str, dict[str, np.ndarray]]:
-        """Return camera -> set of formulas -> (S, 4) estimated changes for S states, from spot positions (S, C, 2).
+        """Return camera -> set of formulas -> estimated changes in S states, (S, 4).
 
-        The units are those of ``monitoring.PARAMETERS``; C is the number of channels.
+        The estimates are computed from spot positions before and after the change, (S, C, 2) for C channels. The units
+        are those of ``monitoring.PARAMETERS``.
         """
         start = np.broadcast_to(start, end.shape)
         nothing = np.zeros((4, 4))
@@ -174,28 +175,31 @@ def _windows(images: np.ndarray, shape: tuple[int, int]) -> tuple[np.ndarray, np
 
 @dataclass(frozen=True, eq=False)
 class Curves:
-    """Errors over the size of a change.
+    """Errors as functions of the size of a change.
 
     Attributes
     ----------
     size : np.ndarray
         The N sizes, (N,), ascending, > 0.
     value : Mapping[str, np.ndarray]
-        Name -> (N,) errors as shares of what is allowed.
+        Name -> (N,) errors divided by the allowed error.
     """
 
     size: np.ndarray
     value: Mapping[str, np.ndarray]
 
     def bracket(self, name: str) -> int | None:
-        """Return the index of the first size at which the limit is exceeded, None if it never is."""
+        """Return the index of the first size at which the limit is exceeded, None if it never is.
+
+        The limit is a value of 1.
+        """
         beyond = np.flatnonzero(self.value[name] > 1.0)
         return int(beyond[0]) if len(beyond) else None
 
     def crossing(self, name: str) -> float | None:
-        """Return the size at which the limit is first exceeded, interpolated on logarithmic axes.
+        """Return the size at which the limit (a value of 1) is first exceeded, interpolated on logarithmic axes.
 
-        None if it never is, 0 if it is exceeded at the smallest size already.
+        It is None if the limit is never exceeded, 0 if it is exceeded at the smallest size already.
         """
         k = self.bracket(name)
         if k is None:
@@ -215,12 +219,14 @@ class Curves:
 
 @dataclass(frozen=True, eq=False)
 class Domain:
-    """Domain of validity: errors from rendered images as far as possible, then traced until the beam is lost.
+    """Range of sizes of a change over which formulas are valid, from images and, for larger sizes, from ray traces.
+
+    The traces go on until the beam is lost.
 
     Attributes
     ----------
     images, traced : Curves
-        Curves over the size; both have the same names.
+        Errors over the size; both have the same names.
     lost : float
         Size beyond which the beam is lost or not followed.
     lost_why : str
@@ -233,7 +239,10 @@ class Domain:
     lost_why: str
 
     def limit(self, name: str) -> tuple[float, str]:
-        """Return the largest size within a limit, and its source: "images", "trace" or why there is no limit."""
+        """Return the largest size with an error within its limit, and the source of this size as text.
+
+        The source is "images", "trace", or the reason why there is no limit.
+        """
         for curves, whence in ((self.images, "images"), (self.traced, "trace")):
             crossing = curves.crossing(name)
             if crossing is not None:
@@ -276,7 +285,7 @@ CLAIMED = {
     "d_gamma": _TABLE.number("table5.d_gamma_arcsec"),
     "d_f": 1e3 * _TABLE.number("table5.d_f_mm"),
 }
-"""Parameter -> error claimed by section 3.3 and Table 5, in arcsec and um."""
+"""Parameter -> error that section 3.3 and Table 5 of the paper claim, in arcsec and um."""
 FINE = {"d_alpha": 0.1, "d_beta": 0.1, "d_gamma": 0.1, "d_f": 40.0}
 """Parameter -> tighter tolerance: 0.1 arcsec for all angles, and Table 5's 0.04 mm for d_f."""
 RELATIVE = 0.01
@@ -290,7 +299,7 @@ WIDE_PX = 384
 """Rows and columns of the larger CCD with which errors are followed beyond the edge of the instrument's own CCD."""
 _START = {"d_alpha": 0.02, "d_beta": 0.02, "d_gamma": 0.02, "d_f": 8.0}
 _FAR = {"d_alpha": 3600.0, "d_beta": 3600.0, "d_gamma": 36000.0, "d_f": 600e3}
-"""Parameter -> largest change up to which the trace follows it, table units."""
+"""Parameter -> largest change that the ray trace is extended to, in arcsec and um."""
 _WIDE_SHARE = 0.76
 _Raw = dict[str, list[np.ndarray]]
 KINDS = ("1 %", "fine", "claimed")
@@ -306,9 +315,9 @@ _FAR_BOX = 200.0
 
 @dataclass(frozen=True, eq=False)
 class Range(Domain):
-    """Range of one parameter changed in one direction; sizes are true changes in table units.
+    """Range of validity of the formulas for one parameter changed in one direction.
 
-    The names of the curves are those of ``criterion`` and WINDOW.
+    Sizes are true changes in arcsec and um. The names of the curves are those of ``criterion`` and WINDOW.
 
     Attributes
     ----------
@@ -332,17 +341,17 @@ class Range(Domain):
 
     @property
     def window(self) -> float:
-        """True change at which the first spot comes too near the area CCD's edge, table units."""
+        """True change at which the first spot comes too near the area CCD's edge, in arcsec or um."""
         return self.limit(WINDOW)[0]
 
 
 def criterion(form: str, kind: str) -> str:
-    """Return the name of the error of a set of formulas as a share of "1 %", "0.1" or "claimed"."""
+    """Return the name of the curve of a set of formulas' error divided by the allowed one: 1 %, 0.1 or "claimed"."""
     return f"{form} {kind}"
 
 
 def motion_of(camera: str, parameter: str, geometry: MonitorGeometry) -> tuple[ElementaryMotion, float]:
-    """Return the single motion of a parameter, and its amount (SI) for one table unit of change."""
+    """Return the motion that changes one parameter alone, and its amount (SI units) per arcsec or um of change."""
     k = NAMES.index(parameter)
     f, f_x = focal_lengths(geometry)
     amount = (-f_x * ARCSEC, f * ARCSEC, ARCSEC * f_x / f, 1e-6 / f)[k]
@@ -350,7 +359,7 @@ def motion_of(camera: str, parameter: str, geometry: MonitorGeometry) -> tuple[E
 
 
 def single_range(bench: Bench, wide: Bench, parameter: str, sign: int, count: int) -> Range:
-    """Follow one parameter in one direction, up to where the beam is lost.
+    """Compute errors for increasing changes of one parameter in one direction, up to where the beam is lost.
 
     Parameters
     ----------
@@ -424,7 +433,7 @@ def single_range(bench: Bench, wide: Bench, parameter: str, sign: int, count: in
 
 
 def _joined(parts: Mapping[str, list[np.ndarray]]) -> dict[str, np.ndarray]:
-    """Return set of formulas -> N pairs of true change and error, (N, 2), ascending in the change."""
+    """Return set of formulas -> N pairs of true change and error, (N, 2), in ascending order of the change."""
     out = {}
     for form, pieces in parts.items():
         joined = np.concatenate(pieces)
@@ -433,7 +442,10 @@ def _joined(parts: Mapping[str, list[np.ndarray]]) -> dict[str, np.ndarray]:
 
 
 def beam_end(bench: Bench, states: Callable[[np.ndarray], list[State]], start: float, far: float) -> tuple[float, str]:
-    """Return the largest size with whole beams, from ``start`` up to ``far``, to 1 %, and the reason of the limit."""
+    """Return the largest size of a change at which no part of a beam is lost, to 1 %, and the reason of the limit.
+
+    The size is searched between ``start`` and ``far``.
+    """
 
     def fault(size: float) -> str:
         try:
@@ -456,7 +468,7 @@ def beam_end(bench: Bench, states: Callable[[np.ndarray], list[State]], start: f
 
 
 def joint_states(bench: Bench, changes: Mapping[str, np.ndarray]) -> list[State]:
-    """Return S states in which every camera has given changes, (S, 4), in table units, as exactly as motions can."""
+    """Return S states in which every camera has given changes, (S, 4), in arcsec and um, to the motions' accuracy."""
     states: list[dict[str, Motion]] = [{} for _ in next(iter(changes.values()))]
     for camera, wanted in changes.items():
         units = [motion_of(camera, name, bench.geometry(camera))[1] for name in NAMES]
@@ -468,25 +480,28 @@ def joint_states(bench: Bench, changes: Mapping[str, np.ndarray]) -> list[State]
 
 @dataclass(frozen=True, eq=False)
 class Corners(Domain):
-    """Largest errors at the 16 corners of the box of joint changes, over the size as a share of the box.
+    """Largest errors at the 16 corners of the box of joint changes, for boxes of increasing size.
 
-    The names of the curves consist of set of formulas and parameter; the values are the largest error of all corners
-    and cameras as a share of what is claimed.
+    The size is a fraction of the full box. The names of the curves consist of set of formulas and parameter; the values
+    are the largest error of all corners and cameras divided by the error that the paper claims.
     """
 
     def text(self, name: str) -> str:
-        """Return the limit of an error, as a share of the box, as text."""
+        """Return the size of the box at which an error reaches its limit, as a fraction of the full box, as text."""
         share, whence = self.limit(name)
         return f"{share:.3g}" + (" (beam cut)" if whence == self.lost_why else "")
 
 
 def key(form: str, parameter: str, fine: bool = False) -> str:
-    """Return the name of an error as a share of what Table 5 claims or, if ``fine``, of 0.1 arcsec and 0.04 mm."""
+    """Return the name of the curve of an error divided by what Table 5 claims.
+
+    If ``fine``, the error is divided by 0.1 arcsec or 0.04 mm instead.
+    """
     return f"{form} {parameter}{' fine' if fine else ''}"
 
 
 def corners(bench: Bench, count: int) -> Corners:
-    """Follow the errors at the corners of the box, from a thousandth of its size until beams are vignetted."""
+    """Compute the errors at the corners of boxes, from a thousandth of the full size until beams are vignetted."""
     origin, traced_origin = bench.positions([{}]), bench.traced([{}])
 
     def states(share: np.ndarray) -> list[State]:
@@ -592,7 +607,7 @@ SHIFT = 60e-6
 CONFOCAL = load_printed("004").number("alignment.confocal_mm") / 1e3
 """Accuracy with which paper 004 sets the line CCD to the focus, metres."""
 SMALL = {"d_alpha": 2.0, "d_beta": 2.0, "d_gamma": 40.0, "d_f": 1500.0}
-"""Parameter -> single change for the comparison of defocused cameras and other fields, table units.
+"""Parameter -> single change for the comparison of defocused cameras and other fields, in arcsec and um.
 
 The spots move by a third of the area CCD.
 """
@@ -607,12 +622,12 @@ def variant(
     field: float | None = None,
     ccd_offset: tuple[float, float] | None = None,
 ) -> MonitorExperiment:
-    """Build the experiment anew with one camera of an instrument, changed.
+    """Return a new experiment with one camera of an instrument, in which the given properties are changed.
 
     Parameters
     ----------
     resolved : ResolvedJob
-        Instrument as its file gives it.
+        Instrument as specified in its file.
     backend : Backend
         Backend of the ray trace.
     camera : str
@@ -712,9 +727,9 @@ class Response:
     kind : str
         One of RETURNS.
     across, along : (2,) ndarray
-        Motion of the spots (left, right) over the motion of the line CCD across and along the line.
+        Motion of the spots (left, right) divided by the motion of the line CCD, across and along the line.
     gain : (4,) ndarray
-        Corrected estimate over truth for single changes.
+        Estimate by the corrected formulas divided by the true change, for single changes of the four parameters.
     """
 
     kind: str
@@ -753,9 +768,11 @@ def piston(camera: str, amount: float, *, along: tuple[float, float] = (0.0, 0.0
 
 
 def false_slopes(bench: Bench, form: str, pistons: Sequence[float]) -> np.ndarray:
-    """Return the false change per metre of piston between before and after, (4,), table units per metre.
+    """Return the false change of each parameter per metre of piston of the line CCD, (4,).
 
-    It is the estimate minus the truth, from rendered images.
+    The unit is arcsec or um per metre.
+
+    It is the estimate minus the true change, from rendered images before and after the piston.
     """
     camera = bench.cameras[0]
     states = [piston(camera, z) for z in pistons]
@@ -767,18 +784,20 @@ def false_slopes(bench: Bench, form: str, pistons: Sequence[float]) -> np.ndarra
 
 @dataclass(frozen=True, eq=False)
 class PupilStudy:
-    """False changes due to piston, over the position of the monitor's sub-aperture in the pupil.
+    """False changes due to piston of the line CCD, over the position of the monitor's sub-aperture in the pupil.
+
+    A false change is an estimate minus the true change, in arcsec or um.
 
     Attributes
     ----------
     offset : np.ndarray
         (N, 2) X and Y of the N sub-apertures, metres.
     slope : np.ndarray
-        (N, 4) false change of each parameter per metre of piston, table units, corrected form.
+        (N, 4) false change of each parameter per metre of piston, by the corrected formulas.
     gradient : np.ndarray
-        (4, 2) change of the slope with X and Y, table units per m^2.
+        (4, 2) derivatives of the slope with respect to X and Y, arcsec or um per m^2.
     rest : np.ndarray
-        (4,) rms of the slopes about that plane, table units per metre.
+        (4,) rms of the slopes about that plane, arcsec or um per metre.
     """
 
     offset: np.ndarray
@@ -790,7 +809,10 @@ class PupilStudy:
 def pupil_study(
     resolved: ResolvedJob, backend: Backend, like: Bench, offsets: Sequence[tuple[float, float]], depth: float
 ) -> PupilStudy:
-    """Return the false changes due to piston, with the instrument built anew for each position of the sub-aperture."""
+    """Return the false changes due to piston for several positions of the monitor's sub-aperture.
+
+    The instrument is built again for each position.
+    """
     slopes = []
     for offset in offsets:
         bench = Bench(variant(resolved, backend, like.cameras[0], pupil_offset=offset), like)
@@ -803,9 +825,9 @@ def pupil_study(
 
 
 def piston_curves(bench: Bench, count: int) -> Curves:
-    """Return the false changes by the corrected form over the piston, in metres, as shares of FINE and CLAIMED.
+    """Return the false changes by the corrected formulas over the piston (m), divided by FINE and by CLAIMED.
 
-    They are those of the worse of the two directions.
+    Of the two directions of the piston, the one with the larger error counts.
     """
     camera, origin = bench.cameras[0], bench.positions([{}])
 
@@ -823,7 +845,7 @@ def piston_curves(bench: Bench, count: int) -> Curves:
 
 
 def gains(bench: Bench, constant: float = 0.0) -> dict[str, np.ndarray]:
-    """Return set of formulas -> (4,) estimate over truth of the SMALL single changes.
+    """Return set of formulas -> estimate divided by true change, (4,), for the four single changes SMALL.
 
     The same piston, ``constant`` metres, is present before and after.
     """
@@ -856,9 +878,9 @@ class FieldPoint:
     separation : float
         Distance between the area CCDs, metres.
     gains : dict[str, np.ndarray]
-        Set of formulas -> (4,) estimate over truth.
+        Set of formulas -> (4,) estimate divided by true change.
     slope : np.ndarray
-        (4,) false change per metre of piston, corrected form, table units.
+        (4,) false change per metre of piston by the corrected formulas, in arcsec or um.
     """
 
     field: float
@@ -870,7 +892,10 @@ class FieldPoint:
 def field_study(
     resolved: ResolvedJob, backend: Backend, camera: str, fields: Sequence[float], depth: float
 ) -> list[FieldPoint]:
-    """Return the formulas' accuracy with the instrument built anew for area CCDs at each field angle, radians."""
+    """Return the accuracy of the formulas for area CCDs at several field angles, radians.
+
+    The instrument is built again for each field angle.
+    """
     out = []
     for field in fields:
         bench = Bench(variant(resolved, backend, camera, field=field))

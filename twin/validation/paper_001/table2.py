@@ -2,11 +2,12 @@
 
 The rotation "about Z" has to be interpreted. X is up and Y horizontal, so Z is the view of autocollimator 1, along the
 normal of mirror 1: autocollimator 1 cannot observe a rotation about it, and reads its own noise. Mirror 2 rotates about
-Z1 = Y2 sin b + Z2 cos b, with the angle b between the mirrors' normals; of a rotation d_gamma its autocollimator
-observes d_gamma sin b, about Y2. The printed column of mirror 1 grows by 0.8657 of the table's angle and not by 1 or 0:
-it is d_gamma sin 60 deg, and times 2/sqrt(3) it is the column of mirror 2 in all digits. It is therefore the unscaled
-reading of autocollimator 2. A stand with both mirrors at an angle theta = b/2 from Z would read d_gamma sin(theta) =
-0.5 d_gamma on both, and a rotation about the vertical d_gamma; neither is printed.
+Z1 = Y2 sin b + Z2 cos b, with the angle b between the mirrors' normals (indices 1 and 2 name the autocollimators); of a
+rotation d_gamma its autocollimator observes d_gamma sin b, about Y2. The printed column of mirror 1 grows by 0.8657 of
+the table's angle and not by 1 or 0: it is d_gamma sin 60 deg, and times 2/sqrt(3) it is the column of mirror 2 in all
+digits. It is therefore the unscaled reading of autocollimator 2. An arrangement with both mirrors at an angle theta =
+b/2 from Z would read d_gamma sin(theta) = 0.5 d_gamma on both, and a rotation about the vertical d_gamma; neither is
+printed.
 """
 
 from __future__ import annotations
@@ -53,7 +54,7 @@ class Measured:
 
 
 def measured(context: Context) -> Measured:
-    """Render and read the ideal bench and benches with the specified errors."""
+    """Simulate the readings of the ideal bench and of benches with the specified errors."""
     setup = load_autocollimator_test()
     context.progress(0.0, "calibrate the autocollimators")
     reader = laboratory.Reader(setup, context.backend)
@@ -156,7 +157,10 @@ def _z_columns(context: Context, measurement: Measured) -> CheckResult:
 
 
 def _errors(measured: float) -> Chosen:
-    """Return all errors of the bench together as a chosen input, to which mean differences are proportional."""
+    """Return all errors of the bench, multiplied by one factor, as a chosen input.
+
+    Mean differences are proportional to that factor.
+    """
     return Chosen.power("errors of the bench (scenes/lab/principle_experiment.yaml), times", 1.0, "1", measured)
 
 
@@ -215,7 +219,7 @@ def bench_png(reader: laboratory.Reader, tables: Sequence[laboratory.ReadingTabl
 
 
 def _plan(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Project points of the bench, (..., 3), onto the drawing, in millimetres.
+    """Project points of the bench, (..., 3), metres, onto the plan view: two coordinates in millimetres.
 
     They are seen from above (X up): Z to the right, Y down.
     """

@@ -1,7 +1,7 @@
 """Checks of the rigorous model of paper 003.
 
-They use exact points, bright targets on the ground and matched points in rendered images, and points drawn at random. A
-figure shows the combination of parameters that the points cannot determine.
+They use exact points, bright targets on the ground and matched points in rendered images, and points with random
+errors. A figure shows the combination of parameters that the points cannot determine.
 """
 
 from __future__ import annotations
@@ -56,19 +56,19 @@ UNKNOWNS = len(LINES) * len(INTERIOR) + len(BIAS)
 ROLL_PITCH = BIAS[:2]
 FREE_INTERIOR = tuple(n for n in (f"{line} {k}" for line in LINES for k in INTERIOR) if n not in GAUGE.held)
 TOLERANCE = 1e-3
-"""Largest last step of a round of the stepwise solution, in conditional sigmas."""
+"""Convergence limit of the stepwise solution: largest last step of a round, in conditional sigmas of the unknowns."""
 PLACES = (700.0, 6000.0, 11300.0)
 """Pixels of the nadir line at the middles of the windows; the line has 12 000 pixels over the swath."""
 _FOCAL = 0.65
-"""Focal length, metres, with which angles are drawn as image motion."""
+"""Focal length, metres, with which angles are converted to image motion in figures."""
 _NO_LIGHT = EffectsSpec(light_time=False, aberration=False, refraction=False)
 _STEP = {"f": 1e-5, "x": 1e-5, "y": 1e-5}
-"""Change of an element of interior orientation for numerical derivatives, metres, to either side: 1.5 px.
+"""Half step of numerical derivatives with respect to an element of interior orientation, metres (1.5 px).
 
 The error of third order is 1e-9 of the derivative.
 """
 _TURN = 1.5e-5
-"""Change of an attitude angle for numerical derivatives, radians, to either side."""
+"""Half step of numerical derivatives with respect to an attitude angle, radians."""
 _SIDE = 190
 _SIGMA = 2.5
 """Standard deviation of the brightness of a target on the ground, metres: half a pixel.
@@ -116,9 +116,9 @@ def exact_and_images() -> CalibrationSetup:
 
 
 def all_errors(value: float) -> Chosen:
-    """Return the errors of biases, orbit, attitude and points as one input.
+    """Return the errors of biases, orbit, attitude and points, multiplied by one factor, as a chosen input.
 
-    The errors of a calibration are proportional to it.
+    The errors of a calibration are proportional to that factor.
     """
     return Chosen.power("biases and errors of scenes/orbit/calibrate.yaml, times", 1.0, "1", value)
 
@@ -184,7 +184,7 @@ class Turned:
 
 
 def rays_at(sensor: Sensor, attitude: Platform, pitch: float, line: np.ndarray, pixel: np.ndarray) -> Rays:
-    """Return the rays of image points with the station and the given attitude at their exposure times."""
+    """Return the rays of image points, from the exposure stations and with the given attitude at the exposure times."""
     seconds = sensor.time(line)
     y = pitch * (pixel - 0.5 * (sensor.camera.pixels - 1))
     image = np.column_stack([np.zeros_like(y), y])
@@ -211,7 +211,7 @@ def derivatives(setup: CalibrationSetup, field_pass: FieldPass, bias: np.ndarray
     Returns
     -------
     tuple of (str, str, float)
-        Line and unknown with the largest deviation, and its largest difference relative to the largest coefficient.
+        Line and unknown with the largest deviation, and that deviation relative to the largest coefficient.
     """
     payload = changed_payload(setup.test, setup.camera)
     ground, still = field_pass.check_ground, np.zeros(3)
@@ -238,9 +238,11 @@ def derivatives(setup: CalibrationSetup, field_pass: FieldPass, bias: np.ndarray
 def places_seen(
     setup: CalibrationSetup, field_pass: FieldPass, line: str, interior: np.ndarray, bias: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return lines and pixels of the check points in a line with changed f, x, y (3,) and an attitude bias (3,).
+    """Return image lines and pixels of the check points in a camera line with changed orientation.
 
-    They are those of the rigorous sensor.
+    They are computed by the rigorous sensor model.
+
+    ``interior`` holds the changes of f, x, y, (3,), metres; ``bias`` the attitude bias, (3,), radians.
     """
     turned = Turned(field_pass.trajectory, bias)
     return true_sensors(setup, field_pass, turned, {line: interior})[line].image(field_pass.check_ground)
@@ -264,7 +266,7 @@ def recovered(campaign: Campaign, pitch: float) -> tuple[float, str]:
 
 
 def errors_of(campaign: Campaign, field_pass: FieldPass, adjustment: Adjustment | Stepwise) -> dict[str, float]:
-    """Return unknown, without the field's name -> estimated minus true value, metres or radians."""
+    """Return unknown (without the field's name) -> estimated minus true value, metres or radians."""
     value = dict(zip(adjustment.names, adjustment.values, strict=True))
     out = {
         f"{line} {name}": float(value[f"{line} {name}"] - true)
@@ -285,10 +287,10 @@ class Rank:
     open : tuple of Combination
         Undetermined combinations.
     weak_sigma : float
-        Sigma of nadir y, in metres, with nadir x fixed.
+        Sigma of the nadir line's y, in metres, with its x held fixed.
     moved : float
-        RMS displacement of the rigorous sensor's image points, in pixels, due to the undetermined combination with 0.1
-        mm in x of every line.
+        RMS displacement of the rigorous sensor's image points, in pixels, due to the undetermined combination, scaled
+        to 0.1 mm in x of every line.
     alone : float
         RMS displacement due to the changes of x alone, in pixels.
     """
@@ -329,7 +331,7 @@ def rank_of(setup: CalibrationSetup, campaign: Campaign) -> Rank:
 
 @dataclass(frozen=True, eq=False)
 class Walk:
-    """Comparison of the stepwise solution of a field with the simultaneous one.
+    """Comparison of the stepwise solution of a field's calibration with the simultaneous one.
 
     Attributes
     ----------
@@ -338,9 +340,9 @@ class Walk:
     together : Adjustment
         Simultaneous solution.
     distance : float
-        Largest difference between them, in sigmas.
+        Largest difference between the unknowns of both, in sigmas.
     after : Mapping[int, float]
-        Number of rounds -> largest difference after so many, sigmas.
+        Number of rounds of the stepwise solution -> largest difference after these, sigmas.
     """
 
     found: Stepwise
@@ -366,7 +368,7 @@ def walked(campaign: Campaign, field_pass: FieldPass, rounds: tuple[int, ...] = 
 
 @dataclass(frozen=True, eq=False)
 class FoundMarks:
-    """Bright targets measured in all windows of one line.
+    """Measured image positions of the bright ground targets in all image windows of one camera line.
 
     Attributes
     ----------
@@ -398,7 +400,7 @@ class _Spots:
 
 
 def rendered_marks(setup: CalibrationSetup, campaign: Campaign, seed: np.random.SeedSequence) -> dict[str, FoundMarks]:
-    """Return line -> bright targets measured in it, four in each window over the first field of a campaign.
+    """Return camera line -> bright ground targets measured in it, four in each window over a campaign's first field.
 
     They are located by their centroids.
     """
@@ -433,7 +435,7 @@ def rendered_marks(setup: CalibrationSetup, campaign: Campaign, seed: np.random.
 
 
 def missed(setup: CalibrationSetup, campaign: Campaign, marks: dict[str, FoundMarks]) -> dict[str, np.ndarray]:
-    """Return line -> (n, 2) misclosures of the analysis's model at the line's n bright targets, in pixels.
+    """Return camera line -> misclosures of the analysis's model at the line's n bright targets, (n, 2), in pixels.
 
     The model has the true interior orientation and bias, the measured attitude and the known ground.
     """
@@ -447,7 +449,10 @@ def missed(setup: CalibrationSetup, campaign: Campaign, marks: dict[str, FoundMa
 
 
 def _brightest(image: np.ndarray, count: int) -> list[tuple[int, int]]:
-    """Return the brightest pixels, each farther from the previous ones than the image of a target extends."""
+    """Return the brightest pixels of an image, one for each of ``count`` targets, as (row, column).
+
+    Each is farther from the previous ones than the image of a target extends.
+    """
     rest = image.copy()
     out = []
     for _ in range(count):
@@ -493,11 +498,11 @@ class FromImages:
     together : Adjustment
         Simultaneous solution, for sigmas.
     error : dict of str to float
-        Stepwise estimate minus truth of each free unknown, radians and metres.
+        Stepwise estimate minus true value of each free unknown, radians and metres.
     covariance : ndarray
         Covariance of these unknowns, in their order.
     before, after : CheckErrors
-        Errors at check points with the laboratory's camera and with the field's parameters.
+        Errors at check points with the laboratory calibration of the camera and with the field's parameters.
     """
 
     name: str
@@ -585,7 +590,7 @@ def summary(from_images: FromImages, names: tuple[str, ...]) -> str:
 
 @drawing("paper-003-open", 3.4)
 def open_svg(figure: Figure, rank: Rank, walk: Walk) -> None:
-    """Draw the undetermined combination as bars, and the stepwise solution's difference in sigmas over its rounds."""
+    """Draw the undetermined combination as bars, and how the stepwise solution converges over its rounds, in sigmas."""
     left, right = figure.subplots(1, 2)
     combination = rank.open[0]
     names = [n if n.split()[-1] in "fxy" else n.split()[-1] for n in combination.names]

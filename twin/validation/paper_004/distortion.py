@@ -1,9 +1,9 @@
 """Checks of paper 004, sections 3.1 and 3.3: equations (1) to (4), Table 2 and the sources of error.
 
-Distortion tests use rendered collimator spots and exact chief rays. Measured: positions of spots in rendered images,
-angles from the readings of a compensated turntable. True: chief rays of the as-built camera traced at the true angles,
-and the nearest camera without distortion. Without noise the equations are solved on chief rays of the camera as
-designed.
+Distortion tests use rendered collimator spots and exact chief rays. Measured values are positions of spots in rendered
+images and angles from the readings of a compensated turntable. True values are chief rays of the as-built camera traced
+at the true angles, and the nearest camera without distortion. Without noise the equations are solved on chief rays of
+the camera as designed.
 """
 
 from __future__ import annotations
@@ -47,7 +47,8 @@ FEW = 5
 UNEVEN = slice(0, 44)
 """Points from one end of the line to six tenths of the other half, for the check of uneven spacing.
 
-There f and p of eq. (2) are correlated, and the camera's radial distortion causes a p of 54 mm, which no noise hides.
+For these points the estimates of f and p by eq. (2) are correlated, and the camera's radial distortion causes a
+principal point p of 54 mm, far above the noise.
 """
 _PRINTED_ONLY = {f"004.table2.{name}" for name in ("reduction", "mean", "largest", "bound")}
 
@@ -106,7 +107,10 @@ class Perspective:
 
 @dataclass(frozen=True, eq=False)
 class SpotTest:
-    """Positions and angles of one rendered test for the equations, with their true values."""
+    """Positions L and angles W of one rendered distortion test, with their true values.
+
+    L is the position of a point along the line CCD, W the angle of its direction.
+    """
 
     run: SimulatedDistortion
 
@@ -142,7 +146,7 @@ class SpotTest:
 
     @cached_property
     def part(self) -> Perspective:
-        """Principal distance, principal point and distortion of the traced camera from the uneven points alone."""
+        """Principal distance, principal point and distortion of the traced camera from unevenly spaced points."""
         return Perspective.nearest(self.true_place[UNEVEN], self.true_turn[UNEVEN])
 
     @property
@@ -163,7 +167,7 @@ class SpotTest:
         return coefficients, np.asarray(moved - columns @ coefficients)
 
     def errors(self, turn: Array, points: slice | NDArray[np.intp]) -> tuple[float, float]:
-        """Return the error of f and the RMS error of the distortion, metres, for some points and angles.
+        """Return the error of f and the RMS error of the distortion, metres, for selected points with given angles.
 
         A constant, f and p are fitted to these points.
         """
@@ -243,7 +247,7 @@ def _table2(context: Context) -> Iterator[CheckResult]:
 
 
 Facts = Mapping[str, Any]
-"""Facts that the texts of all rows of rendered tests may name."""
+"""Computed values that the texts of all checks with rendered tests may name."""
 
 
 def _eq1(context: Context, tests: Sequence[SpotTest], facts: Facts) -> Iterator[CheckResult]:
@@ -333,7 +337,7 @@ def _uneven(
 
 
 def _sensitivity(context: Context, tests: Sequence[SpotTest], facts: Facts) -> Iterator[CheckResult]:
-    """Check the rows of the sources of error."""
+    """Check the paper's statements about the sources of error."""
     if not context.wants("004.sensitivity"):
         return
     half = np.flatnonzero(np.abs(tests[0].run.bench.field_angle) <= 0.5 * tests[0].run.bench.field_angle[-1])
@@ -413,7 +417,7 @@ def _errors_of_tests(context: Context, tests: Sequence[SpotTest], facts: Facts) 
 def _moved(test: SpotTest) -> Array:
     """Return the change of the distortion at N points due to a correction of the readings, (N,), in metres.
 
-    It is f times the correction, without the part that zero, f and p absorb.
+    It is the principal distance f times the correction, without the part that the fit of zero, f and p absorbs.
     """
     correction = test.camera.f * (test.turn - test.run.raw.fit.angle)
     columns = np.tan(test.turn)[:, None] ** np.arange(3)
@@ -463,7 +467,7 @@ def _statistics(raw: Array, compensated: Array) -> list[Cell]:
 
 @drawing("reduction-004", 4.2)
 def reduction_svg(figure: Figure, errors: NDArray[np.float64], paper: tuple[float, float], reduction: float) -> None:
-    """Draw the RMS with compensated over the RMS with raw angles, of each of T tests and of the paper.
+    """Draw the RMS error with compensated angles divided by that with raw angles, for T tests and for the paper.
 
     The errors are (T, 2), raw and compensated, in micrometres; the reduction is the one that the paper claims.
     """
@@ -486,10 +490,10 @@ def reduction_svg(figure: Figure, errors: NDArray[np.float64], paper: tuple[floa
 
 @drawing("principal-point-004", 3.6)
 def points_svg(figure: Figure, by_eq2: NDArray[np.float64], free: NDArray[np.float64]) -> None:
-    """Draw the principal points of T tests.
+    """Draw the principal points p of T tests.
 
-    The first array (T, 3) has the error of the zero in arcsec, p of eq. (2) and the p that the zero explains in mm; the
-    second (T, 2) has p with a constant term and its sigma, in mm.
+    The first array (T, 3) has the error of the angles' zero in arcsec, p by eq. (2) and the p that this error explains,
+    in mm; the second (T, 2) has p from a fit with a constant term and its sigma, in mm.
     """
     left, right = figure.subplots(1, 2)
     zero, estimated, explained = by_eq2[np.argsort(by_eq2[:, 0])].T
@@ -544,12 +548,12 @@ def run_equations(context: Context) -> Iterator[CheckResult]:
 
 
 def _turn_to(places: Callable[[Array], Array], wanted: float, most: float) -> float:
-    """Return the rotation within ±``most`` that is imaged to a given position on the line, in radians."""
+    """Return the rotation of the table, within ±``most``, that is imaged to a given position on the line, radians."""
     return float(brentq(lambda w: float(places(np.array([w]))[0]) - wanted, -most, most, xtol=1e-14))
 
 
 def _ignored(context: Context, places: Callable[[Array], Array], turn: Array, pitch: float) -> CheckResult:
-    """Check eq. (3) with positions and angles counted from a point one pixel beside the middle of the line."""
+    """Check eq. (3) with positions and angles counted from a point one pixel off the middle of the line."""
     where, beside = places(turn), _turn_to(places, pitch, float(turn[-1]))
     shift = float(places(np.array([beside]))[0])
     first = distortion(where, turn, principal_distance(where, turn))

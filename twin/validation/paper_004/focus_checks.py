@@ -32,9 +32,9 @@ CONFOCAL_MM = load_printed("004").number("alignment.confocal_mm")
 LINE_LEVEL_ARCMIN = load_printed("004").number("alignment.line_level_arcmin")
 PARAMETERS = ("Δα", "Δβ", "Δγ", "Δx", "Δy", "Δz")
 ADJUSTMENTS = ("tilt about the surface's x", "tilt about its y", "turn in it", "slide along x", "slide along y", "lift")
-"""Names of the six adjustments of the mount: tilts and lift are made by shims, the others by hand."""
+"""Names of the six adjustments of the mount: tilts and height are set by shims, the others by hand."""
 LIMITS = np.array([10.0 * ARCSEC, 10.0 * ARCSEC, 10.0 * ARCSEC, 7e-6, 7e-6, 5e-6])
-"""Smallest change of each of the six parameters that counts, radians and metres.
+"""Smallest significant change of each of the six parameters, radians and metres.
 
 They are the theodolite's 10 arcsec, a panchromatic pixel, and a step of the shims.
 """
@@ -46,10 +46,11 @@ _ALL_LOSSES = "what the scene file assumes beyond the paper, in waves, pixels or
 
 
 def effects(bench: FocusBench, inclined: float = 1.0) -> Array:
-    """Return the change of each of six parameters due to each of six adjustments, (6, 6), radians and metres.
+    """Return the change of each of the focal plane's six parameters due to each of six adjustments, (6, 6).
 
-    The size of each adjustment is the initial error of the assembly. The changes Δα, Δβ and Δz are those of the plane
-    through the traced defocus of all sites; Δγ is the rotation of the line, Δx and Δy the displacement of its middle.
+    The unit is radians or metres. The size of each adjustment is the initial error of the assembly. The changes Δα, Δβ
+    and Δz are those of the plane through the traced defocus of all sites; Δγ is the rotation of the line, Δx and Δy the
+    displacement of its middle.
 
     Parameters
     ----------
@@ -108,7 +109,7 @@ def _coupling(context: Context, bench: FocusBench) -> CheckResult:
 def coupled(change: Array) -> float:
     """Return the number of parameters in the largest set that adjustments couple one after the other.
 
-    The changes are those of `effects`.
+    ``change`` is the matrix that `effects` returns.
     """
     seen = np.abs(change) > LIMITS
     _, family = connected_components((seen.T @ seen).astype(float), directed=False)
@@ -117,7 +118,7 @@ def coupled(change: Array) -> float:
 
 @dataclass(frozen=True, eq=False)
 class Plan:
-    """Planned correction from the MTF curves of an alignment's first state."""
+    """Correction of the focal plane planned from the MTF curves of an alignment's first state."""
 
     alignment: SimulatedFocus
 
@@ -148,10 +149,7 @@ class Plan:
 
     @property
     def asked(self) -> Array:
-        """Changes of the shims at H holes that the traced defocus and the line's true rotation require, (H,).
-
-        The unit is metres.
-        """
+        """Changes of the shims at H holes that the true defocus and line rotation require, (H,), metres."""
         alignment = self.alignment
         piston, slope_x, slope_y = alignment.true_plane(0)
         mount = mount_of(alignment.bench.setup.test)
@@ -166,9 +164,9 @@ class Plan:
 
 
 def measured_defocus(state: FocusState) -> tuple[Array, Array]:
-    """Return the distances of the CCDs downstream of best focus at N sites, and their sigmas, (N,), metres.
+    """Return the measured defocus of the CCDs at N sites, downstream of best focus, and its sigma, (N,), metres.
 
-    They are measured by MTF curves through focus.
+    It is measured by MTF curves through focus.
     """
     out = []
     for scan in state.scans:
@@ -220,10 +218,10 @@ def _edges(alignment: SimulatedFocus, band: str) -> list[EdgeMtf]:
 
 
 def _losses(factors: Mapping[str, float], value: float) -> list[Chosen]:
-    """Return the inputs of an MTF that the paper does not print.
+    """Return as chosen inputs the factors of an MTF that the paper does not print.
 
-    The logarithm of each factor is proportional to the square of its size, as for small wavefront errors (Maréchal),
-    diffusion and small motions.
+    The logarithm of each factor is proportional to the square of its cause's size, as for small wavefront errors
+    (Maréchal), diffusion and small motions.
     """
     product = float(np.prod(list(factors.values())))
     wavefront = factors["wavefront"]
@@ -299,7 +297,7 @@ def _measured(
 
 
 def _chips(placed: Sequence[tuple[SimulatedFocus, Pose, Mapping[str, float]]]) -> Chosen:
-    """Return the glueing errors of the line CCDs, in millimetres, as an input.
+    """Return the glueing errors of the line CCDs, in millimetres, as a chosen input.
 
     The largest distance from best focus depends on them.
     """
@@ -315,7 +313,7 @@ def _chips(placed: Sequence[tuple[SimulatedFocus, Pose, Mapping[str, float]]]) -
 
 
 def _theodolite(alignments: Sequence[SimulatedFocus], value: float) -> Chosen:
-    """Return the error of measuring and setting the line's rotation as an input.
+    """Return the error of measuring and setting the line's rotation as a chosen input.
 
     The result is proportional to it.
     """
@@ -351,9 +349,9 @@ def _reached(context: Context, alignments: Sequence[SimulatedFocus], facts: Mapp
 def alignment_svg(
     figure: Figure, far: NDArray[np.float64], turns: NDArray[np.float64], far_bound: float, turn_bound: float
 ) -> None:
-    """Draw A alignments before and after, with the results of the paper.
+    """Draw the results of A alignments before and after, and those of the paper.
 
-    Shown are the largest distance from best focus of each of S states, in mm, and rotations of the line, in arcmin,
+    Shown are the largest distance from best focus in each of S states, in mm, and the rotation of the line, in arcmin,
     both (A, S).
     """
     labels = ("farthest CCD from best focus [mm]", "turn of the line [arcmin]")

@@ -30,7 +30,7 @@ FIT_RMS_ARCSEC = load_printed("004").number("turntable.fit_rms_arcsec")
 TABLES, FAST_TABLES = 1000, 200
 """Turntables that are calibrated; quick."""
 FURTHER = 1.6
-"""Factor on an input with which tables are calibrated again, to find how the result depends on it."""
+"""Factor on a chosen input for a second calibration of the tables, which shows how the result depends on it."""
 FITTED, FAST_FITTED = 60, 12
 """Turntables whose calibration is fitted."""
 NETWORK = "network"
@@ -92,7 +92,7 @@ def run(context: Context) -> Iterator[CheckResult]:
 
 
 def _criterion(context: Context, series: Sequence[CalibrationSeries]) -> CheckResult:
-    """Check the limit of the rejection criterion by the readings that it accepted and rejected."""
+    """Check the limit of the outlier rejection by the readings that it accepted and rejected."""
     readings, keep = (np.concatenate([getattr(s, name) for s in series]) for name in ("comparisons", "keep"))
     size = np.abs(readings - readings.mean(axis=1, keepdims=True)) / readings.std(axis=1, ddof=1, keepdims=True)
     largest_accepted, smallest_rejected = float(np.max(size[keep])), float(np.min(size[~keep]))
@@ -143,7 +143,7 @@ def _repeats(
 
 
 def _readings(spec: TurntableTestSpec, seeds: NDArray[np.integer], identifier: str, value: float) -> list[Chosen]:
-    """Return the inputs on which the largest RMS of repeated readings depends.
+    """Return the chosen inputs on which the largest RMS of repeated readings depends.
 
     They are the scatter of a reading and, before the rejection criterion, gross errors.
     """
@@ -167,7 +167,7 @@ def _readings(spec: TurntableTestSpec, seeds: NDArray[np.integer], identifier: s
 
 
 def _with_errors(spec: TurntableTestSpec, scatter: float, gross: float) -> TurntableTestSpec:
-    """Return the test with factors on the scatter of its readings and on its gross errors."""
+    """Return the test with the scatter of its readings and its gross errors multiplied by factors."""
     table, reference = spec.dividing_error, spec.reference
     noise = {"noise": scatter * reference.noise, "gross_error": gross * reference.gross_error}
     update = {
@@ -178,7 +178,10 @@ def _with_errors(spec: TurntableTestSpec, scatter: float, gross: float) -> Turnt
 
 
 def dividing(value: float, power: float = 1.0) -> Chosen:
-    """Return the dividing error as an input, to which the remaining error of fits and its effect are proportional."""
+    """Return the dividing error as a chosen input.
+
+    The remaining error of fits and its effect are proportional to it.
+    """
     return Chosen.power("dividing error of scenes/lab/turntable.yaml, times", 1.0, "1", value, power)
 
 
