@@ -1,8 +1,8 @@
 """Connected pages and the scheduling of their requests: only each page's latest requested state is computed.
 
-A slider sends faster than states can be computed, and a slow connection receives more slowly than they are computed. So
-there is one slot for a page's next state and one for its next answer, and a later one replaces an earlier one. No queue
-grows without limit.
+A slider sends faster than states can be computed, and a slow connection receives more slowly than they are computed.
+Therefore each page has one slot for its next state and one for its next answer, and a later one replaces an earlier
+one. No queue grows without limit.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ BAD_MESSAGES = 20
 MOST_RECORDED = 20_000
 """Largest number of states in a recording; the oldest are dropped."""
 MOST_QUEUED = 32
-"""Largest number of queued texts for a slow connection, besides states and pictures."""
+"""Largest number of text messages queued for a slow connection, in addition to states and pictures."""
 WATCH_INTERVAL = 0.25
 """Interval at which the computing process is checked, in seconds."""
 STOP_TIMEOUT = 10.0
@@ -64,7 +64,7 @@ class Disconnected(Exception):
 
 @dataclass(frozen=True, eq=False)
 class _Request:
-    """Request of a page.
+    """Request of a page to the computing process.
 
     Attributes
     ----------
@@ -80,7 +80,7 @@ class _Request:
 
 @dataclass(eq=False)
 class Client:
-    """One connected page.
+    """One connected page with its open requests and queued answers.
 
     Attributes
     ----------
@@ -93,13 +93,13 @@ class Client:
     factors : Factors | None
         Values of a study's factors that it requests.
     reveal : BlindState | None
-        State whose hidden motions it wants revealed.
+        State whose hidden motions it requests to be revealed.
     shown : AskedState | None
         Latest state computed for it.
     before : BeforeKey | None
         Noise, frames and seed of the reference images that it has.
     blind : int | None
-        Seed of the hidden motions; None if nothing is hidden.
+        Seed of the hidden motions, which the user is to recognise; None if nothing is hidden.
     recorded : deque[tuple[float, AskedState]] | None
         Recorded states with their seconds since the recording began.
     record_began : float
@@ -132,7 +132,7 @@ class Client:
         return bool(self.state or self.view or self.factors or self.saves or self.reveal)
 
     def next_request(self) -> _Request:
-        """Remove and return its next request; there has to be one."""
+        """Remove and return the page's next request; the page must have one."""
         if self.saves and not (self.factors or self.state or self.reveal):
             return _Request("save", self.saves.popleft())
         kind = next(kind for kind in ("factors", "state", "reveal", "view") if getattr(self, kind) is not None)
@@ -198,11 +198,11 @@ class Client:
                     self.record_began = 0.0
 
     def _with_hidden(self, state: messages.AskedState) -> messages.AskedState:
-        """Return a state with the motions hidden from the page."""
+        """Return a state together with the motions that are hidden from the page."""
         return state if self.blind is None else _hiding(state, self.blind)
 
     def state_computed(self, state: messages.AskedState) -> None:
-        """Note that a state was computed, and record it if a recording is running."""
+        """Remember a computed state as the one shown, and record it if a recording is running."""
         self.shown = state
         if self.recorded is not None and self.record_began and not isinstance(state, messages.BlindState):
             self.recorded.append((time.monotonic() - self.record_began, state))
@@ -365,7 +365,7 @@ class LiveApi:
             self._announce("runs")
 
     def _announce(self, state: str, problem: str = "") -> None:
-        """Inform all present and later pages about the computing process; each change once."""
+        """Inform all present and later pages about the computing process, once for each change of its state."""
         news = {"type": "computing", "state": state, "problem": problem}
         if news == self.process_trouble or (state == "ended" and self.process_trouble.get("state") == "ended"):
             return
@@ -374,7 +374,7 @@ class LiveApi:
             client.queue_json(news)
 
     def _requeue_lost(self, client: Client, request: _Request, problem: str) -> None:
-        """Put back a request during which the process ended, unless the process ended twice during it."""
+        """Put back a request during which the process ended, unless it did so twice for this request."""
         self._announce("ended", RESTARTED_TEXT.format(problem))
         if request.asked is self._suspect_message:
             client.queue_json(

@@ -1,7 +1,7 @@
-"""Computing process of the live twin, its answers, and the handle by which the server uses it.
+"""Computing process of the live twin, its answers, and the object by which the server uses it.
 
-One process does all computing, so that one page does not take the cores from its own readings. Under overload the
-server requests only the latest state (`twin.live.clients`).
+One process does all computing, so that the pages do not compete for the processor cores. Under overload the server
+requests only the latest state of each page (`twin.live.clients`).
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from twin.pictures.scene_file import scene_bytes
 from twin.scripting.instrument_twin import InstrumentTwin
 
 MOST_BUILT = 3
-"""Largest number of a study's instruments that stay built."""
+"""Largest number of instruments of a study, with different factors, that are kept in memory."""
 
 
 class RequestHandler:
@@ -66,7 +66,7 @@ class RequestHandler:
     def _open(
         self, factors: Mapping[str, float], advance: Callable[[str], None] = lambda part: None
     ) -> tuple[LiveBench, CameraPictures, Opened]:
-        """Return the instrument for these values of a study's factors, and build it if necessary.
+        """Return the instrument for given values of a study's factors, building it if necessary.
 
         Raises
         ------
@@ -99,7 +99,7 @@ class RequestHandler:
         return getattr(self, f"_{kind}")(question)
 
     def _factors(self, factors: Mapping[str, float]) -> Opened | str:
-        """Switch to an instrument with other values of factors; an error is returned as text."""
+        """Switch to an instrument with other values of a study's factors; an error is returned as text."""
         try:
             self.bench, self.pictures, self.opened = self._open(factors)
         except IMPOSSIBLE as error:
@@ -139,7 +139,7 @@ class RequestHandler:
         return self._file("job.yaml", lambda: job_text(self.bench, asked))
 
     def _course(self, kept: Sequence[tuple[float, AskedState]]) -> str:
-        """Return the message with a job file of the recorded states as a series over time."""
+        """Return the message with a job file that contains the recorded states as a time series."""
         return self._file("course.yaml", lambda: course_text(self.bench, kept))
 
     def _file(self, name: str, text: Callable[[], str]) -> str:
@@ -166,7 +166,7 @@ class ComputerLost(Exception):
 
 
 class CannotStart(Exception):
-    """Error that the instrument cannot be built; the message is that of a command."""
+    """Error that the instrument cannot be built; the message is the one that a command would print."""
 
 
 class Computer:
@@ -338,7 +338,7 @@ class Computer:
         return "starts" if self._starting else "runs" if alive else "ended"
 
     def kill(self) -> None:
-        """Kill the process; whoever waits for an answer gets ComputerLost."""
+        """Kill the process; callers that wait for an answer get ComputerLost."""
         with self._process_lock:
             if self._process is not None:
                 self._process.kill()
@@ -361,7 +361,7 @@ class Computer:
 
 
 def _stopped(pid: int) -> bool:
-    """Return whether a process was stopped by a signal (not by a debugger); False where the system does not tell."""
+    """Return whether a process was stopped by a signal (not by a debugger); False if the system cannot tell."""
     try:
         message = Path(f"/proc/{pid}/stat").read_text("utf-8", "replace")
     except OSError:
@@ -407,7 +407,7 @@ def compute(pipe: Connection, what: str, backend: str, run: int | None) -> None:
 
 
 def _end_with(parent: int) -> None:
-    """End this process when the server was killed, even in the middle of a state."""
+    """End this process when the server (process id ``parent``) has been killed, even during a computation."""
 
     def watch() -> None:
         while os.getppid() == parent:

@@ -8,8 +8,8 @@ the WebSocket before it is accepted, needs the cookie, a Host header of this ser
 uvicorn's own limits do not suffice: ``limit_concurrency`` counts idle connections, so that anybody who opens enough of
 them locks out all others, and ``timeout_keep_alive`` begins only with the first answer. Therefore a connection is
 **unauthenticated** until it shows the token, which a browser does with its first request. Unauthenticated connections
-have places of their own, few for each address, and never take a place of an authenticated one; if their places are
-full, the oldest is closed. The head of every request, its answer and the idle time after it have timeouts.
+have separate limits, in total and for each address, and never displace an authenticated one; if a limit is reached, the
+oldest is closed. The head of every request, its answer and the idle time after it have timeouts.
 """
 
 from __future__ import annotations
@@ -76,7 +76,7 @@ def new_token(variable: str) -> str:
 
 @dataclass(frozen=True)
 class Guard:
-    """Access control: what a request has to have in order to be accepted.
+    """Access control: conditions that a request must meet to be accepted.
 
     Attributes
     ----------
@@ -197,9 +197,9 @@ MOST_UNAUTHENTICATED, MOST_OF_ONE_ADDRESS = 128, 64
 MOST_AUTHENTICATED = 64
 """Largest number of authenticated connections without a WebSocket: eight pages of a browser open six each."""
 ACCEPT_BACKLOG = 16
-"""Number of connections accepted at a time: an eighth of the places for unauthenticated ones.
+"""Number of connections accepted at a time: an eighth of the limit for unauthenticated ones.
 
-The data received on open connections are therefore read several times before a new connection can be the one that is
+Data received on open connections are therefore read several times before a new connection can cause one of them to be
 closed.
 """
 QUEUE = 1024
@@ -314,7 +314,7 @@ class Connection(H11Protocol):
         self.cut()
 
     def handle_websocket_upgrade(self, event: Any) -> None:
-        """Stop counting a connection that becomes a WebSocket, or is refused at once."""
+        """Stop counting a connection that becomes a WebSocket, whether it is then accepted or refused."""
         self._set_deadline(None)
         self.all.forget(self)
         super().handle_websocket_upgrade(event)

@@ -42,12 +42,12 @@ MOST_NAMED = 3
 
 @dataclass(frozen=True, eq=False)
 class Source:
-    """Opened source.
+    """Opened source: the job to be shown on the page, and where it comes from.
 
     Attributes
     ----------
     resolved : ResolvedJob
-        Resolved job with everything that it refers to.
+        Job with the contents of all files that it refers to.
     name : str
         Name of the file or run folder, with the number of a study's run; empty for an instrument of the library.
     about : str
@@ -74,7 +74,7 @@ class Source:
     has_own_seed: bool = False
 
     def with_factors(self, values: Mapping[str, float]) -> ResolvedJob:
-        """Return the job with other values of factors, as a run of the study has it, including dependent values.
+        """Return the job with other values of a study's factors, including the values that scale with them.
 
         Parameters
         ----------
@@ -183,13 +183,13 @@ def _of_file(file: Path, run: int | None, manifest: Manifest | None = None) -> S
 
 
 def _require_no_run(what: str, run: int | None) -> None:
-    """Raise InputError if a run is chosen of a source that is not a study."""
+    """Raise InputError if the number of a run is given for a source that is not a study."""
     if run is not None:
         raise InputError(Issue("--run chooses a run of a study, but this is not a study", what, found=f"--run {run}"))
 
 
 def _run_of(kind: FileKind | None, manifest: Manifest) -> str:
-    """Return the kind of a run folder in words."""
+    """Return a description of what kind of run folder it is, as text."""
     if kind is not None and kind.command.startswith(manifest.program):
         return f"the run folder of {kind.what} ({kind.command})"
     return f"a run folder of {manifest.program}"
@@ -237,7 +237,7 @@ def _of_measurement(file: Path) -> Source:
 
 
 def _of_orbit(file: Path) -> Source:
-    """Return a monitored orbit as a job with a series of states, which includes its stepwise motions."""
+    """Return a monitored orbit as a job with a time series of states, which includes its stepwise motions."""
     setup = MonitorSetup.read(file)
     if setup.test.course is None:
         problem = "the motions of this orbit are random, so that it has no course to show"
