@@ -166,10 +166,7 @@ def _layout(axes: Axes, design: Design, prescription: Prescription) -> None:
 
 
 def _edges(hits: np.ndarray) -> tuple[int, int]:
-    """Return the indices of the rays (N, 2) of a beam with the smallest and the largest y.
-
-    Array dimensions: N rays.
-    """
+    """Return the indices of the rays of a beam with the smallest and the largest y, from N hits (x, y), (N, 2)."""
     return int(np.argmin(hits[:, 0])), int(np.argmax(hits[:, 0]))
 
 
