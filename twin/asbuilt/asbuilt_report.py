@@ -29,7 +29,7 @@ from twin.framework.svg import (
 from twin.tolerance.monitor_merit import merit_head, merit_unit, shown_merit
 
 _MOST_COMBINATIONS = 12
-"""Largest number of combinations of motions in the table."""
+"""Largest number of observable combinations of motions in the table."""
 _FEW = 3
 """Largest number of candidate measurements that the verdict names."""
 BANDS = FrozenMap({"prior": GREY, "as built": BLUE, "after the next move": GREEN})
@@ -105,7 +105,7 @@ def _percent(share: float) -> str:
 
 
 _CERTAIN = 0.95
-"""Probability from which the verdict says that a requirement is met, and, as its complement, that it fails."""
+"""Probability from which the verdict says that a requirement is met; below its complement, that it is missed."""
 
 
 def _verdict(run: AsBuiltRun) -> str:
