@@ -72,7 +72,7 @@ class ElementaryMotion:
                 raise ValueError(f"a motion is a rotate, shift, scale or figure, not a {self.kind!r}")
 
     def state(self, amount: float) -> State:
-        """Return the state with only this motion of the given amount, in SI units."""
+        """Return the state of the instrument with only this motion, of the given amount in SI units."""
         return {self.body: self.motion(amount)}
 
 
@@ -123,5 +123,8 @@ def _six(body: str, name: str, pivot: str) -> list[ElementaryMotion]:
 
 
 def pivot_states(motions: Sequence[ElementaryMotion]) -> list[State]:
-    """Return for each motion the unperturbed state with its pivot and figure term, for derivatives about that state."""
+    """Return for each motion the unperturbed state, with the motion's pivot and (at zero amplitude) its figure term.
+
+    Derivatives with respect to the motions are taken about these states.
+    """
     return [m.state(0.0) for m in motions]
