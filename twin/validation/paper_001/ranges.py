@@ -541,7 +541,7 @@ class Separation:
     sigma : Mapping[str, Mapping[str, np.ndarray]]
         Standard deviations of ``gain``.
     scatter : Mapping[str, np.ndarray]
-        Set of formulas -> (4,) rms residual of the regression, table units, all cameras.
+        Set of formulas -> (4,) rms residual of the regression over all cameras, in arcsec and um.
     trials : int
         Number of states.
     """
