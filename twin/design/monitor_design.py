@@ -146,7 +146,7 @@ def run_monitor_design(
 
 
 def _check_start(setup: monitor_layout.MonitorDesignSetup, backend: Backend, seed: int, advance: Advance) -> None:
-    """Raise InputError if the starting instrument has ghost images on a spot, unless the file excludes this check.
+    """Raise InputError if the file requests tracing ghosts and the starting instrument has one on a spot.
 
     All layouts have the prism tilts of the start.
 
@@ -166,7 +166,7 @@ def _check_start(setup: monitor_layout.MonitorDesignSetup, backend: Backend, see
 def _ghosts(
     setup: monitor_layout.MonitorDesignSetup, facts: LayoutFacts, backend: Backend, seed: int, advance: Advance
 ) -> tuple[Ghost, ...]:
-    """Return the ghost images on a layout's spots; none if the file excludes tracing them."""
+    """Return the ghost images on a layout's spots; none unless the file requests tracing them."""
     detector = setup.detectors.get(facts.beams[0].area_ccd, setup.detector)
     return _traced_ghosts(setup, monitor_layout.layout_spec(setup, facts.beams), detector, backend, seed, advance)
 
