@@ -59,7 +59,7 @@ _written = 0
 
 
 class _UnnamedError(TypeError):
-    """Error raised for an input that cannot be digested into a name, so that the result is not cached."""
+    """Error raised for an input of a computation that has no checksum, so that the result cannot be cached."""
 
 
 def cache_folder() -> Path | None:
@@ -194,7 +194,7 @@ class CacheEntry:
 
 
 class _Writer(pickle.Pickler):
-    """Pickler that writes references instead of the backend and the specifications."""
+    """Pickler of cache entries that writes references instead of the backend and the specifications."""
 
     def __init__(self, file: io.BytesIO, entry: CacheEntry) -> None:
         super().__init__(file, pickle.HIGHEST_PROTOCOL)
@@ -241,7 +241,7 @@ _ARRAYS = {
 
 
 def _of_program(module: str) -> bool:
-    """Return True if a module belongs to this program."""
+    """Return True if a module, given by its name, is part of this program."""
     return module.removeprefix(provenance.BEFORE).partition(".")[0] in provenance.SOURCES
 
 

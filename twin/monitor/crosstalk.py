@@ -98,7 +98,7 @@ class CameraCrosstalk:
         return tuple(f"{channel} {axis}" for channel in self.channels for axis in ("y", "x"))
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the response as plain data for the file crosstalk.json."""
+        """Return the response to elementary motions as plain data for the file crosstalk.json."""
         rows, keys = [], [parameter.key for parameter in parameters.CAMERA_PARAMETERS.values()]
         for k, motion in enumerate(self.motions):
             rows.append(
@@ -145,7 +145,7 @@ class CameraCrosstalk:
 def estimator_gains(
     cameras: Mapping[str, CameraCalibration], prior: Disturbances | None, covariance: np.ndarray | None = None
 ) -> dict[str, np.ndarray]:
-    """Return for each estimator the linear matrix from spot shifts (px) to camera parameters (rad, m).
+    """Return for each estimator the linear map from spot shifts (px) to camera parameters (rad, m), its gain.
 
     Parameters
     ----------
@@ -154,7 +154,7 @@ def estimator_gains(
     prior : Disturbances | None
         Prior of the disturbances; None if there is none.
     covariance : (2 x spots, 2 x spots) ndarray | None
-        Covariance of the spots' shifts, in px^2, which weights them; None for no noise.
+        Covariance of the spots' shifts, in px^2, by which they are weighted; None if they have no noise.
 
     Returns
     -------

@@ -5,11 +5,11 @@ chief ray of the pixel is traced back to the scene, and the beam from that direc
 is the left end of the line (+Y'), -1 the right one.
 
 Wavefront errors are rms over the stop's area. The reference sphere is centred on the pixel, where the chief ray
-arrives, with the radius of the nominal exit pupil; piston and tilt are removed. Best focus is where the rms is least
-along the light, with the exact phase sqrt(1 - u^2 - v^2) of a shift. The MTF is that of the traced pupil, polychromatic
-if the camera describes a band, multiplied by those of the pixel and of the other parts of the band's line CCD. Light
-blocked by prisms and other bodies of the instrument (``scenes.models.shadow``) is missing in both, unless obstruction
-is ignored.
+arrives, with the radius of the nominal exit pupil; piston and tilt are removed. Best focus is where the rms is smallest
+along the light; the phase of a shift is exact, proportional to sqrt(1 - u^2 - v^2) for direction cosines u and v. The
+MTF is that of the traced pupil, polychromatic if the camera describes a band, multiplied by those of the pixel and of
+the other parts of the band's line CCD. Light blocked by prisms and other bodies of the instrument
+(``scenes.models.shadow``) is missing in both, unless obstruction is ignored.
 """
 
 from __future__ import annotations
@@ -137,8 +137,9 @@ _DARKEST = 0.99
 """Largest fraction of the light that bodies in the beam may block; above it, no image quality is given."""
 
 COLOURS = 5
-"""Number of Gauss wavelengths of a band: four are accurate to 1e-7 except near cut-offs inside the band, where the MTF
-vanishes.
+"""Number of wavelengths of a Gauss quadrature over a band.
+
+Four are accurate to 1e-7 except near cut-offs inside the band, where the MTF vanishes.
 """
 
 _ROUNDING = 1e-5
@@ -247,7 +248,7 @@ class ImageQuality:
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """Warnings about unknown values, with their reasons."""
+        """Warnings about image quality values that could not be computed, with the reasons."""
         return tuple(
             f"image quality of {name}: {reason}" for name, c in self.cameras.items() for reason in c.reasons if reason
         )
@@ -260,7 +261,7 @@ class ImageQuality:
 
 @dataclass(frozen=True, eq=False)
 class CameraState:
-    """Image quality of one camera in one state of the instrument, at the fields that have names in files."""
+    """Image quality of one camera in one state of the instrument, at the field points that result files name."""
 
     camera: CameraQuality
     number: int
@@ -275,7 +276,7 @@ class CameraState:
 
 
 def _known(value: float | np.floating[Any]) -> float | None:
-    """Return a finite number unchanged, and None for NaN or infinity."""
+    """Return a finite number unchanged, and None for NaN or infinity, which JSON cannot hold."""
     return float(value) if np.isfinite(value) else None
 
 
@@ -416,14 +417,14 @@ def quality_dicts(
 
 
 _COLUMNS = ("light_lost", "wfe", "wfe_refocused", "defocus", "mtf_along_line", "mtf_along_track")
-"""Names of the arrays of ``CameraQuality`` that are computed together; new ones go at the end."""
+"""Names of the arrays of ``CameraQuality`` that are computed together, in their order; new ones go at the end."""
 
 
 @dataclass(frozen=True, eq=False)
 class _Traced:
-    """Traced beams of B images, each for one state and one field.
+    """Traced beams of B images, each for one state and one field point.
 
-    Dimensions: N nodes of the stop.
+    Dimensions: B images, N nodes of the stop.
 
     Attributes
     ----------
@@ -434,7 +435,7 @@ class _Traced:
     origin : (B, 1, 3) ndarray
         Image points on the line CCD.
     shadows : shadow.Shadows | None
-        Shadows in the beams; None for free beams.
+        Shadows in the beams; None if no body is in them.
     outlines : StopOutlines | None
         Outlines of edges and bodies on the stops; None for a camera whose surfaces have no edges.
     free : (B, N) ndarray | None
@@ -453,7 +454,7 @@ class _Traced:
 
 
 class _CameraBench:
-    """Computation of one camera's image quality, with the data that do not depend on the state."""
+    """Computation of one camera's image quality; it holds the data that do not depend on the state."""
 
     def __init__(
         self,

@@ -1,11 +1,11 @@
 """Sampling of the monitor's pupil for an image, and checks of the computed images.
 
 The field on a pixel is an integral over the aperture; its phase varies the faster, the farther the pixel is from the
-point where the rays arrive. The nodes are therefore chosen by the largest such distance among all pixels and traced
-rays, which includes aperture, extent of the image and aberration. They form a ladder of classes, so that many states
-share one set of nodes.
+point where the rays arrive. The quadrature nodes are therefore chosen by the largest such distance among all pixels and
+traced rays, which includes aperture, extent of the image and aberration. There is a series of ever finer quadratures
+(classes of nodes), so that many states share one set of nodes.
 
-Every image is checked. A second rule, with other radii and other arms, has to give the same values at some pixels; it
+Every image is checked. A second quadrature, with other radii and angles, has to give the same values at some pixels; it
 does not if the wavefront is too rough for the nodes, or if an edge cuts the beam. The light on the CCD has to equal
 that of the rays that fall on it, within what diffraction may carry across the CCD's edge.
 """
@@ -91,14 +91,12 @@ class ImageChecks:
     light: float = 0.0
 
     def add(self, difference: np.ndarray, light: np.ndarray) -> None:
-        """Add the checks of further images.
-
-        Dimensions: B images.
+        """Add the checks of B further images.
 
         Parameters
         ----------
         difference : (B,) ndarray
-            Differences of each image between two quadratures, relative to its peak.
+            Difference of each image between two quadratures, relative to its peak.
         light : (B,) ndarray
             Light beyond the allowed range, as a fraction of the channel's light: positive for an excess, negative for a
             deficit.
@@ -108,7 +106,7 @@ class ImageChecks:
         self.light = max(self.light, float(np.max(np.abs(light), initial=0.0)))
 
     def self_checks(self) -> tuple[SelfCheck, ...]:
-        """Return the checks for a manifest; none if no image was made."""
+        """Return the checks in the form of a run's manifest; an empty tuple if no image was made."""
         if not self.images:
             return ()
         refused = f"{self.images} images; images beyond the limit are refused"
@@ -120,7 +118,7 @@ class ImageChecks:
 
 
 class UncertainImageError(BeamMissedError):
-    """Image of the monitor that cannot be computed to within ``WRONG`` of its peak."""
+    """Error that an image of the monitor cannot be computed to within ``WRONG`` of its peak."""
 
 
 @dataclass(frozen=True)
@@ -161,11 +159,11 @@ class NodeClasses:
         return rings * arms
 
     def nodes(self, number: int) -> PupilNodes:
-        """Return the nodes over the pupil of a class, given by its number."""
+        """Return the quadrature nodes over the pupil of the class with index ``number``."""
         return quadrature.disk_for(self.phase(number))
 
     def second_nodes(self, number: int) -> PupilNodes:
-        """Return the nodes of a second quadrature over the pupil, which checks the images of a class."""
+        """Return the nodes of a second quadrature over the pupil, used to check the images of a class."""
         return quadrature.second_disk_for(self.phase(number))
 
     def class_of(

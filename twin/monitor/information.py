@@ -31,7 +31,7 @@ from twin.monitor.truth import ground_geometry
 from twin.sensors.area_detector import EmvaDetector
 
 NOISE = "noise"
-"""Name, among the causes of variance, of the noise of the images."""
+"""Name of the images' noise among the causes of an estimate's variance."""
 _SLOPE = 2  # pixels more on every side of an image, for its slopes
 _PARAMETERS = 4
 
@@ -181,7 +181,7 @@ def quantity_rows(instrument: Instrument, ground: GroundGeometry | None) -> dict
     The quantities are d_alpha, d_beta, d_gamma (rad) and d_f (m) of every camera, as ``camera/d_alpha``; the
     intersection angle of the first two cameras (rad); and the height (m) at the line's centre.
 
-    Dimensions: n rows of coefficients, K cameras.
+    Dimensions: n linear combinations, over which the quantity's variance is averaged; K cameras with 4 parameters each.
     """
     names = list(instrument.cameras)
     unit = np.eye(_PARAMETERS * len(names))

@@ -60,18 +60,19 @@ class AimedRays:
 class CoarseTrace:
     """Trace with a few rays that finds the spots of C channels in S states (all states of a channel together).
 
-    Dimensions: T Zernike terms.
+    Dimensions: C channels, S states, T Zernike terms.
 
     Attributes
     ----------
     fan : RayFan
         Rays from the pinholes.
     outgoing, back : SystemBatch
-        Systems from the pinholes to the return face, and on to the CCDs.
+        Optical systems from the pinholes to the return face, and from there to the CCDs.
     uploaded : UploadedSystems
-        Systems ``back`` on the device.
+        Systems ``back`` on the computing device.
     aim_change : (2, C*S, T) ndarray
-        Change of the aim parameters relative to the nominal instrument, as Zernike terms on the face.
+        Change of the two aim parameters (ray direction) relative to the nominal instrument, as coefficients of Zernike
+        terms on the return face.
     centre : (C, S, 2) ndarray
         Centres of the spots, (row, column) in pixels from the CCD's centre.
     blur : (C, S) ndarray
@@ -152,15 +153,15 @@ leaves a residual below 1e-7 for smooth surfaces; figures of prisms and mirrors 
 """
 
 SMOOTH = 1e-6
-"""Largest neglected residual of the map from aperture to direction, relative to the beam's aperture.
+"""Largest residual of the map from aperture to ray direction that is neglected, relative to the beam's aperture.
 
 It corresponds to an error of 5e-5 in the density of rays.
 """
 
 TOO_ROUGH = 2e-5
-"""Residual of the map from aperture to direction, relative to the aperture, above which an image is refused.
+"""Residual of the map from aperture to ray direction, relative to the beam's aperture, above which an image is refused.
 
-It corresponds to an error of 1e-3 in the density of rays, and is what all Zernike terms leave.
+It is the residual after a fit of all Zernike terms, and corresponds to an error of 1e-3 in the density of rays.
 """
 
 _COARSE_RINGS = 6
@@ -213,7 +214,7 @@ class MonitorBeams:
 
     @property
     def nodes(self) -> PupilNodes:
-        """Nodes and weights of the quadrature over the aperture."""
+        """Nodes and weights of the quadrature over the return face's aperture."""
         assert self._nodes is not None
         return self._nodes
 
@@ -270,11 +271,9 @@ class MonitorBeams:
         return solve, basis, dx, dy
 
     def area_ratio(self, u: np.ndarray, v: np.ndarray) -> np.ndarray:
-        """Return the local ratio of areas of maps (x, y) -> (u, v) from the unit disk, at the nodes, (..., N).
+        """Return the local ratio of areas of maps (x, y) -> (u, v) of the unit disk, at N nodes, (..., N).
 
-        It is the determinant of the derivatives of u and v with respect to x and y.
-
-        Dimensions: N nodes of the aperture.
+        It is the determinant of the derivatives of u and v (such as direction cosines) with respect to x and y.
 
         Raises
         ------
@@ -435,9 +434,9 @@ class MonitorBeams:
         return rays
 
     def _where_lost(self, channel: Channel, state: State, position: np.ndarray, direction: np.ndarray) -> str:
-        """Return the element and the body at which the last of a channel's rays (N, 3) are lost.
+        """Return the names of the element and of the body at which the last of a channel's N rays are lost.
 
-        Dimensions: N nodes of the aperture.
+        ``position`` and ``direction`` are the launch points and directions of the rays, (N, 3).
         """
         names = self.instrument.assembly.sequences[f"{channel.key}/monitor"]
         steps = surviving_rays(self.backend, self.instrument.assembly, names, position, direction, state)

@@ -310,7 +310,7 @@ def _named(motion: ElementaryMotion, about: State) -> State:
 
 
 def _union(states: Sequence[State], about: State) -> State:
-    """Return ``about`` with every figure term of any state, so that all have the same structure."""
+    """Return the state ``about`` with every figure term of any of the states, so that all have the same structure."""
     figures: dict[str, dict[int, float]] = {}
     for state in states:
         for body, motion in state.items():
@@ -320,9 +320,9 @@ def _union(states: Sequence[State], about: State) -> State:
 
 
 def _aimed(path: MonitorBeams, about: State) -> tuple[np.ndarray, np.ndarray]:
-    """Return launch points and directions (C, N, 3) of the rays that hit the nodes of the return faces in the state.
+    """Return launch points and directions of the rays that hit the nodes of the return faces in a state.
 
-    Dimensions: C channels (one spot each), N nodes of the aperture.
+    Both arrays are (C, N, 3) for C channels (one spot each) and N nodes of the aperture.
     """
     nominal = path.nominal
     start = np.broadcast_to(nominal.position, nominal.direction.shape)
@@ -407,12 +407,12 @@ def _elementary(component: Component) -> ElementaryMotion:
 
 
 def single_states(components: Sequence[Component], amounts: np.ndarray, thermal: ThermalModel) -> list[State]:
-    """Return M states, each with the amount of one component.
+    """Return M states, in each of which one component of the prior has a given amount.
 
     Parameters
     ----------
     components : sequence of Component
-        M components.
+        M components (motions or temperatures of bodies).
     amounts : (M,) ndarray
         Amounts, in SI units.
     thermal : ThermalModel
@@ -458,7 +458,7 @@ SMALL: Mapping[str, float] = {"rotate": 1e-6, "shift": 1e-6, "scale": 1e-6, "fig
 def derivative_changes(
     prior: DisturbancePrior, path: MonitorPath, sight: LineSight, thermal: ThermalModel, built: Sequence[State]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return how the derivatives of spots and cameras differ between instruments as built and as designed.
+    """Return how the derivatives of spots and camera parameters of instruments as built differ from the design's.
 
     The derivatives are with respect to the motions of the prior. Both are one-sided differences of exact traces with
     the same steps, so that their truncation errors cancel.
@@ -479,8 +479,8 @@ def derivative_changes(
     Returns
     -------
     tuple of ndarray
-        Differences for spots, (Z, D, M), in pixels, and for parameters, (Z, 4 K, M), per standard deviation of each
-        motion.
+        Differences for spots, (Z, D, M), in pixels, and for parameters, (Z, 4 K, M), in rad and m, per standard
+        deviation of each motion.
 
     Raises
     ------
@@ -601,7 +601,7 @@ def _prior_states(prior: DisturbancePrior, thermal: ThermalModel, amounts: np.nd
 
 
 def _of_families(cameras: Mapping[str, CameraCalibration], trace: Callable[[Sequence[State]], Retraced]) -> MotionModel:
-    """Return the model of the four motions of each camera for which paper 001 derives its formulas."""
+    """Return the motion model of the four motions of each camera for which paper 001 derives its formulas."""
     families = {name: line_family(name) for name in cameras}
     spot_slices, count = _spots_of(cameras), sum(map(len, families.values()))
     spots, parameters = np.zeros((spot_slices[-1].stop, count)), np.zeros((4 * len(cameras), count))

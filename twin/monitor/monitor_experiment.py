@@ -1,4 +1,4 @@
-"""Monitoring experiment: perturb the instrument, render images of its area CCDs, and recover the perturbation."""
+"""Monitoring experiment: perturb the instrument, render images of its area CCDs, and estimate the perturbation."""
 
 from __future__ import annotations
 
@@ -138,7 +138,7 @@ class MonitorExperiment:
         return MonitorPath(self.instrument, self.backend)
 
     def _require_sampled(self) -> None:
-        """Raise InputError if the pixels do not sample the spots."""
+        """Raise InputError if the pixels are too coarse to sample the spots."""
         try:
             self.path.response  # noqa: B018 - fitted before anything is traced
         except UnsampledImageError as error:
@@ -327,7 +327,10 @@ class MonitorExperiment:
 
     @cached_property
     def cameras(self) -> dict[str, CameraCalibration]:
-        """Camera -> its calibration without images: geometry, and Jacobians of spots and parameters."""
+        """Camera -> its calibration without images: geometry, and Jacobians of spots and parameters.
+
+        The Jacobians are with respect to the four motions that paper 001 considers.
+        """
         families = {name: line_family(name) for name in self.instrument.cameras}
         spots = spot_jacobian(self.path, [motion for family in families.values() for motion in family])
         cameras = {}
@@ -447,7 +450,7 @@ class MonitorExperiment:
         return pattern
 
     def _drawn_pattern(self, seed: int | tuple[int, ...]) -> FixedPattern:
-        """Draw at random the response (PRNU) and offset (DSNU) of every pixel of all area CCDs."""
+        """Return the random response (PRNU) and offset (DSNU) of every pixel of all area CCDs, determined by a seed."""
         if isinstance(seed, tuple):
             patterns = [self._drawn_pattern(pattern) for pattern in seed]
             return FixedPattern(

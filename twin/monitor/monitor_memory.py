@@ -63,7 +63,7 @@ _PIXEL = 380.0
 190.
 """
 _RAY = 600.0
-"""Bytes per traced ray, with its derivatives, aiming data and pupil polynomials at its node."""
+"""Bytes per traced ray, including its derivatives, aim parameters and Zernike polynomials at its pupil node."""
 GREY = 2.0
 """Bytes per pixel of a recorded frame."""
 _OF_COURSE = 6.0

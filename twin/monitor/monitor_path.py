@@ -85,7 +85,7 @@ class MonitorPath(MonitorBeams):
 
     @cached_property
     def node_classes(self) -> NodeClasses:
-        """Ladder of pupil quadratures from which the images of this instrument take their nodes."""
+        """Series of ever finer pupil quadratures (classes of nodes) that the images of this instrument use."""
         phase = 2.0 * np.pi * self.numerical_aperture * self.pitch / self.wavelength
         return NodeClasses(phase, (0.5 * self.shape[0], 0.5 * self.shape[1]))
 
@@ -121,9 +121,9 @@ class MonitorPath(MonitorBeams):
         return self._class_beams[number]
 
     def class_of(self, coarse: CoarseTrace, margin: int = 0) -> np.ndarray:
-        """Return the class of nodes that suffices for all spots of each state, (S,), as estimated from a few rays.
+        """Return the class of nodes that suffices for all spots of each of S states, (S,), estimated from a few rays.
 
-        Dimensions: S states.
+        A class is one of the pupil quadratures in ``NodeClasses``.
 
         Parameters
         ----------
@@ -458,7 +458,7 @@ class MonitorPath(MonitorBeams):
 
 
 class _OnSpots(MonitorBeams):
-    """Monitor beams whose positions on the CCD count from the centre of their own spot, wherever it is."""
+    """Monitor beams whose positions on the CCD are measured from the centre of their own spot."""
 
     def _with(self, nodes: PupilNodes) -> MonitorBeams:
         return _OnSpots(self.instrument, self.backend, nodes, self.cameras)
@@ -480,8 +480,5 @@ class SpotPath(_OnSpots, MonitorPath):
     """
 
     def class_of(self, coarse: CoarseTrace, margin: int = 0) -> np.ndarray:
-        """Return the class of pupil nodes that suffices for all spots of each state, centred on their CCDs, (S,).
-
-        Dimensions: S states.
-        """
+        """Return the class of pupil nodes that suffices for all spots of each of S states, (S,), with centred spots."""
         return super().class_of(replace(coarse, centre=np.zeros_like(coarse.centre)), margin)

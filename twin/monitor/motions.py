@@ -14,7 +14,7 @@ from scenes.specs.instrument import BASE, CENTRAL_PRISM
 _UNITS = {"rotate": ("arcsec", ARCSEC), "shift": ("um", 1e-6), "scale": ("ppm", 1e-6), "figure": ("nm", 1e-9)}
 _AXES = "XYZ"
 FIGURE_TERMS = {4: "power", 5: "astigmatism", 6: "astigmatism", 7: "coma", 8: "coma"}
-"""Noll index of each Zernike term of a mirror's figure in the tables -> its name."""
+"""Noll index -> name, for each Zernike term of a mirror's figure that the tables contain."""
 
 
 @dataclass(frozen=True)

@@ -79,18 +79,16 @@ class ObservationOptions:
 class Light:
     """Light of S states on the area CCDs before detection, with the true changes of the cameras.
 
-    Dimensions: C channels.
-
     Attributes
     ----------
     numbers : (S,) ndarray of int
-        Numbers of the states.
+        Numbers of the states, which select random streams.
     placed : PlacedBodies
-        Bodies of the states.
+        Positions of the bodies in the states.
     truth : Truth
         True changes of the cameras.
     photons : (S, C, rows, columns) ndarray
-        Expected photons per pixel and frame.
+        Expected photons per pixel and frame on the CCDs of C channels.
     """
 
     numbers: np.ndarray

@@ -203,8 +203,9 @@ class ErrorBudget:
     def halved_glass(self, slope: float) -> tuple[float, float, float]:
         """Compare the spots' response to a temperature gradient before and after halving the 180-deg prisms' glass.
 
-        Rhomboid prisms take over half of the sideways transfer of the light. The same gradients across the prism, once
-        along its y and once along its z, act on both instruments.
+        In the second instrument, longer rhomboid prisms take over half of the sideways shift of the light by the
+        180-deg prisms. The same gradients across the 180-deg prisms, once along their y and once along their z, act on
+        both instruments.
 
         Parameters
         ----------

@@ -141,7 +141,7 @@ class TimeSeries:
         return tuple(out)
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the contents of course.json, the file of results of a time series.
+        """Return the contents of course.json, the result file of a time series.
 
         They are those of truth.json and recovered.json, with a list over the times for each number.
         """

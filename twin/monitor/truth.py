@@ -145,7 +145,10 @@ def line_points(instrument: Instrument, camera: str) -> np.ndarray:
 
 
 def line_in_world(instrument: Instrument, camera: str, placed: PlacedBodies) -> np.ndarray:
-    """Return the points of the line CCD in the world, (S, LINE_POINTS, 3), in metres; complex if ``placed`` is."""
+    """Return the points of the line CCD in the world frame for S states, (S, LINE_POINTS, 3), in metres.
+
+    The array is complex if ``placed`` is, for derivatives by the complex step.
+    """
     position = line_points(instrument, camera)
     line = np.stack([np.zeros_like(position), position, np.zeros_like(position)], axis=-1)
     return points_to_world(placed, line_body(f"{BASE}/{camera}"), line)
