@@ -89,12 +89,12 @@ def mirror_body(unit: int) -> str:
 
 
 def outgoing(unit: int) -> str:
-    """Return the name of the element sequence from the pinhole to the mirror."""
+    """Return the name of the sequence of surfaces from the pinhole to the mirror of autocollimator 1 or 2."""
     return f"outgoing_{unit}"
 
 
 def round_trip(unit: int) -> str:
-    """Return the name of the element sequence from the pinhole via the mirror to the area CCD."""
+    """Return the name of the sequence of surfaces from the pinhole via the mirror to the area CCD of unit 1 or 2."""
     return f"round_trip_{unit}"
 
 
@@ -222,7 +222,7 @@ exact pixel filter; with two per side it is exact, and the mean of the four samp
 CHUNK = 24
 """Number of states that are traced and rendered at once, to limit memory."""
 TILE = 64
-"""Side of the square tiles in which the fixed pattern of a CCD is drawn, pixels."""
+"""Side, in pixels, of the square tiles in which the random fixed pattern of a CCD is generated."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -531,7 +531,7 @@ class SeriesResult:
 
     @property
     def scale(self) -> float:
-        """Factor applied to the readings of mirror 2: 1 (X), 1 / cos b (Y), 1 / sin b (Z).
+        """Factor applied to the readings of mirror 2 in a series about X (1), Y (1 / cos b) or Z (1 / sin b).
 
         The angle b is that between the mirrors' normals.
         """
@@ -564,7 +564,7 @@ class SeriesResult:
 
 @dataclass(frozen=True, eq=False)
 class ReadingTable:
-    """All series of one run of the experiment.
+    """Readings of all rotation series in one run of the experiment.
 
     Attributes
     ----------
@@ -661,7 +661,7 @@ def run_autocollimator_test(
 
 
 def states_of(spec: AutocollimatorTestSpec, series: Series, seed: int | None) -> list[State]:
-    """Return the reading at zero and all rows of a series as states of the bench, with errors drawn from the seed.
+    """Return the states of the bench for the reading at zero and all rows of a series, with random errors.
 
     Errors of the bench are the same in all series of a seed, except the mounting errors of the mirrors, which are drawn
     anew for every half angle. ``seed`` None is the ideal bench.
@@ -795,7 +795,7 @@ class Reader:
         )
 
     def place(self, mean: np.ndarray, corner: np.ndarray) -> tuple[np.ndarray, SpotPositions]:
-        """Measure spots of B images in pixels of the whole CCD, (B, 2) row and column.
+        """Measure the positions of the spots in B window images, in pixels of the whole CCD.
 
         Parameters
         ----------
@@ -807,7 +807,7 @@ class Reader:
         Returns
         -------
         tuple of ndarray and SpotPositions
-            Positions on the CCD, and the spot measurements in their windows.
+            Positions (row, column) on the CCD, (B, 2), and the spot measurements in their windows.
         """
         bench = self.path(self.spec.programme.narrow).bench
         airy = 0.61 * self.spec.autocollimator.wavelength / bench.numerical_aperture

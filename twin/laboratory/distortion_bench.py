@@ -95,7 +95,7 @@ class PinholeImages:
         window: int,
         progress: Callable[[int, int], None] = lambda done, total: None,
     ) -> PinholeImages:
-        """Compute the spectra at the nodes of the field.
+        """Compute the spectra of the pinhole's images at the Chebyshev nodes of the field.
 
         Parameters
         ----------
@@ -212,7 +212,7 @@ def _node_weights(position: float) -> np.ndarray:
 
 
 def _extent_x(image: Disk | Polygon) -> float:
-    """Return the size of a shape along x, metres."""
+    """Return the size of a target's image (disk or polygon) along x, metres."""
     low, high, _, _ = image.bounds
     return high - low
 
@@ -325,7 +325,7 @@ class DistortionBench:
 
     @classmethod
     def build(cls, setup: DistortionSetup, backend: Backend, advance: Advance = silent) -> DistortionBench:
-        """Trace the camera and compute the spectra of its spots.
+        """Trace the camera and compute the spectra of its spots, from which all images are made.
 
         Raises
         ------

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 RAW, COMPENSATED = "angles as read", "compensated angles"
 SHOWN = 3
-"""Number of points whose frames are saved: first, middle, last."""
+"""Number of points (angles) of the test whose frames are saved: first, middle, last."""
 ZERO_SHARE = 0.3
 """Ratio above which a shift of the principal point due to an error of the angles' zero is reported.
 
@@ -37,7 +37,7 @@ The ratio is that of the shift to the standard deviation of the principal point.
 
 
 def distortion_report(run: DistortionRun) -> Report:
-    """Build the report of a distortion test."""
+    """Return the report of a distortion test: results, accuracy, figures and tables."""
     data = DISTORTION(run)
     verdict, more = _verdict(run, data)
     simulated = run if isinstance(run, SimulatedDistortion) else None
@@ -68,7 +68,7 @@ def _frames(run: SimulatedDistortion) -> tuple[dict[str, np.ndarray], dict[str, 
 
 
 def _facts(run: DistortionRun, data: Mapping[str, Any]) -> tuple[tuple[str, str], ...]:
-    """Return the facts about the test, as pairs of label and text."""
+    """Return the facts about the distortion test, as pairs of label and text."""
     count, sets = run.reading.shape
     first, last = np.degrees([np.min(run.compensated.fit.angle), np.max(run.compensated.fit.angle)])
     facts = [("points, sets", f"{count} from {first:.3f}° to {last:.3f}°, {sets} sets, {np.sum(run.present)} spots")]
@@ -126,7 +126,7 @@ def _shares(run: DistortionRun) -> dict[str, float]:
 
 
 def _verdict(run: DistortionRun, data: Mapping[str, Any]) -> tuple[str, tuple[str, ...]]:
-    """Return the verdict and the sentences that follow it."""
+    """Return the verdict on the measured distortion and the sentences that follow it."""
     noise, f, sigma = data["noise"], data["principal_distance_mm"], data["principal_distance_mm_sigma"]
     expected, truth = noise["rejected_expected_by_chance"], data.get("truth")
     distortion_text = f"distortion has σ = {1e6 * float(np.sqrt(np.mean(run.compensated.sigma**2))):.2f} µm"
@@ -168,7 +168,7 @@ def _typeset(text: str) -> str:
 
 
 def _warnings(run: DistortionRun, data: Mapping[str, Any]) -> tuple[str, ...]:
-    """Return the warnings of the report."""
+    """Return the warnings about the measurements and their analysis."""
     out = []
     fit = run.compensated.fit
     f, sigma = fit.value("principal_distance"), fit.sigma("principal_distance")
@@ -257,7 +257,7 @@ def _curve(run: DistortionRun, data: Mapping[str, Any]) -> Section:
 
 
 def _compensation(run: DistortionRun) -> Section:
-    """Return the section that compares raw and compensated angles."""
+    """Return the section that compares distortion from raw angles and from angles corrected for the dividing error."""
     raw, compensated = run.raw, run.compensated
     pairs = {
         "residual from the smooth curve": (raw.smooth.residual, compensated.smooth.residual),

@@ -56,7 +56,10 @@ CLOSED_FORMS = tuple(name for name in FITS if name != "network")
 The neural network, which takes minutes to train, is compared in the turntable test only.
 """
 MAX_FIELD_ANGLE = np.radians(40.0)
-"""Largest plausible angle from the middle of the line, radians; the model's tangents end at 45 deg."""
+"""Largest plausible angle from the middle of the line, radians.
+
+The tangents in the distortion model become too large toward 45 deg.
+"""
 _EXACT = 1e-9
 """Nominal noise given to the true positions, metres, because a fit needs a weight; the estimates do not depend on it.
 """
@@ -75,7 +78,7 @@ class Estimate:
     distortion : (N,) ndarray
         Distortion of the N points, metres.
     f_sigma, p_sigma : float or None
-        Standard deviations, metres; None where an equation gives none.
+        Standard deviations of f and p, metres; None where an equation gives none.
     """
 
     f: float
@@ -184,7 +187,7 @@ class SimulatedDistortion(DistortionRun):
 
     @property
     def setup(self) -> DistortionSetup:
-        """Test with all files that it refers to."""
+        """Test with the contents of all files that it refers to."""
         return self.bench.setup
 
     def true_fit(self, terms: Sequence[str] = interior.CALIBRATED) -> interior.InteriorOrientation:
@@ -359,7 +362,7 @@ def reduce(
 
 
 def measure_files(spec: MeasuredDistortionSpec, seed: int) -> DistortionRun:
-    """Read measured angles and spots, and reduce them.
+    """Read measured angles and spots from files, and compute interior orientation and distortion.
 
     Raises
     ------
@@ -410,7 +413,7 @@ def _check_region(files: DistortionFiles, readings: SpotReadings, series: Calibr
 
 
 def _check_angles(files: DistortionFiles, readings: SpotReadings, zero: float) -> None:
-    """Raise InputError for readings far from the zero, which point to a mistaken zero or unit."""
+    """Raise InputError for readings far from the angle zero, which suggest a wrong zero or unit in the file."""
     distance = np.abs(readings.reading - zero) * (readings.lines > 0)
     if np.max(distance) > MAX_FIELD_ANGLE:
         index = np.unravel_index(int(np.argmax(distance)), distance.shape)

@@ -4,8 +4,8 @@ All numbers are in the focal-plane frame of the camera's prescription (X' flight
 the light). A ``Pose`` places the focal-plane assembly in it, and the chip of each band lies at a height above the
 assembly.
 
-At every site the target is moved through focus, its edge recorded, the MTF measured, and the vertex of the MTF curve
-fitted.
+At every site (a position on a line CCD) the target is moved through focus, its edge recorded, the MTF measured, and the
+vertex of the MTF curve, its peak, fitted.
 """
 
 from __future__ import annotations
@@ -135,7 +135,7 @@ class BudgetLine:
     edge : str
         Direction in which the MTF is measured.
     factors : mapping
-        Effect -> its transfer factor.
+        Effect (such as diffraction or the pixel) -> its MTF factor.
     total : float
         MTF, the product of the factors.
     """
@@ -200,7 +200,7 @@ class FocusBench:
         return tuple(sites)
 
     def _site(self, band: str, field: float, direction: np.ndarray, hit: np.ndarray, pupil: PupilFunction) -> Site:
-        """Build the site of one band and field from its traced pupil."""
+        """Build the site of one band and field point, from its traced pupil."""
         test, ccd = self.setup.test, self.ccds[band]
         local = self.path.local_map(self.camera.as_built, direction, ccd.band.pitch * test.edge.region)
         nominal = self.path.local_map({}, direction, ccd.band.pitch * test.edge.region)
@@ -345,7 +345,7 @@ class SiteScan:
 
     @property
     def defocus(self) -> float:
-        """Defocus of the CCD from the mean of the edges' vertices, positive downstream of best focus, metres."""
+        """Defocus of the CCD, the mean over the edges' fitted MTF peaks, positive downstream of best focus, metres."""
         return float(np.mean([v.position for v in self.vertex.values()]))
 
     @property
@@ -361,7 +361,7 @@ class NyquistMtf:
     Attributes
     ----------
     by_edge : mapping
-        Edge -> MTF at the Nyquist frequency and its standard deviation.
+        Edge (direction in which it measures the MTF) -> MTF at the Nyquist frequency and its standard deviation.
     frames : mapping
         Edge -> recorded frames, (frames, region, region), DN.
     """
@@ -371,7 +371,7 @@ class NyquistMtf:
 
 
 class Recorder:
-    """Recorder of edge images for one placement of the assembly.
+    """Recorder of images of slanted edges, for one placement of the focal-plane assembly.
 
     Parameters
     ----------
@@ -398,7 +398,7 @@ class Recorder:
         self.patterns = patterns
 
     def frames(self, number: int, edge: str, shift: float, take: int) -> np.ndarray:
-        """Record frames (frames, region, region) of an edge at one site.
+        """Record frames of an edge at one site, (frames, region, region), DN.
 
         Parameters
         ----------
@@ -502,7 +502,7 @@ def in_focus(recorder: Recorder) -> tuple[NyquistMtf, ...]:
 
 
 def _scan_site(recorder: Recorder, number: int, search: bool) -> SiteScan:
-    """Measure one site through focus and fit its vertices."""
+    """Measure one site through focus and fit the peaks (vertices) of its MTF curves."""
     bench = recorder.bench
     site, plan = bench.sites[number], bench.setup.test.scan
     zero = bench.geometric_zero(site.band)
@@ -534,9 +534,9 @@ def _scan_site(recorder: Recorder, number: int, search: bool) -> SiteScan:
 
 
 def _search(recorder: Recorder, number: int, zero: float, first: int = 0) -> float:
-    """Return the target shift with the highest contrast along the line over the whole range of the scan, metres.
+    """Return the target shift at which an edge's contrast along the line is highest, metres.
 
-    ``first`` is the number of the first image.
+    The whole range of the scan is searched; ``first`` is the number of the first image.
     """
     plan = recorder.bench.setup.test.scan
     site = recorder.bench.sites[number]

@@ -189,11 +189,11 @@ def edges_svg(run: SimulatedFocus) -> str:
 
 
 MOVED = {"image": "image, along the light", "target": "target, along the light", "focal_plane": "CCD, along the light"}
-"""Part that was moved through focus -> its description in reports."""
+"""What was moved through focus (image or target) -> its description in reports."""
 
 
 def focus_report(run: FocusRun) -> Report:
-    """Build the report of an alignment."""
+    """Return the report of a focal-plane alignment: results, accuracy, figures and tables."""
     data = focus_run.focus_numbers(run)
     sections = (_shims(run), _plane(run), _curve_section(run))
     if isinstance(run, SimulatedFocus):

@@ -265,7 +265,7 @@ class FocusRun:
 
     @property
     def chi_square(self) -> tuple[float, int]:
-        """Chi-square of all curves through focus of the first state together, and their degrees of freedom."""
+        """Chi-square of all MTF curves through focus of the first state together, and its degrees of freedom."""
         vertices = [vertex for scan in self.states[0].scans for vertex in scan.vertex.values()]
         return sum(v.chi_square for v in vertices), sum(v.degrees_of_freedom for v in vertices)
 
@@ -328,7 +328,7 @@ def run_focus(setup: ExperimentSetup[Any], backend: Backend, seed: int, advance:
 
 
 def _require_memory(setup: FocusSetup) -> None:
-    """Raise an error unless the frames in focus and those of one edge per thread fit into memory."""
+    """Raise an error unless all frames in focus, and the frames of one edge per thread, fit into memory."""
     test = setup.test
     series = 2 * test.rounds * len(setup.camera.bands) * len(test.fields)  # of edges in two directions
     bytes_per_frame = test.edge.region**2 * (series * _GREY + cores() * _EDGE_PIXEL)
@@ -390,7 +390,7 @@ def _check_light(bench: FocusBench) -> None:
 
 
 def align(bench: FocusBench, seed: int, advance: Advance = silent) -> SimulatedFocus:
-    """Misalign the focal plane at random and align it.
+    """Simulate an alignment: misalign the focal plane at random, then measure and shim it in rounds.
 
     Raises
     ------
@@ -762,7 +762,7 @@ ROW_FAULT: Record[RowFault] = Record(
 
 
 def _first_plane(run: FocusRun) -> _PlacePlane:
-    """Return the run with its first state and the plane fitted to it."""
+    """Return the run, its first state, and the plane fitted to that state's best foci."""
     return run, run.states[0], run.shimmings[0]
 
 

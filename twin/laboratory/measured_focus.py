@@ -29,7 +29,7 @@ from twin.laboratory.measured_readings import DataFile
 from twin.targets.target_images import ALONG, DIRECTIONS
 
 MAX_SITES = 3000
-"""Largest number of sites of a series."""
+"""Largest number of sites (positions on the focal plane) in a measured series."""
 NANOMETRE = 1e-9
 """Distance below which two positions are the same site, metres."""
 _WHERE = (
@@ -48,7 +48,7 @@ IMAGE_COLUMNS = (
     *(Column(name, needed=False, whole=True, least=1.0, most=1e5) for name in ("height", "width")),
 )
 _FALSE_ALARM = 1e-3
-"""Probability that any line of a table without errors is excluded as an outlier."""
+"""Probability that any row of a table without errors is excluded as an outlier."""
 _REGION = ("row", "column", "height", "width")
 
 

@@ -1,6 +1,6 @@
 """Measured readings of a turntable, and spots of a camera on it, read from tables for the analysis.
 
-Rows are sorted before anything is computed, so that their order in a file changes no bit of a result.
+Rows are sorted before anything is computed, so that their order in a file does not change any digit of a result.
 """
 
 from __future__ import annotations
@@ -453,7 +453,7 @@ class _Cells:
         return np.where(least == most, least, mean)
 
     def refuse_twice(self, number: Array, name: str) -> None:
-        """Raise InputError if two rows of a group have the same number."""
+        """Raise InputError if two rows of a group have the same number (such as that of a set) in a column."""
         numbers = number[self.order]
         same = (np.diff(self.group) == 0) & (np.diff(numbers) == 0)
         if np.any(same):

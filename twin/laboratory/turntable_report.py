@@ -188,7 +188,7 @@ def _comparison(run: TurntableRun, result: Mapping[str, Any]) -> Section:
 
 
 def _fits(run: TurntableRun, result: Mapping[str, Any]) -> Section:
-    """Return the section on the fits of the dividing error."""
+    """Return the section on the functions fitted to the dividing error."""
     fits, chosen, held, model = result["fits"], result["chosen"], run.held_out, run.model
     best = result["ranking"][0]
     ranking_text = (
@@ -275,7 +275,7 @@ def _ranking(result: Mapping[str, Any]) -> Table:
 
 
 def _noise(run: TurntableRun) -> float:
-    """Return the sigma of a compensated angle due to noise of the calibration, RMS over its readings, arcsec."""
+    """Return the sigma of a compensated angle due to noise of the calibration, RMS over the readings, arcsec."""
     return float(np.sqrt(np.mean(np.diag(run.compensation.fit.covariance(run.series.angle))))) / ARCSEC
 
 
@@ -300,7 +300,7 @@ def _chi_square(result: Mapping[str, Any]) -> Table:
 
 
 def turntable_report(run: TurntableRun) -> Report:
-    """Build the report of a turntable test."""
+    """Return the report of a turntable test: dividing error, fits, remaining error, figures and tables."""
     data, spec = TURNTABLE(run), run.spec
     chosen, parts, truth = data["chosen"], data["compensation"], data.get("truth")
     sigma = float(np.sqrt(np.mean(run.compensation.sigma(run.series.angle) ** 2))) / ARCSEC
@@ -351,7 +351,7 @@ def turntable_report(run: TurntableRun) -> Report:
 
 
 def _warnings(run: TurntableRun, data: Mapping[str, Any]) -> tuple[str, ...]:
-    """Return the warnings of the report."""
+    """Return the warnings about the measurements and the fits of the dividing error."""
     warnings = []
     if run.too_few:
         warnings.append(f"too few angles for: {', '.join(FIT_NAMES[name] for name in run.too_few)}")

@@ -53,7 +53,7 @@ _FIXED_POINT_STEPS = 8
 
 @dataclass(frozen=True, eq=False)
 class Harmonics:
-    """Periodic function sum_k cosine_k cos(k R) + sine_k sin(k R) of the reading R.
+    """Periodic function of a turntable reading R: sum over k of cosine_k cos(k R) + sine_k sin(k R), radians.
 
     Attributes
     ----------
@@ -301,15 +301,15 @@ class TurntableRun:
 
     @cached_property
     def chi_square(self) -> tuple[float, float]:
-        """Chi-square of the chosen fit at the calibrated readings, against their sigmas, and its degrees of freedom."""
+        """Chi-square of the chosen fit's residuals at the calibrated readings, and its degrees of freedom."""
         square = float(np.sum((self.residual(self.choice.chosen) / self.series.sigma) ** 2))
         return square, len(self.series.angle) - self.compensation.fit.effective_parameters
 
     @cached_property
     def held_out_chi_square(self) -> tuple[float, int] | tuple[None, None]:
-        """Chi-square at the held-out readings and its degrees of freedom; None without such readings.
+        """Chi-square of the residuals at the held-out readings, and its degrees of freedom; None without such readings.
 
-        Its covariance is that of the readings plus the full covariance of the compensation.
+        Their covariance is that of the readings plus the full covariance of the compensation.
         """
         if self.held_out is None:
             return None, None
