@@ -167,7 +167,7 @@ def _short(label: str) -> str:
 
 
 def is_wrong(reading: float, true: float, floor: float = SAME) -> bool:
-    """Return True if an estimate differs from the true value by more than ``WRONG`` of it and more than ``floor``."""
+    """Return True if an estimate's error exceeds both ``WRONG`` times the true value and ``floor``."""
     return abs(reading - true) > max(WRONG * abs(true), floor)
 
 
@@ -225,7 +225,7 @@ def formula_section(run: RenderRun) -> Section:
 
 
 def _factor_text(run: RenderRun, name: str) -> str:
-    """Return a sentence with the numbers that explain a camera's factors."""
+    """Return a sentence with the numbers that explain the scale factors of the formulas for one camera."""
     geometry, factors = run.experiment.geometry(name), run.crosstalk[name].factors
     f, f_x = geometry.principal_distance_m, geometry.principal_distance_across_m or geometry.principal_distance_m
     by_model = {(factor.estimator, factor.parameter): float(factor.by_model) for factor in factors}

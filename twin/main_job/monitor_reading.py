@@ -96,10 +96,10 @@ class MonitorReading:
 
     @cached_property
     def doubts(self) -> tuple[str, ...]:
-        """Reasons why sigma does not hold for this measurement, as sentences without full stops.
+        """Reasons why sigma is not valid for this measurement, as sentences without full stops.
 
         They are spots whose shape differs from their calibration, estimates that are not linear in the motions and
-        cannot be relinearised, and spot shifts that contradict the prior.
+        cannot be linearised again, and spot shifts that contradict the prior.
         """
         texts = list(self.earlier_doubts)
         evidence = self.recovery.evidence
@@ -117,12 +117,12 @@ class MonitorReading:
 
     @property
     def contradiction(self) -> tuple[str, ...]:
-        """Sentence that the shifts contradict the prior; empty where they agree with it."""
+        """Sentence that the spot shifts contradict the prior; empty if they agree with it."""
         return contradicted(self.disturbances, self.consistency)
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """Notes on estimates that were relinearised about the estimated state, as sentences without full stops."""
+        """Notes on estimates that were linearised again about the estimated state, as sentences without full stops."""
         return tuple(
             f"the motions read by the {self.estimators[name].title} are too large for a linear estimate "
             f"({self._error_text(name)} against the retraced state): its readings are Gauss-Newton iterates"
@@ -215,14 +215,15 @@ class MonitorReading:
         return {b: np.stack([c for (body, _, _), c in columns.items() if body == b], axis=1) for b in bodies}
 
     def worst_of(self, shifts: np.ndarray, covariance: np.ndarray) -> tuple[int, Consistency] | None:
-        """Return the state of a series whose spot shifts agree least with the prior, and its chi-square test.
+        """Return the time of a series at which the spot shifts agree least with the prior, and its chi-square test.
 
-        The limit is that of the largest value of all times, at the same false-alarm rate. None without a prior.
+        The limit of the test is that of the largest value of all times, at the same false-alarm rate. The result is
+        None without a prior.
 
         Parameters
         ----------
         shifts : (T, 2 C) ndarray
-            Spot shifts of C channels at T times, in pixels.
+            Shifts of C spots (row and column of each) at T times, in pixels.
         covariance : (T, 2 C, 2 C) ndarray
             Covariance of the shifts at each time, in px^2.
         """
@@ -252,7 +253,7 @@ class MonitorReading:
                 yield SelfCheck(f"linear readings of {name} against the retraced state", size, None, "sigma", meaning)
 
     def recovered_dict(self) -> dict[str, Any]:
-        """Return the contents of recovered.json."""
+        """Return the contents of recovered.json: estimated changes, sigmas, spots and tests."""
         groups = self.table.groups()
         spots: dict[str, Any] = {}
         r = self.recovery
@@ -371,7 +372,7 @@ def prior_check(name: str, test: Consistency) -> SelfCheck:
 
 
 def worst_checks(readings: Iterable[MonitorReading]) -> tuple[SelfCheck, ...]:
-    """Return, for each name of a check, the one with the worst result among several measurements.
+    """Return for each kind of check, by its name, the one with the worst result among several measurements.
 
     Parameters
     ----------
@@ -452,7 +453,7 @@ _FIT = {
     "core_chi_square_sigma_noise": "core_sigma",
     "sigma_widened": "widening",
 }
-"""Key of a spot in files -> attribute of its fit."""
+"""Key of a spot's goodness of fit in files -> attribute of its fit."""
 
 
 def _spot(position: np.ndarray, sigma: np.ndarray) -> dict[str, float]:

@@ -229,7 +229,7 @@ def _mtf_rows(name: str, camera: CameraTargets) -> list[list[Cell]]:
 
 
 def _mtf_cells(key: str, reading: EdgeReading | BarReading) -> tuple[Marked, Marked]:
-    """Return the cells of a measured MTF at Nyquist and of its true value."""
+    """Return the table cells of a measured MTF at Nyquist and of its true value."""
     true = Marked(fixed(reading.true_nyquist, _DECIMALS), "", "truth", f"{key}.true")
     measured = reading.nyquist
     if measured is None:

@@ -37,7 +37,7 @@ def irradiance_file(run: RenderRun) -> bytes:
 
 
 def write_results(run: JobRun, folder: RunFolder) -> None:
-    """Write everything that a run computed except irradiance.nc.
+    """Write all results of a run except irradiance.nc into its folder.
 
     Parameters
     ----------
@@ -86,12 +86,12 @@ def _write_monitor(run: RenderRun, folder: RunFolder) -> None:
 
 
 def _write_numbers(folder: RunFolder, kind: str, data: Mapping[str, Any]) -> None:
-    """Write ``KIND.json`` with its schema and reference frames."""
+    """Write the JSON file of a kind of results (``KIND.json``), with its schema and reference frames."""
     folder.write_json(f"{kind}.json", described(kind, data))
 
 
 def _spot_facts(run: RenderRun, channel: Channel, note: str) -> FrameFacts:
-    """Return the metadata of frames of a monitor's area CCD."""
+    """Return the metadata for the file of a monitor CCD's frames."""
     camera = f"{channel.camera}, {channel.name} area CCD"
     return FrameFacts(camera, run.experiment.path.pitch, run.experiment.exposure, note=note)
 

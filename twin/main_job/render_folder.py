@@ -137,7 +137,7 @@ def render_report(
     pictures: Sequence[Path] = (),
     drawn: Mapping[str, Any] | None = None,
 ) -> str:
-    """Return the HTML text of the report.
+    """Return the report of a run as HTML text.
 
     Parameters
     ----------
@@ -266,6 +266,8 @@ FILES = {IRRADIANCE: "irradiance.nc", SCENE: "scene.glb", SUMMARY: "summary.png"
 
 def begin_drawing(beside: SecondProcess, instrument: Instrument, backend: Backend, state: State) -> None:
     """Start drawing in the second process what does not depend on the measurement, unless it has started already.
+
+    It draws the instrument and its light in the state that is shown.
 
     Parameters
     ----------

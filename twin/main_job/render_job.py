@@ -71,7 +71,9 @@ MIN_LIGHT = 0.5
 """Fraction of the nominal light on a CCD below which the user is warned of vignetting or a spot leaving the CCD."""
 
 SHARP = 1.0 / 14.0
-"""Wavefront error, in waves RMS, below which a nominal spot counts as diffraction limited (Marechal: Strehl ratio 0.8).
+"""Wavefront error, in waves RMS, below which a nominal spot counts as diffraction limited.
+
+It is Maréchal's criterion, a Strehl ratio of 0.8.
 """
 
 
@@ -246,7 +248,7 @@ def _without_monitor(
     Raises
     ------
     InputError
-        The job cannot be run (see `render_job`), or it asks for what requires a monitor.
+        The job cannot be run (see `render_job`), or it requests results that require a monitor.
     """
     require_one_state(resolved)
     job = resolved.job
@@ -322,7 +324,7 @@ def _image_warnings(
 
 
 class _Stages:
-    """Progress reports when each of STAGES begins and ends."""
+    """Reporter of the progress, which is called when each of STAGES begins and ends."""
 
     def __init__(self, advance: Advance) -> None:
         self._advance, self._now = advance, ""
@@ -448,7 +450,7 @@ def _unmeasured(experiment: MonitorExperiment, before: np.ndarray, error: SpotEr
 
 
 def _blurred(experiment: MonitorExperiment, focus: SpotFocus) -> tuple[str, ...]:
-    """Return a warning for each camera whose spots are out of focus as designed, which is probably a mistake."""
+    """Return a warning for each camera whose spots are out of focus in the design, which is probably a mistake."""
     warnings = []
     for name in experiment.instrument.cameras:
         indices = [i for i, channel in enumerate(experiment.path.channels) if channel.camera == name]

@@ -132,7 +132,10 @@ def _label(reading: Reading) -> Marked:
 
 
 def _all_digits(run: RenderRun, name: str, table: ReadingTable, over: bool) -> Table:
-    """Return a table of all changes: truth, and each estimator's value (or RMS error), sigma and noise sigma."""
+    """Return a table of all changes with all digits: true value, and each estimator's value, sigma and noise sigma.
+
+    If ``over`` is set, the table is over a time series and holds RMS errors instead of values.
+    """
     heads = ["camera", "parameter", "unit", "true rms" if over else "true"]
     heads += _value_and_sigma(run, " error rms" if over else "")
     rows: list[list[Cell]] = []
@@ -233,7 +236,7 @@ def _range(values: np.ndarray, places: int) -> str:
 
 
 def _worst(run: RenderRun, series: TimeSeries) -> str:
-    """Return a sentence with the largest error in alpha of the estimator that the verdict uses.
+    """Return a sentence with the largest error in d_alpha of the estimator that the verdict uses.
 
     It names the camera, the size, the time and the true change.
     """
@@ -427,7 +430,7 @@ ZERO_CELSIUS = 273.15
 
 
 def facts(run: JobRun) -> tuple[tuple[str, str], ...]:
-    """Return the facts about set-up and assumptions, as pairs of title and text."""
+    """Return the facts about the set-up and assumptions of a run, as pairs of title and text."""
     resolved, instrument = run.resolved, run.experiment.instrument
     spec, has_prior = resolved.instrument, run.experiment.stated is not None
     instrument_fact = ("Instrument", f"{spec.name}: {spec.description}" if spec.description else spec.name)
@@ -496,7 +499,7 @@ def _fields(degrees: list[float]) -> str:
 
 
 def setup_section(run: JobRun) -> Section:
-    """Return the section with the cameras and with the prior on disturbances, cause by cause."""
+    """Return the section with a table of the cameras and one of the prior on disturbances, cause by cause."""
     spec, instrument = run.resolved.instrument, run.experiment.instrument
     rows: list[list[Cell]] = []
     for name, model in instrument.cameras.items():
@@ -597,7 +600,7 @@ def done_table(run: JobRun) -> Table:
 
 
 def _shown(run: JobRun) -> int | None:
-    """Return the index of the time of a time series that is shown; None for a single state."""
+    """Return the index of the time of a time series that is shown in full; None for a single state."""
     return run.series.shown if isinstance(run, RenderRun) and run.series is not None else None
 
 

@@ -37,7 +37,7 @@ def mean_images(run: RenderRun) -> tuple[np.ndarray, np.ndarray]:
 
 
 def stretch(images: np.ndarray) -> Normalize:
-    """Return the common asinh stretch of images from the background to the peak."""
+    """Return the asinh stretch of grey values that several images have in common, from background to peak."""
     low, high = float(np.percentile(images, 5)), float(images.max())
     high = max(high, low + 1.0)
     return AsinhNorm(linear_width=(high - low) / STRETCH, vmin=low, vmax=high)
@@ -161,7 +161,7 @@ def marks(names: Iterable[str]) -> dict[str, tuple[str, str]]:
 
 
 def residuals_svg(run: RenderRun) -> str:
-    """Draw the errors of all estimators in sigmas, a panel for each camera, the angle and the ground."""
+    """Draw the errors of all estimators divided by their sigmas, a panel for each camera, the angle and the ground."""
     names = {name: estimator.title for name, estimator in run.estimators.items()}
     panels: dict[str, dict[str, dict[str, float | None]]] = {}
     for same in run.reading.table.by_change():
@@ -216,9 +216,9 @@ ROW = 0.168
 _DECADES = 3
 """Number of decades below the largest number that the colour scale shows logarithmically."""
 _MOST_LEVEL = 4
-"""Largest number of column names that fit horizontally side by side."""
+"""Largest number of column names that are written horizontally side by side; more are rotated."""
 _STRONG = 0.55
-"""Depth of a cell's colour, from 0 to 1, above which the number in it is written in white."""
+"""Colour intensity of a cell, from 0 to 1, above which the number in it is written in white."""
 
 
 def motion_map_svg(run: RenderRun) -> str:

@@ -33,7 +33,7 @@ SHOWN = 1e-3
 
 
 HEAT = "temperatures (expansion, bending, change of index)"
-"""Name of the effects of temperatures, which have no motion of their own in a crosstalk table."""
+"""Text for the effects of temperatures, which have no motion of their own in a crosstalk table."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,7 +43,7 @@ class Systematics:
     Attributes
     ----------
     bias : dict of str to (P,) ndarray
-        Estimator -> estimate minus truth, to first order, of each of the camera's P changes, in its unit.
+        Estimator -> estimate minus true change, to first order, of each of the camera's P changes, in its unit.
     outside : tuple of str
         Motions of this camera that the estimators of paper 001 do not assume, as text with amounts.
     parts : dict of str to (P,) ndarray
@@ -110,7 +110,7 @@ def _motion_text(motion: ElementaryMotion, amount: float) -> str:
 
 
 def _amount(run: RenderRun, elementary: ElementaryMotion) -> float:
-    """Return the amount of an elementary motion in the run's state, in table units.
+    """Return the amount of an elementary motion in the run's state, in its table unit (arcsec, um, ppm or nm).
 
     Different pivots of rotation are accounted for to first order.
     """
@@ -125,7 +125,10 @@ def _amount(run: RenderRun, elementary: ElementaryMotion) -> float:
 
 
 def _shift_at(run: RenderRun, body: str, motion: Motion, pivot: str) -> np.ndarray:
-    """Return the shift, in metres, that describes the same motion about a different pivot, to first order."""
+    """Return the shift, in metres, with which a body's rotation about another pivot is the same motion.
+
+    It is computed to first order.
+    """
     pivots = next(b for b in run.experiment.instrument.assembly.tree.bodies if b.path == body).pivots
     arm = np.array(pivots[motion.pivot]) - np.array(pivots[pivot])
     return np.asarray(np.array(motion.shift) - np.cross(motion.rotate, arm) - motion.scale * arm)
@@ -168,15 +171,15 @@ def joined(names: Sequence[str]) -> str:
 UNNOTICED_SIGMAS = 4.0
 """Smallest error of an estimate, in sigmas, for which a warning says that the spots do not show it.
 
-A motion drawn from the prior itself causes as much in one of 20 000 runs.
+A random motion from the prior itself causes as much in one of 20 000 runs.
 """
 
 
 def unobserved_perturbations(run: RenderRun) -> tuple[str, ...]:
     """Return a warning for each perturbed body that falsifies estimates without moving the spots noticeably.
 
-    The effect of that body's perturbation alone on spots and cameras is traced and compared with the estimate from
-    these spots.
+    The effect of that body's perturbation alone on spots and cameras is traced; the change of the camera is compared
+    with the estimate from these spots.
 
     Parameters
     ----------

@@ -112,7 +112,7 @@ def _curve(axes: Axes, when: str, edge: EdgeReading) -> None:
 
 
 def _difference(axes: Axes, when: str, edge: EdgeReading) -> None:
-    """Draw measured minus true MTF, in thousandths."""
+    """Draw measured minus true MTF over spatial frequency, in units of 0.001."""
     measured = edge.measured
     if measured is None:
         return
@@ -219,7 +219,7 @@ def deformation_svg(faces: Mapping[str, NodalDeformation]) -> str:
 
 
 def _deformation(figure: Figure, axes: Any, path: str, face: NodalDeformation) -> None:
-    """Draw the maps of one body; each node colours its cell of the aperture."""
+    """Draw the maps of one body's deformation; each node of its table colours its cell of the aperture."""
     inside = face.weight > 0.0
     points = face.places[inside]
     low, high = points.min(axis=0), points.max(axis=0)

@@ -40,9 +40,9 @@ FALSE_ALARM = 1e-3
 _EXPLAINED = 0.2
 """Fraction of an error that first-order crosstalk may leave unexplained if the error still counts as explained."""
 _SOFTER = 0.05
-"""Smallest relative loss of MTF at Nyquist that is reported."""
+"""Smallest relative loss of MTF at the Nyquist frequency that is reported."""
 MOST_FRAMES = 10_000
-"""Largest number of frames that is recommended."""
+"""Largest number of frames per state that the verdict recommends."""
 _DIMMED = 0.5
 """Fraction of its nominal light below which a spot is reported as dimmed."""
 
@@ -57,7 +57,10 @@ class Judgement:
 
 
 def readings(run: RenderRun, estimator: str) -> tuple[Reading, ...]:
-    """Return all changes by an estimator: cameras, angle and ground errors; over a time series, RMS values."""
+    """Return all changes estimated by an estimator: of cameras, of the angle between two, and on the ground.
+
+    For a time series they are RMS values over its times.
+    """
     return run.series.readings.rms.of(estimator) if run.series else run.reading.table.of(estimator)
 
 
@@ -187,7 +190,7 @@ def _are(what: list[Reading]) -> str:
 
 
 def _changes(rows: tuple[Reading, ...]) -> list[Reading]:
-    """Return the changes without the errors on the ground, which follow from them."""
+    """Return the changes of cameras and angle, without the errors on the ground, which follow from them."""
     return [r for r in rows if r.group != GROUND_GROUP]
 
 
@@ -217,14 +220,14 @@ def _recovered(run: RenderRun, rows: tuple[Reading, ...]) -> tuple[str, ...]:
 
 
 def _frames(run: RenderRun, rows: tuple[Reading, ...]) -> str:
-    """Return whether more frames help, as text; they lower only the noise."""
+    """Return a sentence on whether more frames would improve the accuracy; they lower only the noise."""
     if any(r.noise**2 > 0.5 * r.sigma**2 for r in _changes(rows)):
         return "; more frames or more light would reveal smaller changes"
     return "; more frames do not lower this limit"
 
 
 def _needed(run: RenderRun, clearest: Reading) -> str:
-    """Return the number of frames that would reveal a change, as text; empty if none would."""
+    """Return a text with the number of frames that would make a change detectable; empty if none would."""
     allowed = (clearest.true / FAR) ** 2 - (clearest.sigma**2 - clearest.noise**2)
     need = math.ceil(run.frames * clearest.noise**2 / allowed) if allowed > 0.0 else math.inf
     return f"about {need} frames would reveal the clearest change" if need <= MOST_FRAMES else ""
@@ -270,7 +273,7 @@ def _score(rows: tuple[Reading, ...], wrong: list[Reading], suffix: str = "") ->
 
 
 def _misread_reason(run: RenderRun) -> str:
-    """Return why an estimator gives wrong changes for a motion, as text."""
+    """Return a sentence on why an estimator reports wrong changes for the motion of this run."""
     if run.estimators[run.judged].stated:
         return "larger than the prior expects"
     return f"outside the family of the {_title(run)}"
