@@ -26,9 +26,12 @@ from twin.framework.artefact import plain, significant
 FARTHEST = 100.0
 """Largest factor on a chosen input up to which the limit of its admissible range is searched."""
 _STEP = 1.1
-"""Factor between two trial values of an input in the search for its limit."""
+"""Ratio of one trial value of a chosen input to the one before, in the search for the limit of its range."""
 _HALVINGS = 20
-"""Number of bisections that locate a limit: 1.1 to 2^-20 of a step, far below the two digits shown."""
+"""Number of bisections that locate the limit of an input's range.
+
+An interval of a factor 1.1 is narrowed to 2^-20 of it, far below the two digits shown.
+"""
 
 
 @dataclass(frozen=True)
@@ -79,7 +82,7 @@ class InputRange:
 
 
 def _two(value: float) -> str:
-    """Return a number with two digits and without an exponent."""
+    """Return a number as text with two significant digits and without an exponent."""
     return significant(value, 2, floor=0.0)
 
 
@@ -251,7 +254,7 @@ VERDICTS: dict[Verdict, str] = {
     NOT_CHECKABLE: "The paper does not print what a comparison needs; the reason is given.",
     FAILED: "The check could not be computed; this says nothing about the paper.",
 }
-"""Meaning of each verdict."""
+"""Verdict of a check -> its meaning in words."""
 
 SIGMAS = 3.0
 """Noise allowance of a comparison, in standard deviations of the measured value."""

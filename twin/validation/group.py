@@ -121,17 +121,17 @@ class Context:
         self.artefacts.append(artefact)
 
     def figure(self, name: str, drawing: str | bytes, **facts: object) -> None:
-        """Add a drawing, SVG or PNG, with the title and caption from the group's file."""
+        """Add a drawing (SVG or PNG) to the report, with the title and caption from the group's file."""
         texts = self._said(name, facts)
         self.add(SvgFigure(name, *texts, drawing) if isinstance(drawing, str) else PngFigure(name, *texts, drawing))
 
     def table(self, name: str, rows: Sequence[Sequence[Cell]], **facts: object) -> None:
-        """Add a table with the title, caption and heads from the group's file."""
+        """Add a table to the report, with the title, caption and column names from the group's file."""
         text = self.texts[name]
         self.add(Table(name, *self._said(name, facts), text.heads, rows, text.decimals))
 
     def data(self, name: str, content: dict[str, Any]) -> None:
-        """Add data with the title and caption from the group's file."""
+        """Add data to the report's downloads, with the title and caption from the group's file."""
         self.add(Data(name, *self._said(name, {}), content))
 
     def _said(self, name: str, facts: Mapping[str, Any]) -> tuple[str, str]:
@@ -248,7 +248,7 @@ class Printed:
         return self._number(_path(key), self._at(key))
 
     def whole(self, key: str) -> int:
-        """Return the printed whole number of a key."""
+        """Return the printed integer at a key."""
         value = self._at(key)
         if not isinstance(value, int) or isinstance(value, bool):
             raise self._error(_path(key), "no whole number", value)
@@ -259,11 +259,11 @@ class Printed:
         return self._column(_path(key), self._at(key))
 
     def numbers(self, key: str) -> Mapping[str, float]:
-        """Return the printed numbers below a key, by name, in the order of the file."""
+        """Return name -> printed number for all entries below a key, in the order of the file."""
         return FrozenMap({k: self._number((*_path(key), k), v) for k, v in self._mapping(key).items()})
 
     def columns(self, key: str) -> Mapping[str, tuple[float, ...]]:
-        """Return the printed lists of numbers below a key, by name, in the order of the file."""
+        """Return name -> printed list of numbers for all entries below a key, in the order of the file."""
         return FrozenMap({k: self._column((*_path(key), k), v) for k, v in self._mapping(key).items()})
 
     @cached_property

@@ -26,7 +26,7 @@ FILES = "artefacts"
 """Folder of the groups' figures, tables and data in the run folder; each group has a subfolder named by its prefix."""
 
 Progress = Callable[[float, str], None]
-"""Callable with the estimated seconds of work done, out of ``rough_seconds``, and the name of the present work."""
+"""Function that is called with the finished work, in estimated seconds out of ``rough_seconds``, and its name."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -240,7 +240,7 @@ def _run_group(
 
 
 def _keep(result: CheckResult, results: dict[str, CheckResult], group: CheckGroup, wanted: frozenset[str]) -> None:
-    """Add a result to the results of its group.
+    """Add the result of a check to the results of its group.
 
     Raises
     ------

@@ -24,7 +24,7 @@ PAGE = "README.md"
 
 
 def summary_files(validation: Validation) -> dict[str, bytes]:
-    """Return the files of the summary by name: the page and the figures that it shows."""
+    """Return name -> contents of the files of the summary: the page and the figures that it shows."""
     figures = {
         f"{run.group.prefix}-{a.name}.{a.kind}": a
         for run in validation.runs
@@ -81,7 +81,7 @@ def _tables(validation: Validation) -> Iterator[str]:
 
 
 def _measured(result: CheckResult) -> str:
-    """Return the measured value with its sigma and unit as text."""
+    """Return the simulated value with its sigma and unit as text."""
     text, sigma = measured_text(result), sigma_text(result)
     parts = [text, f"± {sigma}" if sigma else "", "" if result.unit == "1" or result.measured is None else result.unit]
     return " ".join(part for part in parts if part)
@@ -132,7 +132,7 @@ def _cell(text: str) -> str:
 
 _LOOKS = "confirmed", "reproduced", "consistent", "corrected", "refuted", "undecided", "silent", "failed"
 MARKS: dict[Verdict, tuple[str, str]] = dict(zip(VERDICTS, zip("=⊜∼≈≠±?✕", _LOOKS, strict=True), strict=True))
-"""Character and CSS class of each verdict; the character makes the meaning independent of the colour."""
+"""Verdict -> its character and CSS class in the report; the character shows the meaning without colour."""
 
 
 def render_report(validation: Validation) -> str:
@@ -234,7 +234,7 @@ def _words(validation: Validation) -> list[str]:
 
 
 def measured_text(result: CheckResult) -> str:
-    """Return the measured value with the digits that its sigma justifies."""
+    """Return the simulated value as text, with the digits that its sigma justifies."""
     if result.measured is None:
         return "\N{EM DASH}"
     if result.sigma:

@@ -144,7 +144,7 @@ def repeated(
     turns: Mapping[str, tuple[float, float, float]] = FrozenMap(),
     corrected: bool = True,
 ) -> Passes:
-    """Simulate a pass and ``count`` measurements of it.
+    """Simulate a pass of the satellite over ground points and ``count`` measurements of it.
 
     Parameters
     ----------
@@ -157,7 +157,7 @@ def repeated(
     backend : Backend | None
         Backend that traces an instrument's lines; None for lines without an instrument.
     turns : Mapping[str, tuple[float, float, float]]
-        Line -> rotation vector in body axes since the laboratory calibration, radians.
+        Line -> its rotation vector in body axes since the laboratory calibration, radians.
     corrected : bool
         True if the analysis removes aberration, light time and refraction from the points.
     """
@@ -482,7 +482,7 @@ def _refraction(passes: Passes, line: str) -> float:
 
 
 def _traced(context: Context, passes: Passes) -> Iterator[CheckResult]:
-    """Check measurements of a traced instrument that has changed since the laboratory."""
+    """Check measurements of a ray-traced instrument that has changed since its laboratory calibration."""
     flight = passes.flight
     first, second = flight.pairs["alpha"]
     lab = dihedral_angle(

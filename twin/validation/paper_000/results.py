@@ -29,7 +29,10 @@ from twin.validation.paper_000.method import PAIRS, TEST, Passes, planes_of, rep
 PRINTED_ARCSEC = load_printed("000").numbers("table1.difference_arcsec")
 ALPHA, BETA = PRINTED_ARCSEC["alpha"], PRINTED_ARCSEC["beta"]
 POINT_SIGMA = float(np.hypot(2.0, 5.0 / 3.0))
-"""Standard deviation of a ground point, metres: control points of 2 m, matched to a third of a pixel of 5 m."""
+"""Standard deviation of a ground point, metres.
+
+It combines a control point's error of 2 m with a matching error of a third of a pixel of 5 m.
+"""
 
 POINTS = float(setup_of(TEST).test.strips.points)
 """Number of ground points on each line."""
@@ -167,7 +170,7 @@ def _rms(bias: float, spread: float, factor: float) -> float:
 
 
 def _points(response: Callable[[float], float]) -> list[Chosen]:
-    """Return the error of the ground points as an input on which the scatter of an angle depends."""
+    """Return the error of the ground points as a chosen input, on which the scatter of an angle depends."""
     return [
         Chosen("error of a point", POINT_SIGMA, "m", response),
         Chosen("points on a line", POINTS, "1", lambda factor: response(factor**-0.5)),
@@ -240,7 +243,7 @@ FAR, ALIKE, LITTLE, GROWS = 2.0, 1.25, 0.25, 0.05
 GREEK: Mapping[str, str] = {"alpha": "α", "beta": "β"}
 _STYLES = {"x": (BLUE, "o"), "y": (GREEN, "s"), "z": (VERMILION, "^")}
 REACH = 10.0
-"""Largest displacement of a station or of ground points in the figures, metres."""
+"""Largest displacement of the projection centre (station) or of ground points in the figures, metres."""
 ELSEWHERE = (45.0, 120.0)
 """Latitude and longitude, degrees, of another pass, at which the paper's position-dependent statements are true."""
 PANELS = {
@@ -286,7 +289,7 @@ class Sentence:
 
     @property
     def implied(self) -> float:
-        """Value of `measure` that the statement implies."""
+        """Value of the number that `measure` returns, as the statement implies it."""
         return {
             "signs": 0.0, "largest": 1.0, "far": FAR, "alike": ALIKE, "little": LITTLE, "grows": GROWS, "opposite": 1.0,
         }[self.kind]  # fmt: skip
@@ -375,7 +378,7 @@ def sensitivity_svg(
 
 @drawing("places-000", 3.6)
 def places_svg(figure: Figure, held: Mapping[Place, int], total: int, marked: Sequence[Place]) -> None:
-    """Draw the number of confirmed statements by geographic position."""
+    """Draw a map of the number of statements that are confirmed at each position of the pass."""
     axes = figure.subplots()
     lat, lon = (np.unique([place[k] for place in held]) for k in (0, 1))
     grid = np.array([[held[a, b] for b in lon] for a in lat])
@@ -409,7 +412,10 @@ class Answers:
 
     @classmethod
     def of(cls, table: Sequence[Sensitivity]) -> Answers:
-        """Return the curves from a table of sensitivities, for every moved object along every axis."""
+        """Return the curves of the angles' changes from a table of sensitivities.
+
+        They are given for every moved object along every axis.
+        """
         change = {
             (row.what, angle, row.axis): row.change[k] / ARCSEC for row in table for k, angle in enumerate(row.angles)
         }

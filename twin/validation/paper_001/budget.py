@@ -52,7 +52,7 @@ FROM_ALL_CAUSES = frozenset(
         *(f"table5.{parameter}" for parameter in ("d_beta", "d_alpha", "d_gamma", "d_f")),
     )
 )
-"""Ids of the checks that need a simulation with all causes at once."""
+"""Ids of the checks that need a simulation in which all causes act together."""
 _CHUNK = 40
 _LARGEST = ("prism_180_thermal", "prism_0_rotation")
 """The two causes that contribute most to the total of eq. (12)."""
@@ -65,7 +65,10 @@ _INPUT_OF = {
     "prism_0_rotation": "rotation of the 0° prism",
     "central_prism_thermal": "gradient in the central prism",
 }
-"""Cause -> its main input. Rotations act through the residual angle errors of the prisms, which are chosen too."""
+"""Cause of the error budget -> its main input.
+
+Rotations act through the residual angle errors of the prisms, which are chosen here too.
+"""
 _ANGLE, _LENGTH = ("arcsec", ARCSEC), ("mm", 1e-3)
 _PARAMETERS = {
     "d_beta": ("d_beta_rad", "Δβ, 3σ", *_ANGLE),
@@ -84,7 +87,7 @@ def frame_mean(error: float, frames: int = FRAMES) -> float:
 def root_sum(errors: Mapping[str, float]) -> float:
     """Return the total error of eq. (12) from the errors of Table 3, in their unit.
 
-    It is the root of the sum of their squares, with the centroid's error divided by the root of the number of frames.
+    It is the root of the sum of squares, with the centroid's error divided by the root of the number of frames.
     """
     return sqrt(sum((frame_mean(e) if name == "centroid" else e) ** 2 for name, e in errors.items()))
 
@@ -127,21 +130,21 @@ class BudgetImages:
     Attributes
     ----------
     geometry : MonitorGeometry
-        Geometry of the first camera; both are alike.
+        Geometry of the first camera; the second has the same.
     inputs : (int, int, int)
         Trials per cause (twice as many for FEW_DRAWS), trials with all causes, and groups of frames.
     lines : dict of str to BudgetLine
         Cause of Table 3 -> its simulated error.
     focal_plane : (float, float) or None
-        True and measured change of d_f due to the focal plane's temperature, metres.
+        True and estimated change of d_f due to the focal plane's temperature, metres.
     halved : (float, float, float) or None
         Glass path of the 180-deg prism before and after halving, metres, and the ratio of its errors.
     together : CombinedErrors or None
         Errors with all causes at once.
     scatter : pair of (float, float) or None
-        Scatter of the centroid in single frames and in means of FRAMES, radians, with standard deviations.
+        Scatter of the centroid in single frames and in means of FRAMES, radians, each with its standard deviation.
     line_pixel : float
-        Pixel of the line CCD, metres.
+        Pixel pitch of the line CCD, metres.
     roll_pixels : float or None
         Displacement of the line of sight at the line's end due to a rotation by ROLL, in pixels of the line CCD.
     """
@@ -158,7 +161,7 @@ class BudgetImages:
 
 
 def measured(context: Context) -> BudgetImages:
-    """Simulate what the selected checks need."""
+    """Simulate the errors that the selected checks of the budget need."""
     spec = load_error_budget(BUDGET)
     trials, together, groups = context.count(400, 60), context.count(1500, 80), context.count(400, 80)
     spec = spec.model_copy(update={"trials": trials, "all_together": together})
@@ -190,7 +193,7 @@ def measured(context: Context) -> BudgetImages:
 
 
 def three_sigma(budget: ErrorBudget, cause: str) -> float:
-    """Return the three-sigma input of a cause whose components are alike, in SI units."""
+    """Return three standard deviations of a cause whose components have equal sigmas, in SI units."""
     return 3.0 * budget.prior.of_causes((cause,)).components[0].sigma
 
 
@@ -202,9 +205,9 @@ def more_trials(budget: ErrorBudget, factor: int) -> ErrorBudget:
 
 
 def centroid_scatter(budget: ErrorBudget, groups: int) -> tuple[tuple[float, float], tuple[float, float]]:
-    """Return three sigma of the energy centroid in single frames and in means of FRAMES of them.
+    """Return three sigma of the energy centroid in single frames, and in means of FRAMES frames.
 
-    Both are in radians, each with its standard deviation; the same frames serve both.
+    Both are in radians, each with its standard deviation; they are computed from the same frames.
     """
     setup = budget.experiment
     pattern = setup.pattern(budget.seed)

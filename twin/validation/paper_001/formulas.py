@@ -103,7 +103,7 @@ def parts_across(left: Value, right: Value) -> tuple[Value, Value]:
 
 
 def focal_lengths(geometry: MonitorGeometry) -> tuple[float, float]:
-    """Focal lengths along and across the line, metres."""
+    """Return the focal lengths of a camera along and across the line, metres."""
     f = geometry.principal_distance_m
     return f, geometry.principal_distance_across_m or f
 
@@ -115,11 +115,11 @@ class Ratio:
     Attributes
     ----------
     value : float
-        Mean of the cameras.
+        Mean over the cameras.
     sigma : float
         Standard deviation of ``value``.
     cameras : Mapping[str, Measured]
-        Camera -> (value, sigma).
+        Camera -> (ratio, its sigma).
     """
 
     value: float
@@ -139,7 +139,7 @@ def quotient(above: Measured, below: Measured) -> Measured:
 
 
 class MonitorImages:
-    """Spots measured in nine rendered frames before and after every state, with the estimates by the formulas.
+    """Spots measured in nine rendered frames before and after every change, with the estimates by the formulas.
 
     Parameters
     ----------
@@ -148,7 +148,7 @@ class MonitorImages:
     experiment
         Monitoring experiment with the instrument.
     states
-        Name -> state; both cameras' bodies may move in it.
+        Name -> state after the change; the bodies of both cameras may move in it.
     """
 
     def __init__(self, context: Context, experiment: MonitorExperiment, states: Mapping[str, State]) -> None:
@@ -605,7 +605,7 @@ def run_joint(context: Context) -> Iterator[CheckResult]:
 
 
 def _table_1(context: Context, images: JointMotions) -> Iterator[CheckResult]:
-    """Check the diagonal of Table 1 and its two couplings that are not zero."""
+    """Check the diagonal elements of Table 1 and its two off-diagonal ones that are not zero."""
     matrix, sigma = images.response("paper_joint")
     right, _ = images.response("derived")
     g, (f, f_x) = images.first, focal_lengths(images.first)

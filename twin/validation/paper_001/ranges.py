@@ -251,12 +251,12 @@ class Domain:
 
 
 def sampled(sample: Sample, sizes: Sequence[float], names: Sequence[str] | None = None) -> Curves:
-    """Sample curves at given sizes, and add points where they cross the limit.
+    """Evaluate error curves at given sizes of a change, and add points where they cross the limit.
 
     Parameters
     ----------
     sample : Sample
-        Function that is sampled.
+        Function that computes the errors.
     sizes : sequence of float
         Initial sizes, ascending.
     names : sequence of str or None
@@ -291,7 +291,7 @@ FINE = {"d_alpha": 0.1, "d_beta": 0.1, "d_gamma": 0.1, "d_f": 40.0}
 RELATIVE = 0.01
 WINDOW, CUT = "leaves the area CCD", "an aperture cuts the beam"
 EDGE_PX = 11.0
-"""Smallest distance of a spot from the outermost pixel centres, pixels.
+"""Smallest allowed distance of a spot from the outermost pixel centres, pixels.
 
 Half a pixel nearer, the fit's template ends on one side; one pixel nearer, the centroid refuses the spot.
 """
@@ -552,7 +552,10 @@ class Separation:
     trials: int
 
     def mean(self, form: str, read: str, changed: str) -> tuple[float, float]:
-        """Return the regression coefficient of one parameter on another, mean of the cameras, and its sigma."""
+        """Return the change of one estimated parameter per unit of true change of another, and its sigma.
+
+        It is the regression coefficient for a set of formulas, averaged over the cameras.
+        """
         p, q = NAMES.index(read), NAMES.index(changed)
         values = [self.gain[form][c][p, q] for c in self.gain[form]]
         sigmas = [self.sigma[form][c][p, q] for c in self.sigma[form]]
@@ -597,7 +600,7 @@ RETURNS: Mapping[str, tuple[tuple[float, float] | None, str]] = {
     "roof along": ((0.0, 3e-3), "the ridge lies along the line; the area CCD stands beside its pinhole along the line"),
     "corner": ((0.0, 0.0), "the spot falls on its own pinhole: the area CCD must see it through a beam splitter"),
 }
-"""Kind of return reflector -> position of the area CCD and a remark.
+"""Kind of return reflector -> position of the area CCD for it, and a remark.
 
 The kinds are a mirror facet; a roof whose ridge lies across the line, or along it; a corner cube. The position is
 relative to the pinhole, in metres; None if the one in the instrument's file can be used.
@@ -691,7 +694,7 @@ def with_return(experiment: MonitorExperiment, kind: str) -> MonitorExperiment:
 
 
 def _returning(instrument: Instrument, kind: str) -> Assembly:
-    """Return the assembly with mutually perpendicular mirrors behind every facet's opening."""
+    """Return the instrument's assembly with mutually perpendicular mirrors behind the opening of every return facet."""
     old = instrument.assembly
     bodies, elements, sequences = list(old.tree.bodies), dict(old.elements), dict(old.sequences)
     for channel in instrument.channels:

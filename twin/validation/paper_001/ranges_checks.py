@@ -297,7 +297,7 @@ def _returns(context: Context, resolved: ResolvedJob, bench: ranges.Bench, data:
 
 
 def _four(value: float) -> str:
-    """Return a number with four decimals as text, without a minus sign before zero."""
+    """Return a number as text with four decimals, without a minus sign before zero."""
     return f"{round(float(value), 4) + 0.0:.4f}"
 
 
@@ -305,7 +305,7 @@ def _four(value: float) -> str:
 
 
 def _thinned(points: np.ndarray) -> np.ndarray:
-    """Remove those of N points, (N, 2), that nearly coincide with the previous one."""
+    """Return N points, (N, 2), without those that nearly coincide with the previous one."""
     indices = [0]
     for i in range(1, len(points)):
         if points[i, 0] > 1.25 * points[indices[-1], 0]:
@@ -373,7 +373,7 @@ def joint_svg(figure: Figure, corners: ranges.Corners) -> None:
 
 @drawing("ranges-001-defocus", 3.9)
 def defocus_svg(figure: Figure, pupil: ranges.PupilStudy, curves: ranges.Curves, focal: tuple[float, float]) -> None:
-    """Draw false changes per metre of piston over the pupil, and false changes over the piston."""
+    """Draw the false changes due to piston of the line CCD: per metre over the pupil, and over the piston."""
     left, right = figure.subplots(1, 2)
     grid = np.array([-0.3, 0.3])
     for axis, name, length, sign in ((0, "d_alpha", focal[0], -1.0), (1, "d_beta", focal[1], 1.0)):

@@ -100,7 +100,7 @@ def run(context: Context) -> Iterator[CheckResult]:
 def printed_mean_difference(axis: str) -> float:
     """Return the mean absolute difference computed from the rows of Table 2, arcsec, to compare with its last line.
 
-    It is mirror 1 - mirror 2 (X, Y) or turntable - mirror 2 (Z).
+    The difference is mirror 1 - mirror 2 for the axes X and Y, and turntable - mirror 2 for Z.
     """
     return mean_difference(ANGLES if axis == "Z" else MIRROR_1[axis], MIRROR_2[axis])
 

@@ -45,7 +45,7 @@ SCHEMES = {
 INNER = tuple(f"{line} {part}" for line in LINES for part in INTERIOR)
 """Names of the unknowns of the interior orientation, ordered by line."""
 MEDIAN = float(np.sqrt(np.pi / 2.0))
-"""Ratio of the standard deviations of a median and a mean, for normal noise and many samples."""
+"""Ratio of a median's standard deviation to that of a mean, for normal noise and many samples."""
 SLOW = 1.5 * ARCSEC, 10.0
 """Slow attitude errors for a test of third differences: sigma of a value, radians, and time between values, seconds."""
 _EDGE = 1e-9
@@ -127,7 +127,7 @@ def flown(
 
 
 def flights_of(campaigns: Sequence[Campaign]) -> Flights:
-    """Calibrate and test all campaigns, and return their results as arrays."""
+    """Calibrate the camera in all campaigns and test it at check points; return the results as arrays."""
     first = campaigns[0]
     names = tuple(p.name for p in first.passes)
     latitude = np.array([p.latitude for p in first.passes])
@@ -342,9 +342,9 @@ def _interior(context: Context, flights: Flights, number: int, parts: tuple[str,
 
 @drawing("paper-003-schemes", 4.6)
 def schemes_svg(figure: Figure, flights: Flights, plan: float, height: float) -> None:
-    """Draw the RMS in plan and height by scheme on logarithmic axes, with the limits of the map scale.
+    """Draw the RMS in plan and height for each scheme of parameters on logarithmic axes.
 
-    Scheme 0 is before calibration.
+    The limits of the map scale are drawn too. Scheme 0 is before calibration.
     """
     panels = figure.subplots(1, 2)
     names = ["0\nlaboratory", "1\n1 field", "2\n2 fields", "3\n4 fields", "4\n6 fields", "5\nits own"]

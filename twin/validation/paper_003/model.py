@@ -50,7 +50,7 @@ FIELD = "Beijing"
 CAMPAIGNS, FAST_CAMPAIGNS = 9, 5
 """Campaigns of seven fields, in the full and in the fast run, for the errors of yaw over their sigma."""
 FAST_SIDE = 380
-"""Lines and pixels of a rendered patch in the fast run."""
+"""Lines and pixels of a rendered image patch in the fast run."""
 ROUNDS = (1, 3, 10, 30, 100, 300, 1000, 3000)
 UNKNOWNS = len(LINES) * len(INTERIOR) + len(BIAS)
 ROLL_PITCH = BIAS[:2]
@@ -58,7 +58,10 @@ FREE_INTERIOR = tuple(n for n in (f"{line} {k}" for line in LINES for k in INTER
 TOLERANCE = 1e-3
 """Convergence limit of the stepwise solution: largest last step of a round, in conditional sigmas of the unknowns."""
 PLACES = (700.0, 6000.0, 11300.0)
-"""Pixels of the nadir line at the middles of the windows; the line has 12 000 pixels over the swath."""
+"""Positions, in pixels of the nadir line, of the middles of the rendered windows.
+
+The line has 12 000 pixels over the swath.
+"""
 _FOCAL = 0.65
 """Focal length, metres, with which angles are converted to image motion in figures."""
 _NO_LIGHT = EffectsSpec(light_time=False, aberration=False, refraction=False)
@@ -71,7 +74,7 @@ _TURN = 1.5e-5
 """Half step of numerical derivatives with respect to an attitude angle, radians."""
 _SIDE = 190
 _SIGMA = 2.5
-"""Standard deviation of the brightness of a target on the ground, metres: half a pixel.
+"""Standard deviation of the Gaussian brightness profile of a target on the ground, metres: half a pixel.
 
 The terrain's curvature under it moves its centroid by 0.004 px at most.
 """
@@ -81,7 +84,7 @@ _TERRAIN: dict[str, Any] = {"kind": "fractal", "relief": "30 m", "exponent": 2.4
 
 
 def setup_of(file: str, fields: Sequence[str] = (), **changes: Any) -> CalibrationSetup:
-    """Return a file of the library with some of its fields and with other values of its test's attributes."""
+    """Return a calibration test of the library with only some of its fields, and other values of some attributes."""
     setup = CalibrationSetup.read(SCENES / ORBIT / file)
     if fields:
         chosen = FrozenMap({name: setup.test.fields[name] for name in fields})
@@ -90,7 +93,7 @@ def setup_of(file: str, fields: Sequence[str] = (), **changes: Any) -> Calibrati
 
 
 def changed(setup: CalibrationSetup, **changes: Any) -> CalibrationSetup:
-    """Return a setup with other values of its test's attributes."""
+    """Return a setup in which some attributes of its test have other values."""
     return setup.model_copy(update={"test": setup.test.model_copy(update=changes)})
 
 
@@ -157,7 +160,7 @@ def true_sensors(
 
 @dataclass(frozen=True, eq=False)
 class Turned:
-    """Platform with its body rotated: attitude -> attitude Rx(roll) Ry(pitch) Rz(yaw).
+    """Platform with its body rotated: its attitude is multiplied by Rx(roll) Ry(pitch) Rz(yaw) from the right.
 
     Attributes
     ----------
@@ -179,7 +182,7 @@ class Turned:
         return self.base.inertial_velocity(seconds)
 
     def body_to_itrs(self, seconds: np.ndarray) -> np.ndarray:
-        """Return the rotated attitude."""
+        """Return the rotated platform's rotation matrices from its body frame to the ITRS at given times."""
         return np.asarray(self.base.body_to_itrs(seconds) @ Rotation.from_euler("XYZ", self.angles).as_matrix())
 
 
@@ -254,7 +257,10 @@ def exact_campaign(setup: CalibrationSetup, seed: np.random.SeedSequence) -> Cam
 
 
 def recovered(campaign: Campaign, pitch: float) -> tuple[float, str]:
-    """Return the largest error of a calibration of exact points, in pixels of image motion, and the unknown with it."""
+    """Return the largest error of the unknowns calibrated from exact points, and the unknown with it.
+
+    The error is in pixels of image motion.
+    """
     field_pass = campaign.passes[0]
     adjustment = calibrated_alone(campaign, field_pass)
     worst, which = 0.0, ""
@@ -352,7 +358,7 @@ class Walk:
 
 
 def walked(campaign: Campaign, field_pass: FieldPass, rounds: tuple[int, ...] = (1, 10, 100)) -> Walk:
-    """Compute both solutions of one field, and their difference after some rounds of the stepwise one."""
+    """Compute the stepwise and the simultaneous solution of one field, and their difference after some rounds."""
     observations = [field_pass.control], campaign.laboratory, campaign.noise
     together = adjust(*observations, gauge=GAUGE)
     free = np.array([name not in GAUGE.held for name in together.names])
@@ -463,7 +469,7 @@ def _brightest(image: np.ndarray, count: int) -> list[tuple[int, int]]:
 
 
 def _centroid(image: np.ndarray, row: int, column: int) -> np.ndarray:
-    """Return the centroid of all pixels that the point spread function reaches from a given pixel, in pixels."""
+    """Return the centroid (line, pixel) of all pixels that the point spread function reaches from a given pixel."""
     part = image[row - _REACH : row + _REACH + 1, column - _REACH : column + _REACH + 1]
     if part.shape != (2 * _REACH + 1,) * 2:
         raise ValueError("a mark lies too near to the window's border")
@@ -527,14 +533,14 @@ class FromImages:
 
 
 def calibrated(campaign: Campaign) -> tuple[FromImages, ...]:
-    """Calibrate every field of a campaign by itself."""
+    """Calibrate the camera from every field of a campaign separately."""
     return tuple(_field(campaign, field_pass) for field_pass in campaign.passes)
 
 
 def matching(campaign: Campaign) -> tuple[float, int, int]:
-    """Return the matching error of control points and the numbers of accepted and of wrong positions.
+    """Return the matching error of control points, and the numbers of accepted and of wrong matches.
 
-    The error is the RMS of correct positions against the truth over lines and pixels, in pixels.
+    The error is the RMS of correctly matched minus true positions over lines and pixels, in pixels.
     """
     assert campaign.images is not None
     patches = [patch.judgements for field in campaign.images for patch in field.patches]

@@ -66,7 +66,7 @@ class Perspective:
     p : float
         Principal point f tan w, metres.
     rest : Array
-        Distortion of the N rays, (N,), metres.
+        Distortion of the N rays: their positions minus this model, (N,), metres.
     """
 
     f: float
@@ -83,7 +83,7 @@ class Perspective:
 
     @classmethod
     def nearest(cls, where: Array, turn: Array, tilted: bool = True) -> Perspective:
-        """Fit the perspective by nonlinear least squares without expansion; p = 0 unless ``tilted``.
+        """Fit the distortion-free camera to chief rays by nonlinear least squares, without series expansion.
 
         Parameters
         ----------
@@ -92,7 +92,7 @@ class Perspective:
         turn : (N,) ndarray
             Angles W of their directions, radians.
         tilted : bool
-            True to estimate p.
+            True to estimate the principal point p; False for p = 0.
         """
         start = (where[-1] - where[0]) / (np.tan(turn[-1]) - np.tan(turn[0]))
 
@@ -155,7 +155,7 @@ class SpotTest:
         return float(np.mean(self.turn - self.true_turn))
 
     def shifted(self, *powers: int) -> tuple[Array, Array]:
-        """Return the effect of the wrong zero alone on a least-squares fit of powers of tan W to the chief rays.
+        """Return the effect of the wrong angle zero alone on a least-squares fit of powers of tan W to the chief rays.
 
         The effect consists of the coefficients of the P powers, (P,), and of the residuals at the N points, (N,), in
         metres.
@@ -219,7 +219,7 @@ def measured_tests(context: Context) -> list[SimulatedDistortion]:
 
 
 def lower(raw: float | np.floating, compensated: float | np.floating) -> float:
-    """Return the reduction of an error by the compensation, in percent of the raw error."""
+    """Return by how much the compensation reduces an error, in percent of the error with raw angles."""
     return float(100.0 * (1.0 - compensated / raw))
 
 
@@ -288,7 +288,7 @@ def _eq2(context: Context, tests: Sequence[SpotTest], facts: Facts) -> Iterator[
         return context.row("004.eq2.f", value, sigma, truth, equation=equation, scatter=scatter, **facts)
 
     def zero(found: Array, predicted: Array, equation: str) -> CheckResult:
-        """Check the principal point by a printed equation, into which the error of the zero of the angles enters."""
+        """Check the principal point by one of the paper's equations, which depends on the error of the angles' zero."""
         error, turn = found - p_true, rms([t.zero for t in tests])
         more: dict[str, Any] = {
             "equation": equation,
@@ -327,7 +327,7 @@ def _uneven(
     identifier: str,
     solve: Callable[[SpotTest, tuple[Array, Array]], Any],
 ) -> CheckResult:
-    """Check the principal point by an equation over unevenly spaced points."""
+    """Check the principal point by one of the paper's equations for unevenly spaced points."""
     points = np.array([solve(t, (t.place[UNEVEN], t.zeroed[UNEVEN])) for t in tests])
     true, turn = np.array([t.part.p for t in tests]), tests[0].true_turn[UNEVEN]
     scatter = MM * float(np.std(points - true, ddof=1))
@@ -374,7 +374,7 @@ def _sensitivity(context: Context, tests: Sequence[SpotTest], facts: Facts) -> I
 
 
 def _ratio(over: Array, under: Array, column: int) -> float:
-    """Return the jackknife standard deviation of a ratio of RMS values over tests."""
+    """Return the jackknife standard deviation of a ratio of RMS values over several tests."""
     n = len(over)
     keep = ~np.eye(n, dtype=bool)
     values = np.array([rms(over[k, column]) / rms(under[k, column]) for k in keep])
@@ -456,7 +456,10 @@ def _show(context: Context, tests: Sequence[SpotTest]) -> None:
 
 
 def _statistics(raw: Array, compensated: Array) -> list[Cell]:
-    """Return RMS, mean and maximum over the N points of T tests, (T, N), with reductions, as medians of the tests."""
+    """Return RMS, mean and maximum of the errors over N points, with the reductions by compensation.
+
+    They are medians over T tests; ``raw`` and ``compensated`` hold the errors, (T, N).
+    """
     out: list[Cell] = []
     for size in (lambda v: np.sqrt(np.mean(v**2, axis=1)), lambda v: np.mean(v, axis=1), lambda v: np.max(v, axis=1)):
         before, after = size(raw), size(compensated)

@@ -88,7 +88,7 @@ def _parameters(bench: FocusBench, pose: Pose) -> Array:
 
 
 def _coupling(context: Context, bench: FocusBench) -> CheckResult:
-    """Check the number of parameters that the adjustments of the mount couple."""
+    """Check the paper's statement on how many parameters the adjustments of the mount couple."""
     change = effects(bench)
     tilt = float(np.degrees(bench.setup.test.mount.tilt))
     changed = "; ".join(
@@ -198,7 +198,7 @@ def run(context: Context) -> Iterator[CheckResult]:
 
 
 def measured_alignments(context: Context, bench: FocusBench) -> list[SimulatedFocus]:
-    """Run alignments with rendered edges."""
+    """Simulate alignments of the focal plane with rendered edges, each with its own random misalignment."""
     count = context.count(ALIGNMENTS, FAST_ALIGNMENTS) if context.wants("004.alignment") else 1
     alignments = []
     for k, seed in enumerate(np.random.SeedSequence(context.seed).generate_state(count)):
@@ -274,7 +274,7 @@ def _mtf(context: Context, alignments: Sequence[SimulatedFocus], facts: Mapping[
 def _measured(
     context: Context, alignments: Sequence[SimulatedFocus], facts: Mapping[str, Any]
 ) -> Iterator[CheckResult]:
-    """Check the results of the analysis of the curves against the traced pupils."""
+    """Check the results of the through-focus analysis against those of the traced pupils."""
     looks = [(a.states[0], a.states[-1]) for a in alignments]
     error = np.array([[measured_defocus(state)[0] - state.true_defocus for state in pair] for pair in looks])
     span = [a.states[0].true_defocus for a in alignments]
@@ -323,7 +323,7 @@ def _theodolite(alignments: Sequence[SimulatedFocus], value: float) -> Chosen:
 
 
 def _reached(context: Context, alignments: Sequence[SimulatedFocus], facts: Mapping[str, Any]) -> Iterator[CheckResult]:
-    """Check the result of repeated measuring and shimming."""
+    """Check the final result of repeated measuring and shimming."""
     plan = alignments[0].bench.setup.test
     far = np.array([[MM_PER_M * np.max(np.abs(s.true_defocus)) for s in a.states] for a in alignments])
     turns = np.array([[abs(s.true_level) / ARCMIN for s in a.states] for a in alignments])

@@ -41,12 +41,12 @@ CLOSED_FORMS = tuple(name for name in FITS if name != NETWORK)
 
 @dataclass(frozen=True, eq=False)
 class FittedTable:
-    """Turntable with its fits.
+    """Turntable with its fits of the dividing error.
 
     Attributes
     ----------
     chosen : str
-        Closed form that cross-validation on the calibration points selects.
+        Closed-form fit that cross-validation on the calibration points selects.
     held_out : mapping of str to float
         RMS of each fit at readings that no fit has used, radians; infinite if the fit failed.
     """
@@ -186,7 +186,7 @@ def dividing(value: float, power: float = 1.0) -> Chosen:
 
 
 def _ranks(tables: Sequence[FittedTable]) -> dict[str, Array]:
-    """Return fit -> its rank on each table, 1 for the smallest error."""
+    """Return fit -> its rank on each turntable, 1 for the smallest error."""
     return {
         name: np.array([1.0 + sum(v < t.held_out[name] for v in t.held_out.values()) for t in tables]) for name in FITS
     }

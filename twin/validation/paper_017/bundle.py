@@ -31,7 +31,7 @@ FINER = 10.0
 IMAGE, FINE = 0.3, 0.1
 """Errors of an image point, pixels."""
 ERRORS = (0.35, 0.7, 1.4)
-"""Standard deviations of the attitude, arcsec, between which the limit is searched."""
+"""Standard deviations of the attitude, arcsec, for which both methods are simulated to find the limit."""
 STATED = 0.5
 STRIPS, FAST_STRIPS = 5, 3
 TIES, CHECKS = 800, 150
@@ -39,7 +39,7 @@ _FIXED = CameraChangeSpec.model_validate({"lasting": {"angles": 3 * ["0.002 arcs
 
 
 def strip(image: float, attitude: float) -> AdjustSetup:
-    """Return the setup of one pass of three lines without control.
+    """Return the setup of one pass of three lines without ground control.
 
     Parameters
     ----------
