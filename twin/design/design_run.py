@@ -1,4 +1,4 @@
-"""Optimisation of a camera's prescription with exact Jacobians from several starts, and its result file."""
+"""Optimisation of a camera's optical prescription from several starts with exact Jacobians, and its result file."""
 
 from __future__ import annotations
 
@@ -262,7 +262,7 @@ def verdict(run: DesignRun) -> str:
 
 
 def _held_text(held: tuple[ActiveConstraint, ...], start: str, across: float) -> str:
-    """Return in words the constraints that cost most, at most three, each with its cost in wavefront error.
+    """Return a text on the constraints that cost most, at most three, each with its cost in wavefront error.
 
     Parameters
     ----------

@@ -33,7 +33,7 @@ from twin.monitor.information import Information, ground_of, information_of, qua
 from twin.sensors.area_detector import EmvaDetector
 
 _AROUND = 24
-"""Number of rays traced along the edge of a beam."""
+"""Number of rays traced along the edge of a monitor beam."""
 EDGE_PX = 10.0
 """Smallest distance between the centre of a spot and the edge of its area CCD that the fit needs, pixels."""
 FULLEST = 0.9
@@ -67,7 +67,7 @@ class Seen:
 
 @dataclass(frozen=True, eq=False)
 class BeamFacts:
-    """Properties of a beam that was evaluated alone.
+    """Properties of a monitor beam that was evaluated alone.
 
     Array dimensions: P corners, N segments, K cameras.
 
@@ -86,8 +86,8 @@ class BeamFacts:
     bodies : tuple of ndarray
         Corners (P, 3) of its prisms in the base frame, metres.
     facets : (channels, 4) ndarray
-        For each channel the tilt of its facet along the base's X and Y (tangents) and its position relative to the
-        apex, metres.
+        For each channel the tilt of its facet (tangents) along the base's X and Y, and the facet's position (X, Y)
+        relative to the apex, metres.
     light : (N, K, 2, 3) ndarray
         Segments of the rays of its beams in front of the cameras, metres.
     """
@@ -179,7 +179,7 @@ class LayoutBench:
 
     @property
     def imaging_shape(self) -> tuple[int, int, int]:
-        """Shape (cameras, 3, rays) of the boolean array that ``BeamFacts.taken`` packs."""
+        """Shape (cameras, 3, rays) of the boolean array that is stored bitwise in ``BeamFacts.taken``."""
         return len(self.setup.instrument.cameras), 3, monitor_layout.RAYS
 
     @cached_property
@@ -188,7 +188,7 @@ class LayoutBench:
         return quantity_rows(self.start, ground_of(self.start))
 
     def detector(self, name: str = monitor_layout.AS_STARTED) -> EmvaDetector:
-        """Return the detector of the area CCD that a beam names."""
+        """Return the detector model of the area CCD named in a beam."""
         sheet = self.setup.detectors.get(name, self.setup.detector)
         return EmvaDetector.from_sheet(sheet, self.setup.instrument.autocollimator.area_ccd.exposure)
 
@@ -238,7 +238,7 @@ class LayoutBench:
             return LayoutFacts(beams, refused=_reason(error))
 
     def judged(self, beams: monitor_layout.Layout, instrument: Instrument, limited: bool = True) -> LayoutFacts:
-        """Return the properties (accuracy, obstruction, mass) of a layout that is built as an instrument.
+        """Return the properties (accuracy, obstruction, mass) of a layout that is already built as an instrument.
 
         Parameters
         ----------

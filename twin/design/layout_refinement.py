@@ -142,10 +142,7 @@ def _largest(facts: LayoutFacts, bench: LayoutBench) -> float:
 
 
 def _slopes_of(bench: LayoutBench, facts: LayoutFacts, slope: Slope) -> np.ndarray:
-    """Return the linearised change of every ratio of sigma to goal over a parameter's whole range, (Q,).
-
-    Array dimensions: Q ratios of sigma to goal.
-    """
+    """Return the linearised change of Q ratios of sigma to goal over a parameter's whole range, (Q,)."""
     low, high = ranges(bench.setup)[slope.number.name]
     out, goal = [], bench.setup.test.goal.wanted
     for name, key in ratios(facts.sigmas, bench):
@@ -232,12 +229,12 @@ _WEIGHTS = {2: {1: 1.0 / 2.0}, 4: {1: 8.0 / 12.0, 2: -1.0 / 12.0}, 6: {1: 45.0 /
 The weights are those of Fornberg, Math. Comp. 51, 699, 1988.
 """
 _JUMP = {4: {1: 4.0 / 3.0, 2: -1.0 / 3.0}, 6: {1: 1.5, 2: -0.6, 3: 0.1}}
-"""Order -> number of steps k -> weight of the second difference f(k h) + f(-k h) - 2 f(0), to detect jumps of f.
+"""Order -> number k of steps -> weight of the second difference f(k h) + f(-k h) - 2 f(0), to detect jumps of f.
 
-f is a function of a layout parameter and h the step. The weighted sum tends to zero for a smooth f, extrapolated by
-even powers. Of a jump J anywhere within the steps it keeps a part that, divided by h, bounds the effect of J on the
-central difference. For order 6 the part and the effect are J and 0.62 J for a jump at the first step, J/2 and 0.13 J at
-the second, J/10 and 0.02 J at the third.
+f is a function of a layout parameter and h the step. The weighted sum is extrapolated by even powers of h and tends to
+zero for a smooth f. If f has a jump J anywhere within the steps, the sum keeps a part of J that, divided by h, is an
+upper limit for the effect of J on the central difference. For order 6 the part and the effect (times h) are J and 0.62
+J for a jump within the first step, J/2 and 0.13 J within the second, J/10 and 0.02 J within the third.
 """
 
 

@@ -43,7 +43,7 @@ The merit of a layout is its largest ratio of a standard deviation to its goal.
 
 @dataclass(frozen=True, eq=False)
 class Candidate:
-    """Combination of beams that were evaluated alone.
+    """Combination of monitor beams, each evaluated alone, that may become a layout.
 
     Attributes
     ----------
@@ -145,12 +145,12 @@ class Found:
 
 
 def merit(sigmas: Mapping[str, Mapping[str, float]], bench: LayoutBench) -> float:
-    """Return the largest ratio of a standard deviation to its goal; 1 or less reaches all goals.
+    """Return the merit of a layout: its largest ratio of a standard deviation to its goal (1 reaches all goals).
 
     Parameters
     ----------
     sigmas : dict
-        Disturbances -> quantity -> sigma, SI.
+        Disturbances -> quantity -> sigma, SI units.
     bench : LayoutBench
         Evaluator of the layouts of the design.
     """
@@ -265,7 +265,7 @@ class Workers:
         return [known[name] for name in names]
 
     def _results(self, items: Mapping[str, Item]) -> Iterator[dict[str, Any]]:
-        """Yield results of items by their names, as they finish."""
+        """Yield name -> result for a few items at a time, as they are finished."""
         if self._pool is None:
             for name, item in items.items():
                 yield {name: _answer(self.bench, item)}
@@ -333,9 +333,9 @@ def _promise(candidate: Candidate) -> tuple[float, tuple[int, ...]]:
 
 
 def spread(level: Sequence[Candidate], width: int) -> list[Candidate]:
-    """Select ``width`` of the ranked candidates: half of them the best, the others evenly spaced over the rest.
+    """Return ``width`` of the ranked candidates: half of them the best, the others evenly spaced over the rest.
 
-    The best are often similar and compatible with the same few other beams.
+    The best ones alone would not do, because they are often similar and compatible with the same few other beams.
 
     Parameters
     ----------
@@ -450,7 +450,7 @@ class _OneSearch:
                 break
 
     def _chosen(self, count: int) -> list[Candidate]:
-        """Return the most promising layouts not built yet, in turn for each number of beams."""
+        """Return the most promising layouts not built yet, alternating between the numbers of beams."""
         by_size = [
             [candidate for candidate in level if candidate.beams not in self.built][:count]
             for level in reversed(self._ranked())
@@ -507,7 +507,7 @@ class _OneSearch:
     def _alike(self, beams: Sequence[int]) -> bool:
         """Return True if all beams have the same kinds of reflectors and the same area CCD.
 
-        The channels of an instrument are traced together, which needs the same kinds of reflectors.
+        The channels of an instrument are traced together, which requires equal kinds of reflectors.
         """
         selected = [self.pool[k].beam for k in beams]
         return len({(kinds_of(self.setup, beam), beam.area_ccd) for beam in selected}) == 1

@@ -28,11 +28,11 @@ from twin.path_tracing.stray_light import GHOSTS, Ghost, ghosts, stray_light
 MOST_POINTS = 6
 """Largest number of layouts that are drawn and written."""
 UNITS = {"angle": ("arcsec", ARCSEC), "d_f": ("um", 1e-6), "height": ("m", 1.0)}
-"""Unit in which each goal is reported, and the size of that unit in SI."""
+"""Goal -> unit in which it is reported, and the size of that unit in SI."""
 _ASIDE = "other tilts of the prisms in the instrument that it starts from, or other fields"
-"""Advice in the error about a start with ghost images on a spot."""
+"""Advice in the error that the starting instrument has ghost images on a spot."""
 GOAL_NAMES = {"angle": "intersection angle", "d_f": "principal distance", "height": "height on the ground"}
-"""Name of each goal in reports."""
+"""Goal -> its name in reports."""
 REMARK = """Made by python -m twin.design monitor from {start}. Posterior standard deviations:
 {sigmas}."""
 """Comment at the top of the file of an instrument that the search has found."""

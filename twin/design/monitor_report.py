@@ -269,7 +269,7 @@ def _cause_bars(axes: Axes, run: MonitorDesignRun, goal: str) -> None:
 
 
 def _pupil_figure(run: MonitorDesignRun) -> Figure:
-    """Plot the positions in the entrance pupil of the beams of the start and of each layout."""
+    """Plot the positions of the beams in the entrance pupil, for the starting layout and each new one."""
     shown = _named(run)[:4]
     figure = new_figure(3.0)
     radius = 0.5e3 * next(iter(run.setup.cameras.values())).entrance_pupil
