@@ -143,7 +143,7 @@ def study(
 
 
 def _run(command: list[str], quiet: bool, progress: bool | ProgressCallback) -> tuple[int, str]:
-    """Run a study's command to its end and return its exit code and, if quiet, its messages."""
+    """Run a study's command to its end; return its exit code and, if ``quiet``, the messages that it printed."""
     callback = progress if callable(progress) else _progress_bar() if progress and not quiet else _silent
     reading, writing = os.pipe()
     with os.fdopen(reading) as lines, tempfile.TemporaryFile("w+") as messages:

@@ -1,4 +1,4 @@
-"""Result of a study as a data set with one dimension, ``run``, and the files of its folder."""
+"""Result of a study as a data set with one dimension, ``run``, and the files of the study's folder."""
 
 from __future__ import annotations
 

@@ -35,7 +35,7 @@ DOUBTFUL_TEXT = (
     "Finite differences not accurate to 1% of the response's largest change (their step crosses a bend, or the job "
     "is noisy)"
 )
-"""Beginning of the warning about inaccurate finite differences."""
+"""Beginning of the warning that finite differences are inaccurate."""
 
 
 def _write_report(setup: StudySetup, gradient: Gradient, folder: RunFolder, warnings: Sequence[str] = ()) -> None:
@@ -107,7 +107,7 @@ def _agreement(gradient: Gradient) -> str:
 
 
 def verdict(gradient: Gradient) -> tuple[str, tuple[str, ...]]:
-    """Return the verdict on which factors dominate and how accurate that is, and the sentences that follow it."""
+    """Return the verdict, on which factors dominate and how accurate that statement is, and further sentences."""
     moved = [i for i in range(len(gradient.responses)) if np.any(gradient.change[i])]
     strongest = Counter(gradient.factors[int(np.argmax(np.abs(gradient.change[i])))].name for i in moved)
     total = len(gradient.responses)

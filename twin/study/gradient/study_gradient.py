@@ -403,7 +403,7 @@ TURN = 1e-4
 It corresponds to about ten pixels.
 """
 PART = 0.5
-"""Step of the finite differences with respect to factors that are no motions, in units of their spreads."""
+"""Step of the finite differences for factors that are not motions, in units of the factor's spread."""
 QUALITY_PART = 0.1
 """Step of the finite differences for image quality responses, in units of the factor's spread.
 
@@ -567,7 +567,7 @@ class _GradientResponse:
 
     @property
     def roots(self) -> set[str]:
-        """Result files that the response needs.
+        """Names of the result files, without suffix, that the response needs; ``image`` for numbers that need images.
 
         Sigmas, and the test of the shifts against the prior, depend on the noise and so need images.
         """

@@ -25,7 +25,7 @@ BAD_MODEL = 0.8
 
 
 def design_title(kind: str) -> str:
-    """Return the name of a kind of design for readers."""
+    """Return the name of a kind of design as the report writes it."""
     return "complete grid" if kind == GRID else SAMPLERS[kind].title
 
 
@@ -148,13 +148,13 @@ def _needed(convergence: Convergence) -> str:
 
 
 def _round_up(count: int) -> int:
-    """Return a count rounded up to two digits."""
+    """Return a number of runs rounded up to two significant digits."""
     step = 10 ** max(len(str(count)) - 2, 0)
     return -(-count // step) * step
 
 
 LEAST_SHARE = 0.02
-"""Share of a response's variance below which a factor is not named in the conclusions."""
+"""Fraction of a response's variance below which a factor is not named in the conclusions."""
 LINEAR = 0.5
 """Coefficient of determination (R²) of the linear model below which the report says that the model is poor."""
 
@@ -309,7 +309,7 @@ DASH = "\N{EN DASH}"
 
 
 def number(value: float | None, digits: int = 4) -> str:
-    """Return a number as text with some digits, a dash for None."""
+    """Return a number as text with ``digits`` significant digits, or a dash for None."""
     return DASH if value is None else significant(value, digits, floor=0.0)
 
 
@@ -351,7 +351,7 @@ def with_limits(value: Estimate | None) -> str:
 
 
 def share(value: Estimate | None) -> str:
-    """Return an index between 0 and 1 and its interval as text, with three decimals."""
+    """Return a sensitivity index between 0 and 1 with its confidence interval as text, with three decimals."""
     if value is None:
         return DASH
     low, high = value.interval
@@ -360,7 +360,7 @@ def share(value: Estimate | None) -> str:
 
 
 def percent(value: float | None, decimals: int = 1) -> str:
-    """Return a share as percent; values that only round to 0 or 100 get a sign < or >."""
+    """Return a fraction as percent; values that would round to 0 or 100 without being equal get a sign < or >."""
     if value is None:
         return DASH
     least = 10.0 ** -(decimals + 2)

@@ -197,18 +197,18 @@ responses of 100 to 300 runs.
 
 @dataclass(frozen=True)
 class Index:
-    """Sensitivity indices of an axis: one factor, or several that vary together.
+    """Sensitivity indices of an axis of the input space: one factor, or several that vary together.
 
     Attributes
     ----------
     factors : tuple of str
         Names of the factors that vary together, mostly one.
     first : Estimate
-        First-order index: share of the variance that the axis explains alone.
+        First-order index: fraction of the variance that the axis explains alone.
     total : Estimate
-        Total index: share of the variance that vanishes when the axis is fixed.
+        Total index: fraction of the variance that vanishes when the axis is fixed.
     check : float or None
-        First-order index by RBD-FAST, which needs no model; None where it cannot be used.
+        First-order index by RBD-FAST (random balance designs), which needs no model; None where it cannot be used.
     agrees : bool or None
         True if ``check`` lies within the interval of ``first``, apart from its noise; None without ``check``.
     """
@@ -259,7 +259,7 @@ class Indices:
 
 @dataclass(frozen=True)
 class NoIndices:
-    """Reason, as text, why sensitivity indices cannot be computed for a response."""
+    """Result for a response whose sensitivity indices cannot be computed, with the reason as text."""
 
     reason: str
 
@@ -330,7 +330,7 @@ def _of_grid(axes: Sequence[tuple[Factor, ...]], values: np.ndarray) -> tuple[In
 
 
 def _cells(axes: Sequence[tuple[Factor, ...]]) -> np.ndarray:
-    """Return for each run the index of its combination of the factors' values, (runs,)."""
+    """Return for each run a number that identifies its combination of the factors' values, (runs,)."""
     factors = [factor for axis in axes for factor in axis]
     if not factors:
         return np.zeros(0, int)

@@ -237,9 +237,9 @@ def _text(spec: ThresholdSpec) -> str:
 
 
 QUANTILES = {"p95": 0.95, "p99.7": 0.997}
-"""Quantiles whose convergence is reported, and their probabilities."""
+"""Name of each quantile whose convergence is reported -> its probability."""
 GOALS = {"mean": 0.1, "sigma": 0.1, "p95": 0.2, "p99.7": 0.2}
-"""Half-width of the 95 % interval, in units of sigma, below which a statistic counts as known."""
+"""Statistic -> half-width of its 95 % interval, in units of sigma, below which it is considered well determined."""
 POINTS = 40
 """Number of points of a convergence curve."""
 

@@ -86,7 +86,11 @@ def jitter(series: Series, seed: int) -> np.ndarray:
 
 
 def bins(factor: Factor, good: np.ndarray) -> Iterator[np.ndarray]:
-    """Yield the runs of a numeric factor in groups of neighbours of equal size, or of equal value for few values."""
+    """Yield the runs of a numeric factor in groups, for means over neighbouring values.
+
+    A group has equal numbers of runs with neighbouring values, or the runs with one value if there are only a few
+    values.
+    """
     levels = np.unique(factor.values[good])
     if len(levels) <= 12:
         for level in levels:
@@ -201,7 +205,7 @@ def curve_figure(analysis: StudyAnalysis, response: Response) -> Figure:
 
 
 def _partner(factor: Factor, factors: Sequence[Factor]) -> Factor | None:
-    """Return the most important other factor with several values, for lines or groups."""
+    """Return the most important of the other factors, whose values are shown as separate lines or bar groups."""
     return next((f for f in factors if f is not factor and len(f.levels) > 1), None)
 
 
@@ -222,7 +226,7 @@ def _binned(axes: Axes, factor: Factor, response: Response) -> None:
 
 
 def _groups(other: Factor | None, response: Response) -> list[tuple[str, np.ndarray]]:
-    """Return the label and the runs of each value of a second factor, or one group without it."""
+    """Return (label, runs) for each value of a second factor, or a single group if there is no second factor."""
     if other is None:
         return [("", response.good)]
     number = (lambda level: plain(level, 4)) if other.numeric else (lambda level: short(str(level)))
@@ -421,7 +425,10 @@ MOST_RESPONSES, MOST = 3, 6
 
 
 def chosen(analysis: StudyAnalysis) -> list[Series]:
-    """Return the series of the scatter matrix: the first three varying responses, and the most influential factors."""
+    """Return the quantities shown in the scatter matrix.
+
+    They are the first three varying responses and the most influential factors.
+    """
     responses = [r for r in analysis.runs.responses if not r.constant][:MOST_RESPONSES]
     weight = {factor.name: 0.0 for factor in analysis.runs.factors}
     for response in responses:

@@ -37,7 +37,7 @@ class StudyReport:
     verdict : str
         Verdict at the top of the report.
     contents : dict
-        Contents of its files by their paths in the study's folder.
+        Path of each file in the study's folder -> its contents.
     undrawn : tuple of str
         One sentence for each figure that could not be drawn.
     warnings : tuple of str
@@ -113,7 +113,7 @@ def report_files(
 MOST_NAMED = 6
 """Largest number of values of a factor that are listed."""
 STATISTICS = "statistics.json"
-"""File with all digits of tables whose cells are texts and that have no file of their own."""
+"""Name of the file with all digits of those tables that show rounded numbers and have no file of their own."""
 
 
 def _factor_table(runs: StudyRuns) -> Table:

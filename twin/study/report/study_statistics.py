@@ -269,7 +269,7 @@ class Description:
     count : int
         Number of runs with a finite value.
     mean, std, median, p95, p997 : Estimate or None
-        Estimates, with intervals where the runs were drawn; std with n - 1; None without runs.
+        Estimates, with confidence intervals if the runs are a random sample; std with n - 1; None without runs.
     low, high : float or None
         Smallest and largest value.
     normality : Normality or None
@@ -639,7 +639,7 @@ def _effect(
 
 
 def _span(factor: Factor, values: np.ndarray) -> tuple[float, float]:
-    """Return the 5 % and 95 % quantiles of a factor: of its distribution if drawn, else of its values."""
+    """Return the 5 % and 95 % quantiles of a factor: of its distribution if it is random, else of its values."""
     if factor.drawn:
         low, high = quantiles(factor.spec, np.array([0.05, 0.95]))
     else:

@@ -27,7 +27,7 @@ from twin.framework.procedure import silent
 
 @dataclass(frozen=True)
 class Run:
-    """One run of a study.
+    """One run of a study: the values that it sets in the base job, and its seed.
 
     Attributes
     ----------
@@ -82,7 +82,7 @@ class BaseJob(Protocol):
         """
 
     def evaluate(self, tree: Tree, runs: Sequence[Run], backend: Backend) -> list[Outcome]:
-        """Return the outcome of every run.
+        """Return the results of every run, or the reason of its failure.
 
         The numbers may depend on which runs are evaluated together, but on nothing else.
         """
@@ -129,7 +129,7 @@ class ProcedureBase:
         """Do nothing, since nothing can be checked before a run."""
 
     def evaluate(self, tree: Tree, runs: Sequence[Run], backend: Backend) -> list[Outcome]:
-        """Return the outcome of every run, evaluated one after the other."""
+        """Return the results of every run, or the reason of its failure; runs are evaluated one after the other."""
         return [self._one(tree, run, backend) for run in runs]
 
     def _one(self, tree: Tree, run: Run, backend: Backend) -> Outcome:
@@ -223,7 +223,10 @@ def is_neutral(tree: Tree, model: type[Spec], key: KeyPath) -> bool:
 
 
 def _entry(node: Tree, model: type[Spec], key: KeyPath, k: int, last: bool) -> Any:
-    """Return the entry at ``key[k]`` of a mapping, created if the model allows it."""
+    """Return the value at element ``k`` of a key path in a mapping; it is created if the data model allows it.
+
+    ``node`` is the mapping in which that key is looked up, ``model`` its data model.
+    """
     part = key[k]
     if part in node:
         return node[part]
@@ -401,7 +404,7 @@ class BlockResult:
 
 
 CONTRADICTED = "the shifts of the spots contradict the prior on disturbances"
-"""Reason why a run's sigma is not valid although the fits of its spots are good."""
+"""Reason, as text, why a run's sigma is not valid although the fits of its spots are good."""
 
 
 def _doubt(outcome: Mapping[str, Any]) -> str:

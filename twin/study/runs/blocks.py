@@ -286,7 +286,7 @@ class Engine:
         )
 
     def _first(self, workers: cluster.Workers, block: int) -> Pilot:
-        """Compute the first block and check that its results hold all responses."""
+        """Compute the first block of runs and check that its results contain all responses."""
         ((_, future),) = next(workers.each(pilot, [self.task(block)]))
         if future.status != "finished":
             if cluster.killed(future.exception()):

@@ -20,7 +20,10 @@ from twin.study.runs.setup import StudySetup
 
 
 def axes_of(study: StudySpec) -> list[tuple[str, ...]]:
-    """Return the groups of factors that vary independently: single factors, or the columns of one table, row by row."""
+    """Return the groups of factors that vary independently of one another.
+
+    A group is a single factor, or the columns of one table, whose values vary together row by row.
+    """
     groups: dict[str, list[str]] = {}
     for name, factor in study.factors.items():
         key = f"table {factor.table.file}" if factor.table is not None else f"factor {name}"
@@ -38,7 +41,7 @@ _LISTS = ("values", "table")
 
 
 def run_count(study: StudySpec) -> int:
-    """Return the number of runs that a study's design specifies."""
+    """Return the number of runs that follows from a study's design."""
     if study.design.runs is not None:
         return study.design.runs
     count = 1
@@ -50,8 +53,8 @@ def run_count(study: StudySpec) -> int:
 def draw(study: StudySpec) -> dict[str, np.ndarray]:
     """Return each factor's value in every run, (runs,): numbers in the factor's unit, or indices into its list.
 
-    The last axis of a grid changes fastest. Distributions are sampled by the inverse of their distribution function, so
-    that low-discrepancy designs keep their uniformity.
+    In a grid, the values of the last group of factors change fastest. Distributions are sampled by the inverse of their
+    distribution function, so that low-discrepancy designs keep their uniformity.
     """
     axes = axes_of(study)
     if study.design.kind == GRID:
@@ -344,7 +347,7 @@ class Plan:
 
     @property
     def runs(self) -> int:
-        """Number of runs."""
+        """Number of runs of the study."""
         return run_count(self.setup.study)
 
     @property
@@ -403,7 +406,7 @@ class Plan:
         return Run(number, tuple(values.items()), None if self.seeds is None else int(self.seeds[number]))
 
     def check(self) -> None:
-        """Validate each factor's smallest and largest value, and every text, in the base, one factor at a time.
+        """Validate each factor's smallest and largest value, and every text, in the base job, one factor at a time.
 
         The schema's limits are intervals, so that values between two valid ones are valid. Combinations that are
         impossible are found when they are run, and fail individually.

@@ -176,7 +176,7 @@ def _resolved(yaml: yaml_file.YamlFile) -> StudySetup:
 
 
 def _again(yaml: yaml_file.YamlFile) -> StudySetup:
-    """Return the study that a config.yaml of an earlier study holds."""
+    """Return the study that a config.yaml of an earlier study describes."""
     known = ("study", "base")
     for key in yaml.data:
         if key not in known:
