@@ -44,7 +44,10 @@ _LAST = 4
 _NEAR = 0.02
 """Fraction of all cameras, on either side of the quantile of the worst margin, whose gradients are averaged."""
 _SAFE = 1.0
-"""Number of standard deviations of the sampled yield by which the chosen limits exceed the required yield."""
+"""Margin of the chosen limits: the yield exceeds the required one by this many standard deviations.
+
+The standard deviation is that of a yield estimated from a sample of cameras.
+"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -181,7 +184,10 @@ class CostCurve:
         self._slope = self._line.derivative()
 
     def __call__(self, level: float) -> tuple[float, float]:
-        """Return the logarithm of the cost and its derivative at ``level``, the logarithm of the limit's ratio."""
+        """Return the natural logarithm of the cost, and its derivative with respect to ``level``.
+
+        ``level`` is the natural logarithm of the ratio of the limit to the specified one.
+        """
         x, y = self._x, self._y
         if x[0] <= level <= x[-1]:
             return float(self._line(level)), float(self._slope(level))
@@ -224,7 +230,7 @@ class _Costs:
         return float(np.sum(self.of_each(level)))
 
     def slope(self, level: np.ndarray) -> np.ndarray:
-        """Return the derivative of each limit's cost with respect to the logarithm of the limit, one per tolerance."""
+        """Return the derivative of each limit's cost with respect to the limit's natural logarithm."""
         values = np.array([curve(x) for curve, x in zip(self.curves, level.tolist(), strict=True)])
         return np.asarray(np.exp(values[:, 0]) * values[:, 1])
 
@@ -369,9 +375,9 @@ class _MarginModel:
         return low
 
     def _between(self, inside: np.ndarray, outside: np.ndarray, total: np.ndarray) -> np.ndarray:
-        """Return the cheapest passing step on the line from ``inside``, which passes, to ``outside``.
+        """Return the cheapest passing step on the line between two steps, of which only ``inside`` passes.
 
-        A step of the limits passes if it reaches the required yield.
+        A step is a change of the logarithms of the limits; it passes if it reaches the required yield.
         """
         best = inside
         for part in np.linspace(0.0, 1.0, 17)[1:]:

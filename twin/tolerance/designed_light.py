@@ -27,7 +27,7 @@ def budget_spectrum(test: ToleranceBudgetSpec, camera: CameraSpec) -> SpectrumSp
     Raises
     ------
     InputError
-        The budget asks for a spectrum that the camera does not have.
+        The budget requests a spectrum that the camera does not have.
     """
     if test.light == "spectrum" and camera.light is None:
         raise test.error(
@@ -116,7 +116,7 @@ def fixed_transfers(
     cosines: np.ndarray,
     degree: int,
 ) -> dict[int, list[list[VariedTransfer]]]:
-    """Return the operators that give the MTF of every merit of kind mtf from the wavefront, by field and direction.
+    """Return the operators that give the MTF of every merit of kind ``mtf`` from the wavefront.
 
     Array dimensions: F fields, C wavelengths, N rays.
 
@@ -129,7 +129,7 @@ def fixed_transfers(
     merits : sequence of Merit
         Merits of the budget.
     fields : (F, 2) ndarray
-        Fields of the bench.
+        Field points of the budget.
     light : tuple of ndarray
         Wavelengths, metres, and their weights in the spectrum, (C,) each.
     cosines : (C or 1, F, N, 2) ndarray
@@ -140,7 +140,7 @@ def fixed_transfers(
     Returns
     -------
     dict
-        Index of the merit -> transfer functions by field and direction.
+        Index of the merit -> operators by field and direction.
 
     Raises
     ------

@@ -21,7 +21,7 @@ FAR = 1e-3
 
 
 def instrument_warnings(setup: ToleranceSetup, bench: ToleranceBench) -> tuple[str, ...]:
-    """Return the warnings about the nominal instrument."""
+    """Return the warnings about the nominal instrument, such as unsharp cameras or parts in a beam."""
     model = bench.optics.model
     shadow = unmodelled_obscuration(model, obscuration(model, bench.backend))
     return (

@@ -29,9 +29,9 @@ _MOST_TURNS = 40
 _GRID = 241
 """Number of ratios of a tolerance to its limit, in geometric steps, at which the model's loss is evaluated."""
 _CLOSE = 1e-4
-"""Relative accuracy, in the loss of a merit, with which an inverse limit is found."""
+"""Relative accuracy of the loss of a merit at a computed inverse limit."""
 _AT_ONCE = 8_000_000
-"""Largest number of elements of a product that are held in memory at a time."""
+"""Largest number of array elements that a matrix product holds in memory at a time."""
 _MOST_HELD, _FEWEST = 25_000_000, 500
 """Largest number of elements of a scaled model in memory, and its smallest number of draws."""
 
@@ -177,9 +177,10 @@ class Sensitivities:
 
 
 def sensitivities(bench: ToleranceBench, advance: Advance = silent) -> Sensitivities:
-    """Trace every parameter at plus and minus its size and derive the second-order model of the merits.
+    """Trace every varied parameter at plus and minus its size and derive the second-order model of the merits.
 
-    Mixed second derivatives follow from the first derivatives of the wavefronts.
+    The size is the limit of a tolerance, or the standard deviation of a figure term. Mixed second derivatives follow
+    from the first derivatives of the wavefronts.
     """
     count = len(bench.numbers)
     x = np.concatenate([np.zeros((1, count)), np.eye(count), -np.eye(count)])
@@ -274,7 +275,7 @@ def default_losses(bench: ToleranceBench, nominal: np.ndarray) -> np.ndarray:
 
 
 def inverse_limits(bench: ToleranceBench, sensitivity: Sensitivities, advance: Advance = silent) -> InverseLimits:
-    """Find the size of each tolerance that alone causes each merit's loss, by exact traces of both signs.
+    """Find the size of each tolerance that alone causes each merit's allowed loss, by exact traces of both signs.
 
     For figure errors the second-order model is used instead of traces.
     """

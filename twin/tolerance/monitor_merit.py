@@ -324,7 +324,7 @@ class Merit:
                 return np.asarray(np.max(np.abs(selected), axis=-1))
 
     def passes(self, values: np.ndarray) -> np.ndarray:
-        """Return True where values of the merit, SI, meet the requirement; NaN does not."""
+        """Return True where values of the merit, SI units, meet the requirement; NaN does not."""
         if self.spec.more_is_better:
             return np.asarray(values >= self.spec.requirement)
         return np.asarray(values <= self.spec.requirement)
@@ -349,7 +349,7 @@ AT_FIELDS = ("wavefront", "mtf", "chief_ray", "obstruction")
 
 
 def part_count(spec: MeritSpec, line_points: int, cameras: Sequence[str] = ()) -> int:
-    """Return the number of parts of a merit, smooth quantities such as the MTF at one field."""
+    """Return the number of parts of a merit; parts are smooth quantities such as the MTF at one field."""
     match spec.kind:
         case "monitor_angle" | "monitor_focus":
             return len(readings_of(spec, cameras))

@@ -52,7 +52,7 @@ class ToleranceBase:
         self._bench(tree, backend)
 
     def evaluate(self, tree: Tree, runs: Sequence[Run], backend: Backend) -> list[Outcome]:
-        """Return merits and compensator moves of every run, or the reason why a camera has no light."""
+        """Return merits and compensator moves of every random camera, or the reason why it has no light."""
         out: list[Outcome] = [Failure("not done")] * len(runs)
         groups: dict[str, list[int]] = {}
         others: dict[str, tuple[Any, ...]] = {}
@@ -81,7 +81,7 @@ class ToleranceBase:
         return outcomes(bench, x, seeds)
 
     def _bench(self, tree: Tree, backend: Backend) -> ToleranceBench:
-        """Return the camera of a budget given as plain data, kept between blocks of runs with the same data."""
+        """Return the nominal camera of a budget given as plain data; it is kept between blocks with the same data."""
         known = self._benches.get(id(tree))
         if known is None or known[0] is not tree:
             setup = validate(ToleranceSetup, YamlFile("", tree, {}))
@@ -218,7 +218,7 @@ class Samples:
 
 @dataclass(frozen=True)
 class Workforce:
-    """Processes that trace the cameras.
+    """Processes that trace the random cameras.
 
     Attributes
     ----------
@@ -227,8 +227,8 @@ class Workforce:
     scheduler : str or None
         Address of a running Dask cluster; None for local processes.
     journal : Path or None
-        Folder of the journal of finished work, from which a run can be resumed; None for no journal, in this process
-        alone.
+        Folder of the journal of finished work, from which a run can be resumed; None to compute without a journal in
+        this process alone.
     warn : callable
         Function that receives warnings about the computation.
     """

@@ -113,7 +113,7 @@ class Adjustments:
         return np.asarray(target * size)
 
     def corrected(self, slopes: np.ndarray, change: np.ndarray, miss: np.ndarray) -> np.ndarray:
-        """Return the derivatives of the residuals (S, R, C) after Broyden's rank-one update by the outcome of a step.
+        """Return the residuals' derivatives (S, R, C) after Broyden's rank-one update with the outcome of a step.
 
         Array dimensions: S cameras, R residuals, C compensators.
 
@@ -122,7 +122,7 @@ class Adjustments:
         slopes : (S, R, C) ndarray
             Derivatives of the residuals with respect to the moves before the step, waves per SI unit.
         change : (S, C) ndarray
-            Change of the moves, SI.
+            Change of the moves, SI units.
         miss : (S, R) ndarray
             Residuals after the step minus those predicted by the derivatives, waves.
         """
@@ -134,7 +134,7 @@ class Adjustments:
 
     @property
     def exact(self) -> bool:
-        """True if moves are executed without steps and errors."""
+        """True if the compensators move continuously and without errors."""
         return not np.any((self.steps > 0.0) | (self.accuracies > 0.0))
 
     def made(self, slopes: np.ndarray, residuals: np.ndarray, moves: np.ndarray, errors: np.ndarray) -> np.ndarray:
@@ -175,7 +175,7 @@ SETTLED = 1e-3
 """Largest change of a camera's rms wavefront error by a further adjustment step, waves, for it to count as converged.
 """
 MOST_STEPS = 12
-"""Largest number of steps of the adjustments, three times as many as any camera of the library has needed."""
+"""Largest number of iterations of a camera's adjustments, three times as many as any library camera has needed."""
 
 FIRST_RULE, LARGEST_RULE = 3, 17
 """Wavelengths of the first and of the last rule over a spectrum."""
@@ -195,13 +195,13 @@ class AdjustedCameras:
     Attributes
     ----------
     moves : (S, C) ndarray
-        Compensator moves, SI.
+        Compensator moves, SI units.
     parts : (S, P) ndarray
-        Parts of all merits (smooth quantities); NaN where the light is lost.
+        Parts of all merits; NaN where the light is lost.
     problems : tuple of str
         Reason why the light is lost, (S,); empty where it is not.
     settled : (S,) ndarray
-        Change of the rms wavefront error by a further step of the adjustments, waves.
+        Change of the rms wavefront error by a further step of the adjustments, waves; it shows convergence.
     paths : (S, F, K N) ndarray or None
         Optical paths of the beams' rays minus those of the chief rays, for all traced wavelengths, metres; None if not
         requested.
@@ -215,7 +215,7 @@ class AdjustedCameras:
 
     @classmethod
     def joined(cls, results: Sequence[AdjustedCameras]) -> AdjustedCameras:
-        """Return the results of several groups of cameras concatenated in order."""
+        """Return the results of several groups of perturbed cameras, concatenated in order."""
         paths = [result.paths for result in results if result.paths is not None]
         return cls(
             np.concatenate([result.moves for result in results]),
@@ -371,11 +371,9 @@ class ToleranceBench:
         self._adjust = Adjustments(self.ranges, self.grid_steps, self.accuracies, self._adjustment_slope())
 
     def _adjustment_slope(self) -> np.ndarray:
-        """Return the derivatives (R, C) of the residuals with respect to the compensators, waves per SI unit.
+        """Return the derivatives of R wavefront residuals with respect to C compensators, (R, C), waves per SI unit.
 
-        They are 0 where the range is zero.
-
-        Array dimensions: R residuals, C compensators.
+        They are 0 where a compensator's range is zero.
         """
         used = np.flatnonzero(self.ranges)
         slope = np.zeros((self._residuals(self.beams.designed.paths).shape[1], len(self.ranges)))
@@ -391,11 +389,9 @@ class ToleranceBench:
         return slope
 
     def _residuals(self, paths: np.ndarray) -> np.ndarray:
-        """Return residuals (S, R) whose squares sum to the mean square wavefront errors of all fields.
+        """Return residuals whose squares sum to the mean square wavefront errors of all fields, (S, R), in waves.
 
-        They are in waves of the design wavelength.
-
-        Array dimensions: S cameras, R residuals.
+        The unit is the design wavelength. Array dimensions: S cameras, R residuals.
         """
         terms = paths.reshape(len(paths), len(self.fields), len(self.traced_shares), -1) @ self.beams.solve.T
         return self._roots.residuals(terms / self.wavelength, self.traced_shares)
@@ -405,17 +401,17 @@ class ToleranceBench:
     def adjust_cameras(
         self, amounts: np.ndarray, errors: np.ndarray | None = None, paths: bool = False
     ) -> AdjustedCameras:
-        """Trace perturbed cameras, adjust them, and compute their merits.
+        """Trace perturbed cameras, adjust them with the compensators, and compute their merits.
 
         Array dimensions: S cameras, K varied parameters, C compensators.
 
         Parameters
         ----------
         amounts : (S, K) ndarray
-            Amounts of the varied parameters, SI.
+            Amounts of the varied parameters, SI units.
         errors : (S, C) ndarray, optional
             Errors of the compensator moves in standard deviations. With them each compensator moves by whole steps with
-            its error, in order, and the later ones compensate the earlier. None for the ideal adjustment.
+            its error, in order, and each move compensates the errors of those before it. None for the ideal adjustment.
         paths : bool
             True to return the optical paths of the rays as well.
 
@@ -538,13 +534,14 @@ class ToleranceBench:
         return np.concatenate(out, axis=1) if out else np.zeros((count, 0))
 
     def pair_curvature(self, slopes: np.ndarray) -> np.ndarray:
-        """Return the second derivatives (P, K, K) of the parts that follow from first derivatives of the wavefronts.
+        """Return the second derivatives of the merits' parts that follow from the wavefronts' first derivatives.
 
-        Mean squares and MTFs are quadratic in a wavefront that itself is nearly linear in the parameters. Parts that
-        are no function of a wavefront get 0.
+        They are a (P, K, K) array.
 
-        Array dimensions: P parts of the merits (smooth quantities, such as the MTF at one field), K varied parameters,
-        F fields, C wavelengths, N rays.
+        Parts are smooth quantities, such as the MTF at one field. Mean squares and MTFs are quadratic in a wavefront
+        that itself is nearly linear in the parameters. Parts that are no function of a wavefront get 0.
+
+        Array dimensions: P parts, K varied parameters, F fields, C wavelengths, N rays.
 
         Parameters
         ----------
@@ -626,7 +623,7 @@ class ToleranceBench:
         )
 
     def _line(self, states: Sequence[State]) -> dict[str, np.ndarray]:
-        """Return the parts of the merits about the image line (boresight, roll, distortion, ...), by kind."""
+        """Return the parts of the merits about the camera's image line (boresight, roll, distortion, ...), by kind."""
         if not self._wanted & {"boresight", "roll", "principal_distance", "distortion"}:
             return {}
         sight, axes = self.experiment.sight, self.experiment.sight.axes[self.camera]
@@ -651,10 +648,7 @@ class ToleranceBench:
         return np.arange(0, LINE_POINTS, EVERY)
 
     def scaled(self, scales: np.ndarray) -> ToleranceBench:
-        """Return the same budget and camera with every limit multiplied by its entry of ``scales`` (E,).
-
-        Array dimensions: E tolerances.
-        """
+        """Return the same budget and camera with the limit of each of E tolerances multiplied by ``scales`` (E,)."""
         other = copy(self)
         by_entry = dict(zip(self.entries, scales.tolist(), strict=True))
         other.numbers = tuple(replace(number, size=number.size * by_entry[number.entry]) for number in self.numbers)

@@ -38,7 +38,7 @@ _ROUNDING = 1e-7
 
 
 def tolerance_report(run: ToleranceRun) -> Report:
-    """Return the report of a budget: verdict, yield, sensitivities, inverse limits, variance shares and allocation."""
+    """Return the report of a budget: verdict, yield, sensitivities, inverse limits, variances and allocation."""
     test = run.setup.test
     with look("tolerance"):
         curves = to_svg(_yield_figure(run))
@@ -272,7 +272,7 @@ def _sensitivity_table(run: ToleranceRun) -> Table:
 
 
 def _number(limit: str | float) -> tuple[float, str]:
-    """Return number and unit of a limit in the form of the files; a pure number has an empty unit."""
+    """Return number and unit of a limit in the notation of the files; a pure number has an empty unit."""
     parts = split_quantity(limit)
     return (float(limit), "") if parts is None else (float(parts[0]), parts[1])
 
