@@ -31,8 +31,8 @@ from twin.tolerance.tolerance_bench import ToleranceBench
 STEP = 0.05
 """Step of the central differences with respect to a parameter, in standard deviations of its prior.
 
-The relative error of a derivative is the square of this step times the relative curvature of the derivative per
-standard deviation squared.
+The relative error of a derivative is the square of this step times the derivative's relative second derivative, with
+the parameter in standard deviations.
 """
 
 _SHARE = 1e-2
@@ -125,7 +125,7 @@ class AsBuiltBench(Site):
         return CameraOptics.within(self.experiment.instrument, self.camera, self.backend)
 
     def bench(self, merits: Mapping[str, MeritSpec]) -> ToleranceBench:
-        """Return the evaluator that computes these merits for the camera."""
+        """Return the evaluator that computes the given merits for the camera."""
         budget = ToleranceBudgetSpec.model_construct(
             instrument=self.test.instrument,
             camera=self.camera,
@@ -204,7 +204,7 @@ class AsBuiltBench(Site):
         Parameters
         ----------
         data : sequence of ndarray
-            Readings of each measurement, SI.
+            Readings of each measurement, SI units.
         start : ndarray, optional
             Parameters at which the iteration starts.
 
@@ -311,7 +311,10 @@ class AsBuiltBench(Site):
 
     @cached_property
     def actuators(self) -> Actuators:
-        """Limits, steps and errors of the next move; the limits are what earlier moves have left of each range."""
+        """Limits, steps and errors of the next move.
+
+        A limit is what earlier moves have left of the actuator's range.
+        """
         specs = tuple(self.test.actuators.values())
         moved = np.sum(self.parameters.wanted, axis=0) if self.parameters.moves else np.zeros(len(specs))
         ranges = np.array([spec.range_si for spec in specs])
@@ -333,26 +336,21 @@ class AsBuiltBench(Site):
 
     @cached_property
     def actuator_steps(self) -> np.ndarray:
-        """Steps of the numerical derivatives with respect to the actuators, SI, (C,).
-
-        Array dimensions: C actuators.
-        """
+        """Steps of the numerical derivatives with respect to C actuators, (C,), SI units."""
         return _SHARE * np.array([spec.range_si or 1.0 for spec in self.test.actuators.values()])
 
 
 def nan_where_lost(
     work: Callable[[slice], np.ndarray], count: int, shape: tuple[int, ...], first: int = 0
 ) -> np.ndarray:
-    """Evaluate a function for S states, with NaN for each state whose light is lost.
-
-    Array dimensions: S states.
+    """Evaluate a function for S states of the instrument, with NaN for each state whose light is lost.
 
     Parameters
     ----------
     work : callable
         Function of a slice of the states; raises PhysicalError if the light of any of them is lost.
     count : int
-        Number of states.
+        Number S of states.
     shape : tuple of int
         Shape of the result for one state.
     first : int

@@ -31,7 +31,7 @@ from twin.tolerance.monitor_merit import merit_head, merit_unit, shown_merit
 _MOST_COMBINATIONS = 12
 """Largest number of observable combinations of motions in the table."""
 _FEW = 3
-"""Largest number of candidate measurements that the verdict names."""
+"""Largest number of further measurements that the verdict recommends by name."""
 BANDS = FrozenMap({"prior": GREY, "as built": BLUE, "after the next move": GREEN})
 """Label of each band of quantiles in a figure (prior, as built, after the move) -> its colour."""
 

@@ -37,7 +37,7 @@ It corresponds to residuals of three sigma on average.
 _INSTRUMENT, _POSTERIOR, _PRIOR, _MOVE, _MADE = range(5)
 """Random streams."""
 ALONG = tuple((float(x), 0.0) for x in np.linspace(-1.0, 1.0, 11))
-"""Fields (x, y), as shares of the half field, at which the wavefront along the line is plotted."""
+"""Fields (x, y), as fractions of the half field, at which the wavefront along the line is plotted."""
 _DRAW = 7e4
 """Memory in bytes of three random states: one from the prior, one from the posterior and one after the next move."""
 
@@ -329,7 +329,7 @@ def _measured_plain(run: AsBuiltRun) -> dict[str, Any]:
 
 
 def motions(run: AsBuiltRun) -> list[dict[str, Any]]:
-    """Return each motion of the prior with its estimate, in reporting units."""
+    """Return the motions of the prior with their estimates and sigmas, in reporting units, as plain data."""
     out = []
     factor = np.sqrt(run.estimate.variance_factor)
     for k, component in enumerate(run.bench.parameters.components):

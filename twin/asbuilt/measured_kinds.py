@@ -81,7 +81,7 @@ class Site(ABC):
 
     @abstractmethod
     def bench(self, merits: Mapping[str, MeritSpec]) -> ToleranceBench:
-        """Return the evaluator that computes these merits for the camera."""
+        """Return the evaluator that computes the given merits for the camera."""
 
 
 class MeasuredKind(ABC):
@@ -119,7 +119,7 @@ class MeasuredKind(ABC):
 
     @abstractmethod
     def prepare(self) -> None:
-        """Compute once what the predictions for all states have in common."""
+        """Compute once the data that the predictions for all states have in common."""
 
     labels: tuple[str, ...]
     blocks: tuple[str, ...]
@@ -483,7 +483,7 @@ class SightReadings(MeasuredKind):
         return np.asarray(np.diag(sigma**2) if rows is None else np.array(rows) * np.outer(sigma, sigma))
 
     def read(self) -> np.ndarray:
-        """Return the rotations and the change of principal distance in the test's file, SI."""
+        """Return the rotations (rad) and the change of principal distance (m) in the test's file."""
         return np.array([getattr(self.spec, name) for name in self.spec.measured])
 
 

@@ -1,8 +1,8 @@
 """Parameters of an as-built estimate: the motions of the prior, and response and errors of the actuators.
 
 A parameter vector holds the components of the prior (motions and temperatures of bodies), then one gain error for each
-actuator whose response is uncertain (travel over commanded amount, minus 1), then one error for each actuator of each
-move. The state at a time is the sum of the components and of all moves until then.
+actuator whose response is uncertain (travel divided by commanded amount, minus 1), then one error for each actuator of
+each move. The state at a time is the sum of the components and of all moves until then.
 """
 
 from __future__ import annotations
@@ -152,10 +152,7 @@ class Parameters:
         return out
 
     def gain(self, values: np.ndarray) -> np.ndarray:
-        """Return the ratio of each actuator's travel to the commanded amount, (S, C); 1 where it is not uncertain.
-
-        Array dimensions: S states, C actuators.
-        """
+        """Return the ratio of travel to commanded amount for C actuators in S states, (S, C); 1 where it is certain."""
         out = np.ones((len(values), len(self.names)))
         start = len(self.components)
         out[:, list(self.gains)] += values[:, start : start + len(self.gains)]

@@ -115,7 +115,7 @@ def _of_map(measurement: WavefrontMeasurement, number: int, name: str, orientati
 
 
 def _less(measured: WavefrontMap, reference: WavefrontMap, measurement: WavefrontMeasurement) -> WavefrontMap:
-    """Return a wavefront map minus the error map of the reference surface."""
+    """Return a measured wavefront map minus the error map of the interferometer's reference surface."""
     if measured.values.shape != reference.values.shape:
         shapes = f"{reference.values.shape} points, the maps {measured.values.shape}"
         raise measurement.wrong(
