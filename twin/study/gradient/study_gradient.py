@@ -3,8 +3,8 @@
 Spots and lines of sight are differentiated by automatic differentiation through the ray trace (spots in reverse mode in
 ``twin.monitor.monitor_derivative``, lines of sight in forward mode in this file). The estimators, which are formulas of
 these numbers, are differentiated along the resulting directions. All other responses have finite differences only: of
-ray traces for everything that needs no image and so has no noise, else of the whole job with the noise of the base's
-seed.
+ray traces for everything that needs no image and so has no noise, else of the whole job with the noise of the base
+job's seed.
 
 A chief ray starts at a point of the line CCD and is aimed through the centre of the stop. By the implicit function
 theorem the change of its direction per motion is -(d hit / d direction)^-1 (d hit / d motion), where hit is the point
@@ -67,7 +67,7 @@ def motion_slopes(about: State, state: Callable[[float], State], step: float) ->
     Parameters
     ----------
     about : State
-        State of the base.
+        State of the instrument in the base job.
     state : callable
         Function from a change of the factor to the state.
     step : float
@@ -216,7 +216,7 @@ class Chain:
 
 
 SHARES = (1.0, -1.0, 0.5, -0.5)
-"""Multiples of a step from the base at which values are taken for Richardson's extrapolation."""
+"""Multiples of a step from the base value at which values are taken for Richardson's extrapolation."""
 
 
 def extrapolated(values: np.ndarray, step: float) -> tuple[np.ndarray, np.ndarray]:
@@ -225,7 +225,7 @@ def extrapolated(values: np.ndarray, step: float) -> tuple[np.ndarray, np.ndarra
     Parameters
     ----------
     values : (4, ...) ndarray
-        Values at the base plus ``SHARES`` times the step.
+        Function values at the base value plus ``SHARES`` times the step.
     step : float
         Full step.
     """
@@ -309,7 +309,7 @@ class GradientFactor:
     unit : str
         Unit of its numbers, empty for pure ones.
     value : float
-        Value in the base.
+        Value in the base job.
     spread : float
         Sigma of a normal distribution, otherwise half of the range of its values; in the factor's unit.
     spread_of : str
@@ -479,7 +479,7 @@ class Gradient:
         k : int
             Index of the factor.
         values : (4, R) ndarray
-            Values of the responses at the base plus ``SHARES`` times the step.
+            Values of the responses at the base value plus ``SHARES`` times the step.
         step : float
             Step, in the factor's unit.
         method : str
@@ -591,10 +591,10 @@ def study_gradient(setup: StudySetup, backend: Backend, advance: Advance = silen
     Raises
     ------
     InputError
-        A factor or response has no number, the base's schema refuses a value beside the base's, or a factor's step
-        loses the light.
+        A factor or response has no number, a value one step away from the base job's is not allowed, or the light is
+        lost one step away.
     InputErrorText
-        The base itself cannot be run.
+        The base job itself cannot be run.
     """
     factors = tuple(GradientFactor.of(setup, name) for name in setup.study.factors)
     asked = [_GradientResponse(name, spec) for name, spec in setup.study.responses.items()]
@@ -739,7 +739,7 @@ class _Traced:
     def _values(self, chain: Chain, factor: GradientFactor, step: float, rows: Sequence[int]) -> np.ndarray:
         """Return the selected responses of four jobs near the base job in which one factor is changed, (4, responses).
 
-        The factor differs from its value in the base by ``SHARES`` times the step.
+        The factor differs from its value in the base job by ``SHARES`` times the step.
         """
         jobs = [self._job(factor, share * step) for share in SHARES]
         same = all(place[:2] == PERTURB for place, _ in factor.values(factor.value))
@@ -785,7 +785,7 @@ def _whole(
     table: Gradient,
     advance: Advance,
 ) -> None:
-    """Store finite differences of the base command's whole results; all runs have the noise of the base's seed."""
+    """Store finite differences of the base command's whole results; all runs have the noise of the base job's seed."""
     for k, factor in enumerate(factors):
         advance(WHOLE, k, len(factors))
         step = PART * factor.spread

@@ -364,7 +364,7 @@ class _Chaos:
     held_out : float
         Leave-one-out cross-validated R².
     rest : float
-        Share of the variance that is not explained.
+        Fraction of the variance that is not explained.
     """
 
     axes: Sequence[tuple[Factor, ...]]

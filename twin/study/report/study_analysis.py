@@ -329,7 +329,7 @@ class StudyAnalysis:
     effects : dict
         Main effects of a grid; empty in drawn designs.
     noise : dict
-        Share of each response's variance that the runs report as noise.
+        Fraction of each response's variance that the runs report as noise.
     indices : dict
         Sensitivity indices; empty if the study does not request them.
     convergences : dict

@@ -242,7 +242,7 @@ class Engine:
         Raises
         ------
         InputError
-            The base cannot be run as it is, or the key of a response does not exist in its results.
+            The base job cannot be run as it is, or the key of a response does not exist in its results.
         Incomplete
             Workers died repeatedly in some runs, or the program failed; finished blocks are kept.
         ClusterError

@@ -151,7 +151,7 @@ class Scaling:
     Attributes
     ----------
     base : dict
-        Key path -> number and unit in the base job; an integer where the base has one.
+        Key path -> number and unit in the base job; an integer where it has one there.
     ratio : dict
         Key path -> multiplier of the number in every run, (runs,).
     """
@@ -203,7 +203,7 @@ def ratios(factor: FactorSpec, tree: Tree, values: np.ndarray, unit: str) -> dic
     Raises
     ------
     Problem
-        The factor's value in the base is zero or no number, or a power is undefined.
+        The factor's value in the base job is zero or no number, or a power is undefined.
     """
     out = {}
     for k, scale in enumerate(factor.scales):
@@ -241,7 +241,7 @@ def number_at(base: Tree, place: KeyPath, unit: str) -> float:
     Raises
     ------
     Problem
-        The base has no value there, or one of a different kind.
+        The base job has no value there, or one of a different kind.
     """
     try:
         value = leaf(base, place)
@@ -333,7 +333,7 @@ class Plan:
         Raises
         ------
         InputError
-            A factor takes a value that the base's schema does not allow.
+            A factor takes a value that the base job's schema does not allow.
         """
         sampled = draw(setup.study)
         plan = cls(setup, tuple(_column(setup, name, values) for name, values in sampled.items()))

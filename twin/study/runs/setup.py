@@ -49,11 +49,11 @@ class StudySetup:
     study : StudySpec
         Specification in the study's file, with the values of the tables.
     tree : dict
-        Plain data of the base job with an entry at the key of every factor. If the base has no value there and some
+        Plain data of the base job with an entry at the key of every factor. If the base job has no value there and some
         value has the same effect as its absence, that value is used; else one of the factor's values.
     base : dict
-        Plain data of the base job without values of factors: an entry exists only if the base has one, or one with the
-        same effect as its absence.
+        Plain data of the base job without values of factors: an entry exists only if the base job has one, or one with
+        the same effect as its absence.
     """
 
     study: StudySpec
@@ -130,7 +130,7 @@ def resolve_study(path: str | Path) -> StudySetup:
     Raises
     ------
     InputError
-        A file cannot be read or is invalid, or a factor's key does not exist in the base.
+        A file cannot be read or is invalid, or a factor's key does not exist in the base job.
     """
     return _resolved(yaml_file.read_yaml(path))
 
@@ -199,7 +199,7 @@ def _again(yaml: yaml_file.YamlFile) -> StudySetup:
 
 
 def _base_file(study: StudySpec) -> Path:
-    """Return the base's file: a path relative to the study's, or a name in the library."""
+    """Return the base job's file: a path relative to the study's, or a name in the library."""
     kind = study.base.command.split()[0]
     return find_named("examples" if kind == "render" else kind, study.base.file, study, ("base", "file"))
 
