@@ -80,14 +80,14 @@ class Adjustments:
         residuals : (S, R) ndarray
             Wavefront residuals at the current moves, waves.
         moves : (S, C) ndarray
-            Current moves, SI.
+            Current moves, SI units.
         free : (C,) ndarray of bool
             True for the compensators that may move.
 
         Returns
         -------
         (S, C) ndarray
-            Moves, SI.
+            Moves, SI units.
         """
         size = np.where(self.ranges > 0.0, self.ranges, 1.0)
         slope = slopes * size

@@ -49,7 +49,7 @@ class BodyMove:
     figure : FrozenMap
         Noll index -> rms of the sag, metres.
     shape : FrozenMap
-        Kind of shape change in ``SHAPE`` -> change, SI.
+        Kind of shape change in ``SHAPE`` -> change, SI units.
     """
 
     rotate: np.ndarray = field(default_factory=lambda: np.zeros(3))
