@@ -24,7 +24,9 @@ from scenes.yaml.spec import Number, Spec, Text
 from twin.framework.artefact import plain, significant
 
 FARTHEST = 100.0
-"""Largest factor on a chosen input up to which the limit of its admissible range is searched."""
+"""Largest factor on an input, chosen because the paper does not print it, up to which the limit of its range is
+searched.
+"""
 _STEP = 1.1
 """Ratio of one trial value of a chosen input to the one before, in the search for the limit of its range."""
 _HALVINGS = 20

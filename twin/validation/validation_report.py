@@ -97,7 +97,7 @@ def _limits(result: CheckResult) -> tuple[str, str, str]:
 
 
 def _chosen(validation: Validation) -> Iterator[str]:
-    """Yield the lines that list the chosen inputs and their admissible ranges."""
+    """Yield the lines that list the inputs chosen here, since no paper prints them, with their ranges."""
     results = [result for result in validation.results if result.inputs]
     if not results:
         return

@@ -170,7 +170,10 @@ def _rms(bias: float, spread: float, factor: float) -> float:
 
 
 def _points(response: Callable[[float], float]) -> list[Chosen]:
-    """Return the error of the ground points as a chosen input, on which the scatter of an angle depends."""
+    """Return the error of the ground points as an input that the paper does not print.
+
+    The scatter of an angle depends on it.
+    """
     return [
         Chosen("error of a point", POINT_SIGMA, "m", response),
         Chosen("points on a line", POINTS, "1", lambda factor: response(factor**-0.5)),
@@ -498,7 +501,10 @@ def _row(
 
 
 def _place(sentences: Sequence[Sentence], places: Mapping[Place, Answers]) -> Supposed:
-    """Return the position of the pass as a chosen input, with other positions where the statements are confirmed."""
+    """Return the position of the pass as an input that the paper does not print.
+
+    It comes with other positions where the statements are confirmed.
+    """
     held = sum(all(s.holds(a.rises, a.growth) for s in sentences) for a in places.values())
     text = f"holds at {held} of {len(places)} places from 25° to 50° N and 80° to 130° E"
     return Supposed("a descending pass over 40° N 116° E", text)

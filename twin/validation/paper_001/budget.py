@@ -300,7 +300,7 @@ def run(context: Context) -> Iterator[CheckResult]:
 
 
 def _in_sum(images: BudgetImages, name: str, value: float) -> Chosen:
-    """Return the main input of one cause as a chosen input of a total error.
+    """Return the main input of one cause as an input of a total error, which the paper does not print.
 
     The total, a root of a sum of squares, depends on it through one term.
     """
@@ -356,7 +356,7 @@ def _show(context: Context, lines: Mapping[str, BudgetLine]) -> None:
 
 
 def _all_causes(value: float) -> list[Chosen]:
-    """Return the inputs of all causes, multiplied by one factor, as a chosen input.
+    """Return the inputs of all causes, multiplied by one factor, as an input that the paper does not print.
 
     Every error is proportional to that factor.
     """

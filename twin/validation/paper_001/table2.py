@@ -157,7 +157,7 @@ def _z_columns(context: Context, measurement: Measured) -> CheckResult:
 
 
 def _errors(measured: float) -> Chosen:
-    """Return all errors of the bench, multiplied by one factor, as a chosen input.
+    """Return all errors of the bench, multiplied by one factor, as an input that the paper does not print.
 
     Mean differences are proportional to that factor.
     """

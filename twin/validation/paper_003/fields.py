@@ -470,7 +470,7 @@ def _per_shift(setup: CalibrationSetup) -> float:
 
 
 def _varied(measured: float, flights: Flights, statistic: Callable[[np.ndarray], np.ndarray]) -> Chosen:
-    """Return the variation of the biases between the fields as a chosen input.
+    """Return the variation of the biases between the fields as an input that the paper does not print.
 
     A factor on it scales the RMS in plan that follows from the true biases, (N, S, K) for N campaigns, S schemes and K
     fields; the response is the median of a statistic, (N,).

@@ -119,9 +119,9 @@ def exact_and_images() -> CalibrationSetup:
 
 
 def all_errors(value: float) -> Chosen:
-    """Return the errors of biases, orbit, attitude and points, multiplied by one factor, as a chosen input.
+    """Return the errors of biases, orbit, attitude and points as one input that the paper does not print.
 
-    The errors of a calibration are proportional to that factor.
+    They have one factor in common, to which the errors of a calibration are proportional.
     """
     return Chosen.power("biases and errors of scenes/orbit/calibrate.yaml, times", 1.0, "1", value)
 

@@ -218,7 +218,7 @@ def _edges(alignment: SimulatedFocus, band: str) -> list[EdgeMtf]:
 
 
 def _losses(factors: Mapping[str, float], value: float) -> list[Chosen]:
-    """Return as chosen inputs the factors of an MTF that the paper does not print.
+    """Return the factors of an MTF that the paper does not print, as inputs of the check.
 
     The logarithm of each factor is proportional to the square of its cause's size, as for small wavefront errors
     (Maréchal), diffusion and small motions.
@@ -297,7 +297,7 @@ def _measured(
 
 
 def _chips(placed: Sequence[tuple[SimulatedFocus, Pose, Mapping[str, float]]]) -> Chosen:
-    """Return the glueing errors of the line CCDs, in millimetres, as a chosen input.
+    """Return the glueing errors of the line CCDs, in millimetres, as an input that the paper does not print.
 
     The largest distance from best focus depends on them.
     """
@@ -313,7 +313,7 @@ def _chips(placed: Sequence[tuple[SimulatedFocus, Pose, Mapping[str, float]]]) -
 
 
 def _theodolite(alignments: Sequence[SimulatedFocus], value: float) -> Chosen:
-    """Return the error of measuring and setting the line's rotation as a chosen input.
+    """Return the error of measuring and setting the line's rotation as an input that the paper does not print.
 
     The result is proportional to it.
     """

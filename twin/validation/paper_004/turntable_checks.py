@@ -30,7 +30,9 @@ FIT_RMS_ARCSEC = load_printed("004").number("turntable.fit_rms_arcsec")
 TABLES, FAST_TABLES = 1000, 200
 """Turntables that are calibrated; quick."""
 FURTHER = 1.6
-"""Factor on a chosen input for a second calibration of the tables, which shows how the result depends on it."""
+"""Factor on an input (not printed in the paper) for a second calibration of the tables, which shows how the result
+depends on it.
+"""
 FITTED, FAST_FITTED = 60, 12
 """Turntables whose calibration is fitted."""
 NETWORK = "network"
@@ -143,7 +145,7 @@ def _repeats(
 
 
 def _readings(spec: TurntableTestSpec, seeds: NDArray[np.integer], identifier: str, value: float) -> list[Chosen]:
-    """Return the chosen inputs on which the largest RMS of repeated readings depends.
+    """Return the inputs that the paper does not print, on which the largest RMS of repeated readings depends.
 
     They are the scatter of a reading and, before the rejection criterion, gross errors.
     """
@@ -178,7 +180,7 @@ def _with_errors(spec: TurntableTestSpec, scatter: float, gross: float) -> Turnt
 
 
 def dividing(value: float, power: float = 1.0) -> Chosen:
-    """Return the dividing error as a chosen input.
+    """Return the dividing error as an input that the paper does not print.
 
     The remaining error of fits and its effect are proportional to it.
     """
