@@ -24,7 +24,7 @@ FOCUS = 150e-6
 STEPS = 49
 """Number of defocus values of the through-focus picture."""
 LINE_POSITION = "centre"
-"""Position of the knife edge on the line CCD."""
+"""Name of the position on the line CCD at which the knife edge is imaged."""
 UM = "\N{MICRO SIGN}m"
 
 
@@ -131,7 +131,7 @@ class CameraPictures:
 
 
 def _with_targets(resolved: ResolvedJob) -> ResolvedJob:
-    """Return the job with knife edges among its images, and so with the data sheets of its line CCDs.
+    """Return the job with knife-edge targets added to it, and with the data sheets of its line CCDs.
 
     Raises
     ------

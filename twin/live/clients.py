@@ -208,9 +208,9 @@ class Client:
             self.recorded.append((time.monotonic() - self.record_began, state))
 
     def queue_state(self, message: bytes, before: BeforeKey) -> None:
-        """Queue a state to be sent to the page; a later one replaces it.
+        """Queue the message with a computed state to be sent to the page; a later one replaces it.
 
-        ``before`` names the noise, frames and seed of the reference images that it contains.
+        ``before`` identifies the noise, frames and seed of the reference images that it contains.
         """
         self._answer = message, before
         self._to_send.set()
@@ -258,7 +258,7 @@ class Client:
 
 
 def _hiding(state: messages.AskedState, seed: int) -> messages.BlindState:
-    """Return a state together with the seed of the hidden motions."""
+    """Return a request for a state with the seed of the motions to hide."""
     return messages.BlindState.model_validate({**state.model_dump(), "blind": seed})
 
 
@@ -301,7 +301,7 @@ class LiveApi:
             self.clients.remove(client)
 
     def notify(self) -> None:
-        """Wake the scheduler for a new request."""
+        """Wake the scheduler, because there is a new request."""
         self._wake.set()
 
     async def serve_requests(self) -> None:
@@ -396,7 +396,10 @@ class LiveApi:
         self._announce("runs")
 
     def _next(self) -> Client | None:
-        """Return the next page that requests a state, or else anything; a served page moves to the end."""
+        """Return the next page to be served: one that requests a state, or else any with a request.
+
+        The page that is served moves to the end of the order.
+        """
         for wants in (lambda c: c.factors or c.state, lambda c: c.busy):
             for client in self.clients:
                 if wants(client):
@@ -406,7 +409,7 @@ class LiveApi:
         return None
 
     async def _build(self, client: Client, asked: messages.Factors) -> None:
-        """Build the instrument with other values of a study's factors, and inform all pages."""
+        """Have the instrument built with other values of a study's factors, and inform all pages."""
         for one in self.clients:
             one.queue_json({"type": "building"})
         answer = await self._ask("factors", asked.values)

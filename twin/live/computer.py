@@ -37,14 +37,14 @@ MOST_BUILT = 3
 
 
 class RequestHandler:
-    """Built instrument that answers requests.
+    """Built instrument that answers the requests of pages in the computing process.
 
     Parameters
     ----------
     what
         Name of an instrument or camera in the library, or path of a file or run folder, as for `read_source`.
     backend
-        Backend that traces.
+        Array backend of the ray trace.
     advance
         Callback that receives the name of each part of the preparation.
     run
@@ -107,7 +107,7 @@ class RequestHandler:
         return self.opened
 
     def _state(self, question: tuple[AskedState, tuple[bool, int, int] | None]) -> bytes:
-        """Return a state's message with its images, and with the reference images if the page lacks them."""
+        """Return the message with a state and its images, and with the reference images if the page lacks them."""
         asked, known = question
         message, after = self.bench.state(asked)
         images = {} if after is None else {"after": after}
@@ -135,7 +135,7 @@ class RequestHandler:
         return json.dumps({"type": "revealed", **self.bench.hidden(asked)})
 
     def _job(self, asked: AskedState) -> str:
-        """Return the message with a job file of a state."""
+        """Return the message with a job file that describes a state."""
         return self._file("job.yaml", lambda: job_text(self.bench, asked))
 
     def _course(self, kept: Sequence[tuple[float, AskedState]]) -> str:
@@ -156,7 +156,7 @@ Kind = Literal["state", "view", "hidden", "job", "course", "factors"]
 BeforeKey = tuple[bool, int, int]
 Condition = Literal["starts", "runs", "stopped", "ended"]
 EXIT_TIMEOUT = 3.0
-"""Time that the process is given to end by itself, in seconds."""
+"""Time that the process may take to end by itself before it is killed, in seconds."""
 ATTEMPTS = 3
 """Number of attempts to restart the process if it ends during its start."""
 
@@ -170,16 +170,16 @@ class CannotStart(Exception):
 
 
 class Computer:
-    """Handle of the computing process for an event loop; it answers one request at a time.
+    """Object by which the server's event loop uses the computing process; it answers one request at a time.
 
     Parameters
     ----------
     what
         Name of an instrument or camera in the library, or path of a file or run folder, as for `read_source`.
     backend
-        Backend that traces.
+        Array backend of the ray trace.
     run
-        Number of a study's run.
+        Number of one of a study's runs, from 0; None for its base.
     """
 
     def __init__(self, what: str, backend: str, run: int | None = None) -> None:
@@ -291,7 +291,7 @@ class Computer:
             return answer
 
     def _exchange(self, kind: Kind, question: Any) -> Any:
-        """Send a request and wait for its answer."""
+        """Send a request to the computing process and wait for its answer."""
         assert self._pipe is not None
         self._asked = True
         try:
@@ -317,7 +317,7 @@ class Computer:
 
     @property
     def ending(self) -> str:
-        """Description of how the process ended."""
+        """Description, as text, of how the computing process ended."""
         code = None if self._process is None else self._process.exitcode
         if code is None:
             return "the computing process ended"

@@ -50,7 +50,7 @@ HEADERS: Mapping[str, str] = {
 
 
 class BadToken(ValueError):
-    """Token that is too easy to guess."""
+    """Error that the token set by the user is too easy to guess or has forbidden characters."""
 
 
 def new_token(variable: str) -> str:
@@ -112,7 +112,7 @@ class Guard:
         return f"{self.cookie_name}={self.token}; HttpOnly; SameSite=Strict; Path=/"
 
     def is_token(self, token: str) -> bool:
-        """Return whether a text is the token, in constant time."""
+        """Return whether a text equals the token; the comparison takes the same time for every text."""
         return secrets.compare_digest(token.encode(), self.token.encode())
 
     def has_token_cookie(self, headers: Mapping[str, str]) -> bool:
@@ -229,7 +229,7 @@ class Connections:
         return len(self._unauthenticated) + len(self._authenticated)
 
     def protocol(self) -> type[Connection]:
-        """Return the class that uvicorn instantiates for each connection."""
+        """Return the protocol class that uvicorn instantiates for each new connection, bound to this list."""
         return type("BoundConnection", (Connection,), {"all": self})
 
     def register(self, one: Connection, address: str) -> None:
@@ -242,7 +242,7 @@ class Connections:
             self._close_oldest(count.most_common(1)[0][0])
 
     def authenticate(self, one: Connection) -> None:
-        """Count a connection that showed the token as authenticated, and close the oldest one if there are too many."""
+        """Move a connection that showed the token to the authenticated ones; close the oldest if there are too many."""
         if self._unauthenticated.pop(one, None) is None:
             return
         self._authenticated[one] = None

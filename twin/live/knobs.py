@@ -64,7 +64,7 @@ KINDS: Mapping[str, _KnobKind] = {
 
 @dataclass(frozen=True)
 class Knob:
-    """One adjustable number.
+    """Adjustable number of the page, the amount of one motion of a body.
 
     Attributes
     ----------
@@ -308,13 +308,13 @@ def base_with_factors(setup: StudySetup, scalars: Mapping[str, Any]) -> Tree:
 
 
 def _fixed(factor: FactorSpec, scalar: Any) -> FactorSpec:
-    """Return the factor with a single value instead of its distribution."""
+    """Return a factor of a study with a single value instead of its distribution."""
     keys = {"key": factor.key, "keys": factor.keys, "scales": factor.scales}
     return FactorSpec.model_validate({**{k: v for k, v in keys.items() if v}, "values": (scalar,)})
 
 
 def _factor(name: str, factor: FactorSpec, setup: StudySetup) -> FactorKnob | None:
-    """Return the knob of a factor; None if it is not numeric."""
+    """Return the knob for a factor of a study; None if the factor is not numeric."""
     numbers = factor.numbers()
     if not numbers.numeric or not len(numbers):
         return None

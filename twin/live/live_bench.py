@@ -112,11 +112,14 @@ class LiveBench:
 
     @property
     def monitored(self) -> bool:
-        """True if the instrument has a monitor; without one the page shows the trace and the cameras' image quality."""
+        """True if the instrument has a monitor.
+
+        Without one the page shows true changes by ray trace and the cameras' image quality.
+        """
         return self.twin.experiment.monitored
 
     def warm(self, advance: Callable[[str], None] = lambda part: None) -> None:
-        """Compute everything that does not depend on the knobs, and compile every kernel.
+        """Compute everything that does not depend on the knobs, and compile every kernel, before the first page.
 
         Parameters
         ----------
@@ -141,7 +144,7 @@ class LiveBench:
         self.state(self.initial_state)
 
     def greeting(self) -> dict[str, Any]:
-        """Return the data that a page needs before its first request."""
+        """Return the data that a page needs before its first request: cameras, knobs and settings."""
         twin, experiment = self.twin, self.twin.experiment
         job = twin.resolved.job
         nodes = {
@@ -403,7 +406,10 @@ class LiveBench:
         return run, after, reading.light.placed
 
     def _state_data(self, run: RenderRun, asked: AskedState, placed: PlacedBodies) -> dict[str, Any]:
-        """Return the data of a state of an instrument with a monitor."""
+        """Return the page's data for a state of an instrument with a monitor.
+
+        They are estimated and true changes, spots and warnings.
+        """
         experiment = self.twin.experiment
         instrument = experiment.instrument
         message: dict[str, Any] = {"readings": stated(run.recovered_dict())}
@@ -442,7 +448,7 @@ class LiveBench:
 
 
 def _elapsed_ms(began: float) -> float:
-    """Return the time since a moment, in milliseconds."""
+    """Return the time since ``began`` (a reading of the clock), in milliseconds."""
     return 1e3 * (time.perf_counter() - began)
 
 

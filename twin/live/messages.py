@@ -1,4 +1,4 @@
-"""Messages between page and program.
+"""Messages between the page and the program of the live twin.
 
 The page sends JSON texts, each one of `Message`; none of them names a file. The program answers with JSON texts and,
 for a state's images, with one binary message: four bytes (little endian) with the length of a JSON text, the text,
@@ -18,7 +18,7 @@ from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 LARGEST_MESSAGE = 1 << 16
 """Largest size of a message of the page, in bytes."""
 MOST_KNOBS = 400
-"""Largest number of knobs that are not zero."""
+"""Largest number of knobs in a message; only knobs that are not zero are sent."""
 MOST_FRAMES = 64
 """Largest number of frames of an exposure."""
 LARGEST_SEED = 2**53 - 1
@@ -29,7 +29,7 @@ Number = Annotated[float, Field(allow_inf_nan=False)]
 
 
 class _PageMessage(BaseModel):
-    """Message of a page, without additional keys."""
+    """Base class of the messages that a page sends; unknown keys are errors."""
 
     model_config = ConfigDict(extra="forbid", strict=True, frozen=True)
 

@@ -58,11 +58,11 @@ class LiveServer:
     Parameters
     ----------
     computer
-        Handle of the started computing process.
+        Object that represents the started computing process.
     guard
         Access control.
     stay
-        Do not end when the last page is closed.
+        True to go on when the last page is closed.
     """
 
     def __init__(self, computer: Computer, guard: Guard, stay: bool = False) -> None:
@@ -85,7 +85,7 @@ class LiveServer:
 
     @property
     def started(self) -> bool:
-        """True if the server answers."""
+        """True if the server has started to answer requests."""
         return self._uvicorn is not None and self._uvicorn.started
 
     def run(self, listening: socket.socket) -> None:
@@ -134,7 +134,7 @@ class LiveServer:
 
     @contextlib.asynccontextmanager
     async def _lifespan(self, app: Starlette) -> AsyncIterator[None]:
-        """Run the scheduler and the watch of the process while the application runs."""
+        """Run the scheduler of requests and the monitoring of the computing process while the application runs."""
         tasks = [asyncio.create_task(make()) for make in (self.api.serve_requests, self.api.watch_process)]
         for task in tasks:
             task.add_done_callback(self._ended)

@@ -98,7 +98,7 @@ class Source:
 
 
 def read_source(what: str, run: int | None = None) -> Source:
-    """Read a source of the live twin.
+    """Read a source that the live twin can open.
 
     Parameters
     ----------
@@ -196,7 +196,7 @@ def _run_of(kind: FileKind | None, manifest: Manifest) -> str:
 
 
 def _nothing_to_show(place: Path, what: str, folder: Path, data: Any = None) -> Issue:
-    """Return why a run folder cannot be opened, with remedies."""
+    """Return the error that a run folder cannot be opened, with the reason and what to open instead."""
     remedies = []
     if (folder / REPORT).is_file():
         remedies.append(f"its results are in {folder / REPORT}")
@@ -221,7 +221,7 @@ def _is_instrument(file: Path) -> bool:
 
 
 def _of_measurement(file: Path) -> Source:
-    """Return the unperturbed instrument with which frames were measured.
+    """Return the unperturbed instrument with which the frames of a measurement were taken, as a source.
 
     The perturbation is not known; it is what the measurement was to find.
     """
@@ -273,7 +273,7 @@ def _with_motions(setup: MonitorSetup) -> ResolvedJob:
 
 
 def _of_study(file: Path, run: int | None) -> Source:
-    """Return the base of a study, or one of its runs."""
+    """Return the base job of a study, or one of its runs, as a source."""
     setup = resolve_study(file)
     if setup.study.base.command != "render":
         found, allowed = setup.study.base.command, "a study of base: {command: render}"
