@@ -196,7 +196,7 @@ def require_memory(resolved: ResolvedJob, size: MonitorSize, detector: EmvaDetec
 
 
 def _lowered(resolved: ResolvedJob, size: MonitorSize, part: str, detector: EmvaDetector) -> tuple[str, Lowered]:
-    """Return a description of a part of the memory, and the number in the files to lower in order to reduce it."""
+    """Return a description of a part of the memory, and which number in the files must be lowered to reduce it."""
     job, rows, columns, frames = resolved.job, size.rows, size.columns, size.frames
     owner: Spec = job
     least = 1

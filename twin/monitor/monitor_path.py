@@ -140,9 +140,9 @@ class MonitorPath(MonitorBeams):
         return self.node_classes.class_of(position, margin, coarse.blur, widening)
 
     def _require_class(self, number: int, coarse: CoarseTrace, state: int) -> int:
-        """Return the number of a class of pupil nodes if it exists.
+        """Return the number of a class of pupil nodes (a pupil quadrature) if it exists.
 
-        UncertainImageError is raised for a spot that is blurred too much for any class.
+        UncertainImageError is raised for a spot that is blurred too much for the finest class.
         """
         if number >= len(self.node_classes.reached):
             worst = int(np.argmax(coarse.blur[:, state]))
@@ -464,7 +464,7 @@ class _OnSpots(MonitorBeams):
         return _OnSpots(self.instrument, self.backend, nodes, self.cameras)
 
     def _require_on_ccd(self, channel: Channel, position: np.ndarray) -> None:
-        """Accept every spot, since its CCD is centred on it."""
+        """Do nothing, since every CCD is centred on its spot."""
 
     def rays(self, states: Sequence[State], coarse: CoarseTrace | None = None) -> CcdRays:
         rays = super().rays(states, coarse)

@@ -121,7 +121,7 @@ class Observation:
 
     @property
     def numbers(self) -> np.ndarray:
-        """Numbers of the states that could be measured, which select their random streams."""
+        """Numbers of the states that could be measured; a state's number selects its random stream."""
         return self.light.numbers[self.measured]
 
     @property

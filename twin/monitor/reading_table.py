@@ -95,7 +95,7 @@ class Reading:
 
     @property
     def far(self) -> bool:
-        """True if the error exceeds so many standard deviations that reports mark it."""
+        """True if the error, in standard deviations, exceeds the limit above which reports mark it."""
         return abs(self.ratio) > FAR
 
     def shown(self, value: float, sign: bool = False) -> str:
@@ -154,7 +154,7 @@ class ReadingTable:
     ground_residuals: Mapping[str, Mapping[str, Any]]
 
     def __iter__(self) -> Iterator[Reading]:
-        """Iterate over the readings (rows of the table)."""
+        """Iterate over the rows of the table, one for each change and estimator."""
         return iter(self.rows)
 
     def at(self, state: int) -> ReadingTable:

@@ -553,7 +553,7 @@ class CourseSmoother:
         self._shifts.append(shift)
 
     def smoothed(self) -> SmoothedCourse | None:
-        """Return the smoothed changes of all stored states; None without a prior, and for a single time."""
+        """Return the smoothed changes of all stored states; None without a prior, or for a single time."""
         prior, noise, times = self._prior, self._noise, self._times
         if prior is None or noise is None or len(times) < 2:
             return None

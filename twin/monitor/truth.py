@@ -210,7 +210,10 @@ class LineSight:
         return self.truth_of(self.trace(states, placed) if states else self.nominal[:, :0])
 
     def truth_of(self, sight: np.ndarray) -> Truth:
-        """Return the true changes of S states from directions of sight (cameras, S, LINE_POINTS, 3)."""
+        """Return the true changes of the cameras in S states, from traced lines of sight.
+
+        ``sight`` holds the directions of the lines of sight in the world frame, (cameras, S, LINE_POINTS, 3).
+        """
         sight = np.concatenate([self.nominal, sight], axis=1)
         cameras: dict[str, LineChange] = {}
         principal: dict[str, float] = {}
