@@ -20,7 +20,7 @@ MOST_LEVELS = 20
 
 
 class _NoBasis(Exception):
-    """Error that no polynomial basis can be made for a factor; the text gives the reason."""
+    """Error that no polynomial basis can be made for a factor, with the reason as text."""
 
 
 def axis_functions(axis: tuple[Factor, ...], good: np.ndarray, degree: int) -> tuple[np.ndarray, np.ndarray]:
@@ -221,7 +221,7 @@ class Index:
 
     @property
     def name(self) -> str:
-        """Names of the factors, joined."""
+        """Names of the factors that vary together, joined to one text."""
         return " + ".join(self.factors)
 
 

@@ -23,9 +23,9 @@ MARKS = ("o", "s", "^", "D", "v", "P")
 MOST_POINTS = 500
 """Largest number of points in a scatter plot, to limit the size of the page and overplotting."""
 STEPS = (1, 2, 2.5, 5, 10)
-"""Allowed spacings of ticks, times a power of ten."""
+"""Allowed spacings of an axis' ticks, apart from a power of ten."""
 LONGEST = 18
-"""Largest number of characters of a text on an axis."""
+"""Largest number of characters of a text at a tick of an axis; longer texts are cut."""
 
 
 def finish(axes: Axes, x_ticks: int | None = 6, y_ticks: int | None = 5) -> None:
@@ -171,7 +171,7 @@ def convergence_figure(analysis: StudyAnalysis, response: Response) -> Figure:
 
 
 MOST_LINES = 6
-"""Largest number of lines in a panel."""
+"""Largest number of lines in one panel of a response curve figure."""
 MOST_PANELS = 6
 """Largest number of factors for which a response curve is drawn."""
 
@@ -321,7 +321,7 @@ def pareto_figure(analysis: StudyAnalysis) -> Figure:
 
 
 MOST_BARS = 10
-"""Largest number of bars in a panel."""
+"""Largest number of bars (factors) in one panel of a tornado or sensitivity figure."""
 
 
 def _bar_panels(rows: Sequence[int]) -> tuple[Figure, list[Axes]]:

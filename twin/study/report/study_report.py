@@ -111,7 +111,7 @@ def report_files(
 
 
 MOST_NAMED = 6
-"""Largest number of values of a factor that are listed."""
+"""Largest number of a factor's values that the table of factors lists one by one."""
 STATISTICS = "statistics.json"
 """Name of the file with all digits of those tables that show rounded numbers and have no file of their own."""
 
@@ -154,7 +154,7 @@ def _values(factor: Factor) -> str:
 
 
 MOST_FIGURES = 12
-"""Largest number of responses with individual figures."""
+"""Largest number of responses that get figures of their own in the report."""
 MOST_FRONT = 50
 """Largest number of rows of a Pareto front in the report; its CSV file has all."""
 

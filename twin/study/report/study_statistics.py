@@ -44,17 +44,17 @@ class Series:
 
     @property
     def label(self) -> str:
-        """Name with its unit, for the label of an axis."""
+        """Name of the factor or response with its unit, for the label of an axis."""
         return f"{self.name}, {typeset(self.unit)}" if self.unit else self.name
 
     @property
     def numeric(self) -> bool:
-        """True if the values are numbers."""
+        """True if the values of the factor or response are numbers, not texts."""
         return self.values.dtype.kind == "f"
 
     @cached_property
     def levels(self) -> np.ndarray:
-        """Distinct values, numbers in ascending order, texts in the order of the study."""
+        """Distinct values of the factor or response, numbers in ascending order, texts in the order of the study."""
         distinct = np.unique(self.values)
         if self.numeric:
             return distinct
@@ -100,7 +100,7 @@ class Response(Series):
 
     @cached_property
     def known(self) -> np.ndarray:
-        """Values that are finite numbers, without those of failed runs."""
+        """Values of the response that are finite numbers, without those of failed runs."""
         return np.asarray(self.values[self.good])
 
     @cached_property
@@ -165,7 +165,7 @@ class StudyRuns:
 
     @property
     def count(self) -> int:
-        """Number of runs."""
+        """Number of runs of the study."""
         return len(self.failed)
 
     @property

@@ -419,7 +419,7 @@ def _doubt(outcome: Mapping[str, Any]) -> str:
 
 
 def _number(outcome: Mapping[str, Any], key: Any, name: str) -> float:
-    """Return the number at a key of the results; NaN where they have none."""
+    """Return the number at a key path of the results, or NaN if there is none."""
     try:
         value = leaf(outcome, key)
     except Problem as problem:

@@ -215,7 +215,7 @@ class Engine:
             self.warn(f"{self.journal.file}: {lines} corrupt; what it held is computed again")
 
     def _known(self, block: int) -> BlockResult | None:
-        """Return the results of a block if the journal holds them, else None."""
+        """Return the results of a block of runs if the journal of finished blocks holds them, else None."""
         result = self.journal.known.get(str(block))
         shape = len(self.plan.block(block)), len(self.plan.setup.study.responses)
         return result if isinstance(result, BlockResult) and result.fits(shape) else None

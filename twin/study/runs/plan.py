@@ -32,7 +32,7 @@ def axes_of(study: StudySpec) -> list[tuple[str, ...]]:
 
 
 def levels(factor: FactorSpec) -> int:
-    """Return the number of values in a factor's list or range of steps; 0 for a continuous distribution."""
+    """Return the number of values in a factor's list or equidistant range; 0 for a continuous distribution."""
     return (factor.count or 0) if factor.kind == "range" else len(factor.scalars()) if factor.kind in _LISTS else 0
 
 
@@ -110,7 +110,10 @@ Beyond it the probability between the limits loses its digits in ordinary arithm
 
 
 def _far(a: float, b: float, u: np.ndarray) -> np.ndarray:
-    """Return quantiles of a standard normal distribution truncated far in one of its tails."""
+    """Return quantiles of a standard normal distribution whose truncation limits are both far in one tail.
+
+    ``a`` and ``b`` are the limits in sigmas, ``u`` the probabilities.
+    """
     # as in ``_quantile``
     from scipy.special import log_ndtr, ndtri_exp
 

@@ -62,7 +62,7 @@ def run_results(
 
 
 MonitorRun = tuple[ResolvedJob, State]
-"""Job and its perturbed state."""
+"""Run of an instrument with a monitor: its job and the perturbed state that the job describes."""
 
 
 def _run_together(

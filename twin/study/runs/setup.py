@@ -292,9 +292,9 @@ def _with_tables(study: StudySpec) -> StudySpec:
 
 
 LARGEST_TABLE = 100_000_000
-"""Largest size of a table's file, bytes."""
+"""Largest size of the file of a table with factor values, bytes."""
 MOST_CELLS = 90_000
-"""Largest number of cells of all tables together.
+"""Largest number of cells of all tables with factor values together.
 
 The config.yaml of the study holds them, with at most 100 000 keys and values.
 """
@@ -352,7 +352,7 @@ _PLAIN = re.compile(r"[-+]?\.?[0-9A-Za-z][-+0-9A-Za-z._/^() ]*")
 
 
 def _cell(text: str) -> Any:
-    """Return a cell as YAML would read it: number, true, false or text."""
+    """Return a text from a table's cell as YAML would read it: number, true, false or text."""
     try:
         if _PLAIN.fullmatch(text):
             return _SCALAR.validate_python(yaml_file.plain_scalar(text.strip()))
