@@ -212,7 +212,7 @@ def _autocollimator_bodies(spec: AutocollimatorTestSpec, unit: int, pose: Pose) 
 AIM_TOLERANCE = 1e-9
 """Largest distance on the mirror between an aimed ray and its target point, metres."""
 MAP_TERMS = 15
-"""Number of Zernike terms that interpolate ray directions between the nodes of the mirror."""
+"""Number of Zernike terms that represent ray directions as functions of the position on the mirror."""
 FINE = 2
 """Number of samples along each side of a pixel at which the irradiance is computed.
 
@@ -774,7 +774,7 @@ class Reader:
         self.map = self._calibrate()
 
     def path(self, half_angle: float) -> AutocollimatorPath:
-        """Return the light path for a half angle theta between the mirrors, radians; it is built once."""
+        """Return the light path for a half angle theta between the mirrors' normals, radians; it is built only once."""
         if half_angle not in self._paths:
             self._paths[half_angle] = AutocollimatorPath(build_bench(self.spec, half_angle), self.backend)
         return self._paths[half_angle]
@@ -826,7 +826,7 @@ class Reader:
         return np.stack(out)
 
     def read(self, series: Series, windows: SpotWindows, seed: int | None) -> SeriesResult:
-        """Measure the mirrors' rotations from the images of a series that begins with the reading at zero."""
+        """Measure the mirrors' rotations from the images of a series, relative to its first reading at zero."""
         if seed is None:
             mean = self.detector.expected_dn(windows.photons, self.exposure)
         else:

@@ -201,7 +201,7 @@ def interpolated(values: np.ndarray, half_field: float, field_angle: np.ndarray)
 
 
 def _nodes() -> np.ndarray:
-    """Return the Chebyshev nodes on -1 ... 1 in increasing order."""
+    """Return the Chebyshev nodes of the interpolation over the field, scaled to -1 ... 1, in increasing order."""
     return np.asarray(-np.cos(np.pi * (np.arange(NODES) + 0.5) / NODES))
 
 
@@ -377,12 +377,12 @@ class DistortionBench:
 
     @property
     def noise(self) -> NoiseModel:
-        """Noise model of one frame."""
+        """Noise model of one frame of the line CCD."""
         return self.ccd.noise
 
     @property
     def radius(self) -> float:
-        """Radius of the centroid's window, pixels."""
+        """Radius of the window over which a spot's centroid is computed, pixels."""
         return 0.5 * self.setup.test.window - MARGIN
 
     @property

@@ -239,7 +239,7 @@ def _summary(run: DistortionRun, data: Mapping[str, Any]) -> Table:
 
 
 def _curve(run: DistortionRun, data: Mapping[str, Any]) -> Section:
-    """Return the section on distortion over the field."""
+    """Return the report section on the measured distortion over the field."""
     text, caption = [], "Means of the sets."
     if isinstance(run, SimulatedDistortion):
         with_it, without = (rms(run.error(d) / d.sigma) for d in (run.compensated, run.raw))
@@ -289,7 +289,7 @@ ESTIMATES = {
     "constant": "constant, balanced f, p (adopted)",
     "constant_radial3": "constant, f, p, radial (joint)",
 }
-"""Name of an estimate -> its description in reports."""
+"""Key of an estimate by an equation or fit -> its description in reports."""
 
 
 def _joint(joint: Mapping[str, Any]) -> Section:
@@ -374,7 +374,7 @@ def _estimates(run: DistortionRun, data: Mapping[str, Any]) -> Section:
 
 
 def _noise(run: DistortionRun, data: Mapping[str, Any]) -> Section:
-    """Return the section on noise and rejected spots."""
+    """Return the report section on the noise of the spots and on rejected spots."""
     noise, stated = data["noise"], data["specified_exposure_um"]
     text = [
         f"One spot scatters by {noise['exposure_um']:.3f} µm "

@@ -191,7 +191,10 @@ class SimulatedDistortion(DistortionRun):
         return self.bench.setup
 
     def true_fit(self, terms: Sequence[str] = interior.CALIBRATED) -> interior.InteriorOrientation:
-        """Fit the exact chief rays at the true angles, with the terms and exposures of the measurement."""
+        """Fit the orientation model to exact chief rays at the true angles.
+
+        The fit has the terms and exposures of the measurement's fit.
+        """
         position, angles = self.means.mean(self.truth.position[..., 0]), self.means.mean(self.truth.field_angle)
         return interior.fit_interior_orientation(position, angles, _EXACT, terms)
 
@@ -470,7 +473,7 @@ def run_distortion(
 
 JOINT_MODEL = "L = constant + principal_distance tan W - principal_point tan^2 W + radial3 tan^3 W"
 _LINE_UNIT = np.array([1.0 / ARCSEC, MM_PER_M, MM_PER_M, 1.0])
-"""Factors from SI units to the units of `LINE`: arcsec, mm, mm, 1/m^2."""
+"""Factors from SI units to the units in which the parameters of `LINE` are reported: arcsec, mm, mm, 1/m^2."""
 
 POINTS: Record[DistortionRun] = Record(
     "One point of the line: means of the sets that Chauvenet's criterion accepts.",

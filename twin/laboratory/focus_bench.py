@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     from scenes.specs.resolved import FocusSetup
 
 _SEARCH = 0.3e-3
-"""Largest defocus to either side in the search for best focus, metres."""
+"""Largest defocus to either side, metres, that is searched for the best focus of the simulated optics."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,7 +98,7 @@ class Site:
         return float(self.crossing(placement, height)[2] - self.best)
 
     def column(self, placement: Pose, height: float) -> int:
-        """Return the first column of the recorded region, which has the image of the edge in its middle."""
+        """Return the first column of the recorded region, in whose middle the image of the edge lies."""
         imager = self.imagers[ALONG]
         along = placement.inverse().apply(self.crossing(placement, height))[1]
         middle = along / imager.ccd.band.pitch + 0.5 * (imager.ccd.band.pixels - 1)
@@ -295,7 +295,7 @@ _COARSE = 4
 A coarser scan could miss the peak.
 """
 _ATTEMPTS = 3
-"""Largest number of scans of one site."""
+"""Largest number of times that one site is scanned through focus until its peak is found."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -566,7 +566,7 @@ def _search(recorder: Recorder, number: int, zero: float, first: int = 0) -> flo
 
 
 def _lost(site: Site, problem: FocusError) -> BenchError:
-    """Return the error for a site without a best focus in the scan."""
+    """Return the error for a site whose scan through focus contains no best focus."""
     return BenchError(
         f"no best focus of {site.band} at field {site.field:g}: {problem}",
         ("scan",),

@@ -128,7 +128,7 @@ def _defocus(axes: Axes, run: FocusRun, number: int, state: FocusState) -> None:
 
 
 def _middle(run: SimulatedFocus, band: str) -> int:
-    """Return the number of the band's site nearest to the middle of the field."""
+    """Return the number of the site of a band that is nearest to the middle of the field."""
     sites = run.bench.sites
     return min((i for i, s in enumerate(sites) if s.band == band), key=lambda i: abs(sites[i].field))
 
@@ -228,7 +228,7 @@ def _alignment_verdict(run: SimulatedFocus, data: Mapping[str, Any]) -> tuple[st
 
 
 def _edge_frames(run: SimulatedFocus) -> dict[str, np.ndarray]:
-    """Return the frames of all edges after the alignment, by file name."""
+    """Return file name -> frames of all edges recorded after the alignment."""
     fields = run.bench.setup.test.fields
     return {
         f"{site.band}_field{fields.index(site.field) + 1}_{edge}": scan.frames[edge]

@@ -591,12 +591,15 @@ def _ground(metres: Any) -> Any:
 
 
 def _mtf(state: SimulatedState, edge: str, which: int) -> dict[str, float]:
-    """Return band -> MTF at the Nyquist frequency in one direction (``which`` 0), or its sigma (1)."""
+    """Return band -> MTF at the Nyquist frequency in one direction, or its sigma.
+
+    ``which`` is 0 for the MTF and 1 for its sigma.
+    """
     return {band: pair[which] for band, pair in state.mtf(edge).items()}
 
 
 def _shims(state: SimulatedState) -> Shimming:
-    """Return the shims that led to the placement of a state."""
+    """Return the shims with which the focal plane came to the placement of a state."""
     assert state.shims is not None
     return state.shims
 
@@ -819,5 +822,5 @@ MEASURED: Record[FocusRun] = Record(
 
 
 def focus_numbers(run: FocusRun) -> dict[str, Any]:
-    """Return the contents of focus.json without its frames."""
+    """Return the contents of focus.json, all results of the alignment as plain data, without the frames."""
     return SIMULATED(run) if isinstance(run, SimulatedFocus) else MEASURED(run)

@@ -31,7 +31,7 @@ from twin.targets.target_images import ALONG, DIRECTIONS
 MAX_SITES = 3000
 """Largest number of sites (positions on the focal plane) in a measured series."""
 NANOMETRE = 1e-9
-"""Distance below which two positions are the same site, metres."""
+"""Distance below which two positions in a table are considered the same site, metres."""
 _WHERE = (
     Column("band", text=True, needed=False),
     Column("x", LENGTH, least=-10.0, most=10.0),

@@ -95,7 +95,7 @@ class DataFile:
 
     @property
     def doubts(self) -> tuple[str, ...]:
-        """Warnings about the contents of the file."""
+        """Warnings about the contents of the file, such as copied rows."""
         text = (
             "of a repeated measurement equal another one to the last digit: were they copied? All count in the sigmas"
         )

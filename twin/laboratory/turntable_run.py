@@ -151,7 +151,7 @@ class TurntableModel:
 
     @cached_property
     def error(self) -> DividingError:
-        """True dividing error of this table, which the analysis does not know."""
+        """True dividing error of the simulated table, which the analysis does not know."""
         return DividingError.draw(self.spec.dividing_error, self.seed)
 
     def true_angle(self, reading: ArrayLike, rng: np.random.Generator | None = None) -> Array:
@@ -266,7 +266,7 @@ class TurntableRun:
 
     @property
     def fits(self) -> dict[str, AngleFit]:
-        """Fits that succeeded, in the order in which they were made."""
+        """Name -> fit of the dividing error, for all fits that succeeded, in the order in which they were made."""
         return {name: trial.fit for name, trial in self.choice.trials.items()}
 
     def residual(self, name: str) -> Array:
