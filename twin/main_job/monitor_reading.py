@@ -73,7 +73,7 @@ class MonitorReading:
 
     @property
     def estimators(self) -> dict[str, Estimator]:
-        """Estimators in the results, by name: all whose requirements (a prior, for instance) are met."""
+        """Name -> estimator in the results, for all whose requirements (a prior, for instance) are met."""
         return applicable(self.cameras, self.disturbances)
 
     @property
@@ -83,7 +83,7 @@ class MonitorReading:
 
     @cached_property
     def table(self) -> ReadingTable:
-        """Table of the changes estimated by all estimators, beside the true changes where these are known."""
+        """Table of the changes estimated by all estimators, with the true changes where these are known."""
         return reading_table(self.recovery, self.cameras, self.truth, self.ground, self.disturbances).at(0)
 
     @cached_property
@@ -402,7 +402,7 @@ _TEST_KEYS: Mapping[str, Callable[[Consistency], Any]] = {
 }
 """Key in files -> function that takes its number from the chi-square test against the prior."""
 _SIGMA_DIGITS = 8
-"""Significant digits of a sigma and of a chi-square in files."""
+"""Number of significant digits of a sigma and of a chi-square in files."""
 _SIGMAS = ("_sigma", "_sigma_noise", "_rms_m")
 """Endings of the keys in files whose values are standard deviations."""
 

@@ -383,7 +383,7 @@ NAMED = 1e-10
 
 
 def _flat(numbers: Mapping[str, Any], *keys: str) -> list[Cell]:
-    """Return the numbers stored under some keys as table cells; a vector gives one cell for each axis."""
+    """Return the numbers that results hold under some keys as table cells; a vector gives one cell for each axis."""
     values = [numbers[key] for key in keys]
     return [number for value in values for number in (value if isinstance(value, list) else [value])]
 

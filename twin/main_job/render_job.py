@@ -65,7 +65,7 @@ QUALITY = "image quality"
 """Progress label of a long part: image quality."""
 
 _FREE_PUPILS = "obstruction: ignore: image quality and targets do not include obstruction by bodies in the beams"
-"""Warning of a job that ignores obstructions of the pupils in image quality and targets."""
+"""Text of the warning that image quality and targets ignore obstructions of the pupils, as the job requests."""
 
 MIN_LIGHT = 0.5
 """Fraction of the nominal light on a CCD below which the user is warned of vignetting or a spot leaving the CCD."""
@@ -471,7 +471,7 @@ def _blurred(experiment: MonitorExperiment, focus: SpotFocus) -> tuple[str, ...]
 def _warnings(
     experiment: MonitorExperiment, nominal: np.ndarray, photons: np.ndarray, before: np.ndarray, after: np.ndarray
 ) -> tuple[str, ...]:
-    """Return warnings about saturation and lost light."""
+    """Return warnings about saturated pixels and lost light in the monitor's images."""
     warnings = []
     channels = experiment.path.channels
     for name, recorded in (("before", before), ("after", after)):

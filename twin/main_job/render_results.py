@@ -109,7 +109,7 @@ class JobRun:
         return out
 
     def _with_nominal(self, out: dict[str, Any]) -> dict[str, Any]:
-        """Add the nominal principal distances and angle to the true changes."""
+        """Return true changes as plain data, with the nominal principal distances and angle added."""
         for name, group in out["cameras"].items():
             group["principal_distance_mm"] = 1e3 * float(self.truth.principal_distance[name])
         if ANGLE_GROUP in out:
@@ -118,12 +118,12 @@ class JobRun:
 
     @property
     def deformed(self) -> Mapping[str, NodalDeformation]:
-        """Body -> deformation by its table of displaced nodes."""
+        """Body -> its deformation by a table of displaced nodes; empty without such tables."""
         return self.experiment.deformed(self.resolved.job)
 
     @property
     def heated(self) -> Mapping[str, HeatedBody]:
-        """Body -> temperature field by its table of nodes."""
+        """Body -> its temperature field by a table of nodes; empty without such tables."""
         return self.experiment.heated(self.resolved.job)
 
     @property
@@ -188,7 +188,7 @@ class RenderRun(JobRun):
 
     @property
     def estimators(self) -> dict[str, Estimator]:
-        """Estimators in the results, by name."""
+        """Name -> estimator, for all estimators in the results."""
         return self.reading.estimators
 
     @property

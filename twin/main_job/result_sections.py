@@ -149,7 +149,7 @@ def _all_digits(run: RenderRun, name: str, table: ReadingTable, over: bool) -> T
 
 
 def _value_and_sigma(run: RenderRun, label: str) -> list[str]:
-    """Return column heads for value, total sigma and noise sigma of each estimator."""
+    """Return the column names for value, total sigma and noise sigma of each estimator."""
     labels = (label, " sigma", " sigma noise")
     return [f"{estimator.title}{what}" for estimator in run.estimators.values() for what in labels]
 

@@ -317,7 +317,7 @@ def _drawn_summary(run: RenderRun) -> Figure:
 
 
 def _notes(run: RenderRun) -> list[str]:
-    """Return the lines below the table: what sigma includes, and the meaning of the signs in the table."""
+    """Return the lines below the summary's table: what sigma includes, and what the signs in the table mean."""
     limit = f" {sentence(limited(run))}" if limited(run) else ""
     texts = f"{assumed(run.reading)}.", f"± is one σ; ● within {FAR:g} σ of the truth, ▲ beyond.{limit}"
     return [line for text in texts for line in wrap(text, LONGEST_NOTE)]
@@ -332,7 +332,7 @@ def _scale_bar(axes: Axes, run: RenderRun, column: float, row: float, half: floa
 
 
 def _table(figure: Figure, table: Table, top: float, run: RenderRun, notes: Sequence[str]) -> None:
-    """Draw recovered and true changes as text on a grid of lines, with notes below."""
+    """Draw the table of recovered and true changes into the summary picture, with notes below."""
     axes = figure.add_axes((0.0, 0.0, 1.0, top), xlim=(0.0, 1.0))
     axes.set_axis_off()
     count = 1 + len(table.bands) + len(table.rows)

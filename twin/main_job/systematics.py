@@ -135,7 +135,7 @@ def _shift_at(run: RenderRun, body: str, motion: Motion, pivot: str) -> np.ndarr
 
 
 def _uncovered(run: RenderRun, camera: str, table: CameraCrosstalk) -> tuple[str, ...]:
-    """Return the bodies that moved and affect this camera, but are not in the crosstalk table."""
+    """Return the bodies that moved and affect this camera, but whose motions are not in the crosstalk table."""
     camera_body = f"{BASE}/{camera}"
     bodies = {motion.body for motion in table.motions}
     uncovered = []
@@ -247,7 +247,7 @@ def _sigmas(rows: np.ndarray, prior: Disturbances | None, noise: np.ndarray, gai
 
 
 _NOISE_ALONE = "There is no prior on disturbances: σ contains the noise of the images only"
-"""Sentence, without a full stop, for runs without a prior."""
+"""Sentence, without a full stop, which says for runs without a prior that sigma contains only the noise."""
 NOISE = "the noise of the images"
 """Name, among the contributions to the variance, of the noise of the images, which more frames reduce."""
 

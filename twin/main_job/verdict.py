@@ -49,7 +49,10 @@ _DIMMED = 0.5
 
 @dataclass(frozen=True)
 class Judgement:
-    """Verdict of a run in at most two sentences, the text that follows, and all warnings, wrong estimates last."""
+    """Verdict of a run in at most two sentences, the text that follows, and all warnings.
+
+    Warnings about wrong estimates come last.
+    """
 
     verdict: str
     more: tuple[str, ...]
@@ -327,7 +330,7 @@ NAMED = 4
 
 
 def _largest(parts: Mapping[str, float]) -> str:
-    """Return the motions with the largest contributions, as text."""
+    """Return the motions with the largest contributions to an error, as text."""
     return joined(sorted(parts, key=lambda text: -abs(parts[text]))[:NAMED])
 
 
