@@ -45,7 +45,7 @@ STOPPED_TEXT = (
     "the computing process ({pid}) was stopped by a signal; `kill -CONT {pid}` resumes it, otherwise it is "
     "restarted after {seconds:.0f} s; the knobs are kept"
 )
-"""Messages to the pages about the computing process."""
+"""Message to the pages that the computing process was stopped by a signal."""
 
 
 class Disconnected(Exception):
@@ -128,7 +128,7 @@ class Client:
 
     @property
     def busy(self) -> bool:
-        """True if the client has an open request."""
+        """True if the page has a request that is not served yet."""
         return bool(self.state or self.view or self.factors or self.saves or self.reveal)
 
     def next_request(self) -> _Request:
@@ -148,7 +148,7 @@ class Client:
             setattr(self, request.kind, request.asked)
 
     def receive(self, text: str | bytes) -> None:
-        """Handle a message of the page.
+        """Handle a message that the page sent.
 
         Raises
         ------
@@ -422,7 +422,7 @@ class LiveApi:
             one.queue_json({"type": "hello", **self.computer.opened.greeting})
 
     async def _answer_request(self, client: Client, request: _Request) -> None:
-        """Compute the answer to a request, and queue it."""
+        """Have the computing process answer a request of a page, and queue the answer."""
         asked = request.asked
         match request.kind:
             case "factors":

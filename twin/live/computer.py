@@ -326,7 +326,7 @@ class Computer:
 
     @property
     def pid(self) -> int | None:
-        """Process id; None before the start."""
+        """Process id of the computing process; None before its start."""
         return None if self._process is None else self._process.pid
 
     @property
@@ -350,7 +350,7 @@ class Computer:
             self.kill()
 
     def stop(self) -> None:
-        """End the process."""
+        """End the computing process."""
         if self._pipe is not None:
             self._pipe.close()
         if self._process is not None:

@@ -89,7 +89,7 @@ class LiveBench:
 
     @cached_property
     def clearances(self) -> Clearances:
-        """Calculator of the distances between bodies that may collide."""
+        """Object that computes the distances between bodies that may collide."""
         return Clearances.of(self.twin.experiment.instrument)
 
     @cached_property
@@ -379,7 +379,7 @@ class LiveBench:
         return np.rint(np.clip(expected, 0, experiment.detector.max_dn)).astype(np.uint16)
 
     def _run(self, asked: AskedState, hidden: State) -> tuple[RenderRun, np.ndarray, PlacedBodies]:
-        """Compute a state, and return its run, its images and the placed bodies."""
+        """Compute a state as in the main job, and return its results, its images and the placed bodies."""
         experiment = self.twin.experiment
         # the knobs are a guess of the hidden motions, and are not added to them
         state = hidden or self.states(asked)

@@ -167,7 +167,7 @@ _MESSAGE: TypeAdapter[Message] = TypeAdapter(Annotated[Message, Field(discrimina
 
 
 class BadMessage(ValueError):
-    """Error that a message of a page is not valid."""
+    """Error that a message from a page is not valid."""
 
 
 def read_message(text: str | bytes) -> Message:

@@ -138,7 +138,7 @@ def _of_folder(folder: Path, run: int | None) -> Source:
 
 
 def _no_config(folder: Path, manifest: Manifest | None) -> Issue:
-    """Return the error about a folder without a config.yaml."""
+    """Return the error that a run folder has no config.yaml."""
     if manifest is not None:
         return _nothing_to_show(folder, f"a run folder of {manifest.program}", folder)
     try:
