@@ -30,7 +30,7 @@ from twin.framework.journal import Journal
 from twin.framework.procedure import Advance
 
 FIRST_STEP = 0.15
-"""Size of the first change of a beam, relative to the range of each parameter."""
+"""Size of the random changes of a beam in the first round, relative to the range of each parameter."""
 _BATCHES = 4  # batches of layouts that are built until one is feasible
 KEPT = 2
 """Number of layouts whose beams are varied in the next round, for each number of beams."""
@@ -374,7 +374,7 @@ class _OneSearch:
         self.refused: Counter[str] = Counter()
 
     def run(self, beams: Sequence[Beam]) -> End:
-        """Search from these beams, supplemented by random ones to the number that the design specifies."""
+        """Search for layouts from these beams, plus as many random ones as the design's number of beams requires."""
         spec = self.setup.test.search
         first = [*dict.fromkeys(beams)]
         while len(first) < spec.beams:

@@ -26,7 +26,7 @@ from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.path_tracing.stray_light import GHOSTS, Ghost, ghosts, stray_light
 
 MOST_POINTS = 6
-"""Largest number of layouts that are drawn and written."""
+"""Largest number of Pareto-optimal layouts that are drawn and written as instruments."""
 UNITS = {"angle": ("arcsec", ARCSEC), "d_f": ("um", 1e-6), "height": ("m", 1.0)}
 """Goal -> unit in which it is reported, and the size of that unit in SI."""
 _ASIDE = "other tilts of the prisms in the instrument that it starts from, or other fields"
