@@ -121,7 +121,7 @@ class AsBuiltBench(Site):
 
     @cached_property
     def optics(self) -> CameraOptics:
-        """Nominal camera, for tracing rays."""
+        """Optics of the nominal camera, with which rays are traced."""
         return CameraOptics.within(self.experiment.instrument, self.camera, self.backend)
 
     def bench(self, merits: Mapping[str, MeritSpec]) -> ToleranceBench:

@@ -155,7 +155,7 @@ def _is_nothing(run: AsBuiltRun, name: str) -> bool:
 
 
 def _short(amount: str | float) -> str:
-    """Return the amount of a move as text with four digits."""
+    """Return the amount of an actuator move as text with four significant digits."""
     if isinstance(amount, str):
         number, _, unit = amount.partition(" ")
         return f"{plain(float(number), 4)} {unit}"

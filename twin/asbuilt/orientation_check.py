@@ -1,4 +1,8 @@
-"""Command ``camtwin asbuilt check``: orientation and sign of measured wavefronts, tested against the data."""
+"""Command ``camtwin asbuilt check``: orientation and sign of measured wavefronts, tested against the data.
+
+A wavefront map may be mirrored, rotated or inverted in sign; the check finds which of sixteen orientations agree with
+the instrument's other data.
+"""
 
 from __future__ import annotations
 

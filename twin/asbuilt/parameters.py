@@ -123,7 +123,7 @@ class Parameters:
 
     @property
     def prior(self) -> StatePrior:
-        """Prior mean and covariance of all parameters."""
+        """Prior mean and covariance of all estimated parameters."""
         count, rest = len(self.components), np.concatenate([self.gain_sigmas, self.error_sigmas])
         covariance = np.zeros((count + len(rest), count + len(rest)))
         covariance[:count, :count] = self.stated.covariance
