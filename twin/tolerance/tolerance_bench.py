@@ -293,7 +293,7 @@ class ToleranceBench:
 
     @property
     def figure_faces(self) -> dict[str, Element]:
-        """Surface of each tolerance that is a figure error, by the tolerance's name."""
+        """Name of each tolerance that is a figure error -> its surface."""
         bodies = {number.entry: next(iter(number.moves)) for number in self.numbers if number.kind == SPECTRUM}
         return {name: self.instrument.assembly.face(body) for name, body in bodies.items()}
 
@@ -657,7 +657,7 @@ class ToleranceBench:
 
     @cached_property
     def entries(self) -> dict[str, tuple[int, ...]]:
-        """Indices of the varied parameters of each tolerance, by its name."""
+        """Tolerance -> indices of its varied parameters, of which a figure error has one for each Zernike term."""
         out: dict[str, tuple[int, ...]] = {}
         for k, number in enumerate(self.numbers):
             out[number.entry] = (*out.get(number.entry, ()), k)

@@ -107,7 +107,7 @@ def tolerance_report(run: ToleranceRun) -> Report:
 
 
 def _light(run: ToleranceRun) -> str:
-    """Return the wavelengths of wavefronts and MTFs as text."""
+    """Return a text on the wavelengths at which wavefronts and MTFs are evaluated."""
     colours = 1e9 * run.bench.colours
     if len(colours) == 1:
         return f"{colours[0]:.4g} nm"
@@ -299,7 +299,7 @@ def _unless_rounding(share: float) -> float:
 
 
 def _scaled_limit(limit: str | float, share: float) -> str:
-    """Return a multiple of a limit as text in the limit's unit."""
+    """Return ``share`` times a tolerance limit as text, in the limit's unit."""
     if isinstance(limit, str):
         number, _, unit = limit.strip().partition(" ")
         return f"{float(number) * share:.3g} {unit}"

@@ -262,7 +262,7 @@ def _amounts(bench: ToleranceBench, samples: Samples, rows: np.ndarray) -> np.nd
 
 
 def _states(bench: ToleranceBench, samples: Samples, rows: np.ndarray) -> list[State]:
-    """Return the states of selected cameras with their adjustments."""
+    """Return the states of selected cameras, with their tolerances' motions and their adjustments."""
     return states_of((*bench.numbers, *bench.compensators), _amounts(bench, samples, rows))
 
 

@@ -157,7 +157,7 @@ class _Maker:
         return VariedParameter(name, name, spec.parts[1], 1.0, moves)
 
     def _node(self, spec: Varied, name: str, key: KeyPath) -> str:
-        """Return the path of a body that allows the motion; raise InputError if there is none."""
+        """Return the path of a body named in the budget if it allows the motion; else raise InputError."""
         try:
             body = find_node(name, self.instrument.nodes)
         except Problem as problem:
@@ -386,7 +386,10 @@ def states_of(numbers: Sequence[VariedParameter], amounts: np.ndarray) -> list[S
 def _motions(
     count: int, rotate: np.ndarray, shift: np.ndarray, figure: dict[int, np.ndarray], shape: dict[str, np.ndarray]
 ) -> list[Motion]:
-    """Return the motions of one body in S states from arrays with one entry per state."""
+    """Return the motions of one body in S states, from arrays with one entry per state.
+
+    The arrays hold rotations, shifts, figure terms and changes of shape.
+    """
     turns, shifts = rotate.tolist(), shift.tolist()
     figures = {j: values.tolist() for j, values in figure.items()}
     shapes = {name: values.tolist() for name, values in shape.items()}
