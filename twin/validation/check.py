@@ -162,7 +162,7 @@ class Supposed:
     said: str
 
     def range(self, holds: Callable[[float], bool], agrees: bool) -> InputRange:
-        """Return the choice without limits of a range, because it is not a number."""
+        """Return this choice as an input without limits of a range, because it is not a number."""
         return InputRange(self.name, None, "1", None, None, agrees, self.said)
 
 
@@ -354,7 +354,7 @@ class CheckResult:
     seconds: float
 
     def __post_init__(self) -> None:
-        """Raise an error if a value cannot be shown or written to JSON."""
+        """Raise an error if a value of the result is not finite or does not fit the others."""
         if self.verdict not in VERDICTS:
             raise ValueError(f"{self.id}: no verdict {self.verdict!r}; there are {', '.join(VERDICTS)}")
         for name in ("printed", "implied", "measured", "sigma", "tolerance", "power", "tells", "seconds"):
@@ -516,7 +516,7 @@ class Check(Spec):
 
     @property
     def paper(self) -> str:
-        """Number of the paper."""
+        """Number of the paper, with which the check's id begins."""
         return self.id.partition(".")[0]
 
     def evaluate(

@@ -81,7 +81,7 @@ class Context:
     artefacts: list[Artefact] = field(default_factory=list)
 
     def wants(self, *prefixes: str) -> bool:
-        """Return True if a selected id begins with one of the prefixes."""
+        """Return True if the id of a selected check begins with one of the prefixes."""
         return any(matches(identifier, prefix) for identifier in self.selected for prefix in prefixes)
 
     def count(self, full: int, fast: int) -> int:
@@ -203,7 +203,7 @@ class CheckGroup:
 
     @property
     def ids(self) -> tuple[str, ...]:
-        """Ids of the group's checks."""
+        """Main ids of the group's checks."""
         return tuple(check.id for check in self.checks)
 
 

@@ -38,7 +38,7 @@ _GROUPS = (
 """Module and name of each group of checks; a new group is added here."""
 
 GROUPS: tuple[CheckGroup, ...]
-"""All groups in the order in which they run; they are imported at the first access."""
+"""All groups of checks in the order in which they run; they are imported at the first access."""
 
 
 def __getattr__(name: str) -> Any:
@@ -52,7 +52,7 @@ def __getattr__(name: str) -> Any:
 
 
 class UnknownCheck(Exception):
-    """Error raised for a prefix that no check's id begins with; the message names the nearest one."""
+    """Error that no check's id begins with a given prefix; the message names the nearest one."""
 
 
 @dataclass(frozen=True)

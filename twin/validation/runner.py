@@ -54,7 +54,7 @@ class GroupRun:
     files: tuple[str, ...] = ()
 
     def place(self, artefact: Artefact) -> str:
-        """Return the path of an artefact in the run folder."""
+        """Return the path, in the run folder, of a figure, table or data file of the group."""
         return f"{FILES}/{self.group.prefix}/{artefact.name}.{artefact.kind}"
 
 

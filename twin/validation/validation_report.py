@@ -18,7 +18,7 @@ from twin.validation.runner import GroupRun, Validation
 
 PROGRAM = "twin.validate"
 SUMMARY = "summary"
-"""Folder of the summary in the run folder."""
+"""Name of the folder in the run folder that contains the summary page and its figures."""
 PAGE = "README.md"
 """Name of the summary page; code hosts show a README.md when its folder is opened."""
 

@@ -279,7 +279,7 @@ def twisted_passes(context: Context) -> tuple[Passes, Passes]:
 
 @one_blas_thread()
 def run(context: Context) -> Iterator[CheckResult]:
-    """Yield the results of all checks of the equations."""
+    """Yield the results of all checks of the equations of paper 000."""
     context.progress(0.0, "measure ground points")
     planes = Planes(context, make_passes(context))
     checks: Mapping[str, Callable[[Planes], CheckResult]] = {

@@ -130,7 +130,7 @@ def _at(measured: Measurement, position: Array) -> Measurement:
 
 @one_blas_thread()
 def run_table_1(context: Context) -> Iterator[CheckResult]:
-    """Yield the results of all checks of Table 1."""
+    """Yield the results of all checks of Table 1 of paper 000."""
     context.progress(0.1, "measure ground points for both methods")
     data = make_data(context)
     same, independent = differences(data.same, data.same), differences(data.light, data.own)
@@ -461,7 +461,7 @@ def answers(measured: Measurement, flight: AnglePass, steps: int = 10, method: M
 
 @one_blas_thread()
 def run_figures(context: Context) -> Iterator[CheckResult]:
-    """Yield the results of all checks of the statements about Figs. 3 to 5."""
+    """Yield the results of all checks of the statements about Figs. 3 to 5 of paper 000."""
     context.progress(0.0, "move station and points")
     passes = make_passes(context)
     all_answers = [answers(m, passes.flight) for m in passes.measured]

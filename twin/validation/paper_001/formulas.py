@@ -39,7 +39,7 @@ from twin.validation.group import Context, drawing, group_of
 
 Value = TypeVar("Value", float, np.ndarray)
 Measured = tuple[float, float]
-"""A measured value and its standard deviation, in the same unit."""
+"""Pair of a measured value and its standard deviation, in the same unit."""
 MIRROR_TURNS = tuple(math.radians(angle) for angle in (1 / 3600, 1 / 60, 0.5, 2.0, 10.0))
 INSTRUMENT = "monitor_pair"
 """Name of the instrument with the camera that Table 5 implies: f = 7.7 m, area CCDs 0.73 m apart."""
@@ -166,7 +166,7 @@ class MonitorImages:
         self.covariance = np.concatenate([p.shift_covariance for p in pieces])
 
     def geometry(self, camera: str) -> MonitorGeometry:
-        """Return the geometry of a camera that the formulas use."""
+        """Return a camera's principal distance, field angles and distances, as the formulas of paper 001 use them."""
         return self.experiment.calibration.cameras[camera].geometry
 
     @property

@@ -81,7 +81,7 @@ class Bench:
         self.frames = experiment.instrument.spec.autocollimator.frames
 
     def geometry(self, camera: str) -> MonitorGeometry:
-        """Return the geometry of a camera that the formulas use."""
+        """Return a camera's principal distance, field angles and distances, as the formulas of paper 001 use them."""
         if camera not in self._geometry:
             self._geometry[camera] = self.experiment.geometry(camera)
         return self._geometry[camera]
@@ -128,10 +128,10 @@ class Bench:
         return np.moveaxis(known.centre, 0, 1)
 
     def readings(self, start: np.ndarray, end: np.ndarray) -> dict[str, dict[str, np.ndarray]]:
-        """Return camera -> set of formulas -> estimated changes in S states, (S, 4).
+        """Return camera -> set of formulas -> estimated changes in S states, (S, 4), in arcsec and um.
 
-        The estimates are computed from spot positions before and after the change, (S, C, 2) for C channels. The units
-        are those of ``monitoring.PARAMETERS``.
+        The estimates of the four parameters are computed from spot positions before and after the change, (S, C, 2) for
+        C channels.
         """
         start = np.broadcast_to(start, end.shape)
         nothing = np.zeros((4, 4))
@@ -151,7 +151,7 @@ class Bench:
         return out
 
     def truth(self, states: Sequence[State]) -> dict[str, np.ndarray]:
-        """Return camera -> (S, 4) traced changes of S states in the units of ``monitoring.PARAMETERS``."""
+        """Return camera -> traced changes of its four parameters in S states, (S, 4), in arcsec and um."""
         changes = self.experiment.sight.truth(states)
         return {
             name: np.stack([c.d_alpha, c.d_beta, c.d_gamma, c.d_f], axis=-1) * PER_SI
@@ -211,7 +211,7 @@ class Curves:
         return math.exp(low - start * (high - low) / (end - start))
 
     def merged(self, size: np.ndarray, value: Mapping[str, np.ndarray]) -> Curves:
-        """Return the curves with further points, sorted by size."""
+        """Return the error curves with further points added, sorted by the size of the change."""
         sizes = np.concatenate([self.size, size])
         order = np.argsort(sizes)
         return Curves(sizes[order], {n: np.concatenate([v, value[n]])[order] for n, v in self.value.items()})
@@ -346,7 +346,10 @@ class Range(Domain):
 
 
 def criterion(form: str, kind: str) -> str:
-    """Return the name of the curve of a set of formulas' error divided by the allowed one: 1 %, 0.1 or "claimed"."""
+    """Return the name of the error curve of a set of formulas for one kind of limit: "1 %", "0.1" or "claimed".
+
+    The error is divided by that limit.
+    """
     return f"{form} {kind}"
 
 
@@ -493,9 +496,9 @@ class Corners(Domain):
 
 
 def key(form: str, parameter: str, fine: bool = False) -> str:
-    """Return the name of the curve of an error divided by what Table 5 claims.
+    """Return the name of the error curve of a set of formulas and a parameter.
 
-    If ``fine``, the error is divided by 0.1 arcsec or 0.04 mm instead.
+    The error is divided by what Table 5 claims or, if ``fine``, by 0.1 arcsec or 0.04 mm.
     """
     return f"{form} {parameter}{' fine' if fine else ''}"
 

@@ -391,7 +391,7 @@ class FoundMarks:
 
 @dataclass(frozen=True, eq=False)
 class _Spots:
-    """Apparent reflectance of bright targets on black ground, as a function of position on the ground."""
+    """Function of the position on the ground that gives the reflectance of bright targets on black ground."""
 
     east: np.ndarray
     north: np.ndarray
@@ -585,7 +585,7 @@ def _field(campaign: Campaign, field_pass: FieldPass) -> FromImages:
 
 
 def summary(from_images: FromImages, names: tuple[str, ...]) -> str:
-    """Return errors and sigmas of some unknowns of a field as text."""
+    """Return a text with the errors and sigmas of some unknowns of a field's calibration."""
     sigma = dict(zip(from_images.error, np.sqrt(np.diag(from_images.covariance)).tolist(), strict=True))
     parts = []
     for n in names:

@@ -599,4 +599,4 @@ def _solutions(context: Context, places: Callable[[Array], Array], edge: float) 
 GROUP = group_of("004.distortion", run)
 EQUATIONS = group_of("004.equations", run_equations)
 FIGURES = group_of("004.figures")
-"""Group of the figures that are printed without numbers, so that nothing can be compared."""
+"""Group of checks about the paper's figures without numbers, for which nothing can be compared."""

@@ -178,7 +178,10 @@ def measured_defocus(state: FocusState) -> tuple[Array, Array]:
 
 
 def run(context: Context) -> Iterator[CheckResult]:
-    """Yield the results of the checks, from random misalignments; from one only if nothing but the MTF is selected."""
+    """Yield the results of the checks, from alignments with random misalignments.
+
+    If only checks of the MTF are selected, a single alignment is simulated.
+    """
     context.progress(0.0, "build the bench")
     with one_blas_thread():
         bench = FocusBench(FocusSetup.read(TEST), context.backend)
@@ -209,7 +212,7 @@ def measured_alignments(context: Context, bench: FocusBench) -> list[SimulatedFo
 
 
 def _edges(alignment: SimulatedFocus, band: str) -> list[EdgeMtf]:
-    """Measure edges along the track at the fields of a band after the alignment."""
+    """Measure the MTF along the track from edges at the fields of a band, after the alignment."""
     noise, focus = alignment.bench.ccds[band].noise, alignment.states[-1].focus
     stacks = [f.frames[TRACK] for f, site in zip(focus, alignment.bench.sites, strict=True) if site.band == band]
     return [
