@@ -58,7 +58,7 @@ The neural network, which takes minutes to train, is compared in the turntable t
 MAX_FIELD_ANGLE = np.radians(40.0)
 """Largest plausible angle from the middle of the line, radians.
 
-The tangents in the distortion model become too large toward 45 deg.
+The distortion model uses tangents of the angle only up to 45 deg.
 """
 _EXACT = 1e-9
 """Nominal noise given to the true positions, metres, because a fit needs a weight; the estimates do not depend on it.
