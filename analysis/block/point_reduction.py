@@ -51,30 +51,31 @@ class Packets(Protocol):
 
     @property
     def point(self) -> Indices:
-        """Index of the ground point that each of the n packets observes, (n,)."""
+        """Index of the ground point that each of the n measurements (packets) observes, (n,)."""
 
     @property
     def columns(self) -> Indices:
-        """Indices (n, w), among all unknowns, of the w unknowns on which each of the n packets depends."""
+        """Indices (n, w), among all unknowns, of the w unknowns on which each of the n measurements (packets) depends."""
 
     def linearised(self, which: Indices, x: Array, ground: Array) -> tuple[Array, Array, Array]:
-        """Return whitened misclosures of packets, and their derivatives with respect to unknowns and points.
+        """Return whitened misclosures of k selected measurements, and their derivatives with respect to unknowns and
+        points.
 
-        For k packets of d equations the misclosures are (k, d), the derivatives (k, d, w) with respect to the w
-        unknowns of `columns` and (k, d, 3) with respect to the ground points.
+        Each measurement gives one packet of d equations. The misclosures are (k, d), the derivatives (k, d, w) with
+        respect to the w unknowns of `columns` and (k, d, 3) with respect to the ground points.
 
         Parameters
         ----------
         which : (k,) ndarray of int
-            Indices of packets.
+            Indices of the measurements.
         x : (P,) ndarray
             Values of all P unknowns.
         ground : (k, 3) ndarray
-            Points of these packets, ITRS, in metres.
+            Ground points of these measurements, ITRS, in metres.
         """
 
     def taken(self, which: Indices, point: Indices) -> Packets:
-        """Return selected packets (indices `which`) as a new set, with the given indices of their ground points."""
+        """Return selected measurements (indices `which`) as a new set, with the given indices of their ground points."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -843,22 +844,23 @@ class Pool(Protocol):
 class SharedReduction:
     """Observation equations of a block distributed over processes by ground points.
 
-    The methods are those of `Reduction`.
+    The methods are those of `Reduction`. A share is the part of the points that one process holds, with their
+    measurements.
 
     Attributes
     ----------
     whole : Reduction
-        Packets and priors of the block.
+        Packets (each the equations of one measurement of one ground point) and priors of the block.
     pool : Pool
         Processes that hold the shares.
     points : tuple of (m_k,) ndarray of int
-        Indices of the points of each share (the part of one process).
+        Indices of the m_k points of each share k.
     packets : tuple of tuple of ndarray of int
         Indices of the measurements of each share, by set of observations.
     held : tuple
-        Handle of each share.
+        Handle of each share's data in its process.
     columns : tuple of (w_k,) ndarray of int
-        Indices of the unknowns on which the measurements of each share depend.
+        Indices of the w_k unknowns on which the measurements of each share k depend.
     """
 
     whole: Reduction

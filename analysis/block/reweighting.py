@@ -106,11 +106,11 @@ def standardised_packets(residual: Array, cofactors: Array, weight: Array, unit:
     residual : (n, d) ndarray
         Whitened residuals.
     cofactors : (n, d, d) ndarray
-        Covariance of the adjusted packets, whitened.
+        Covariances of the adjusted measurements, whitened by the a-priori covariances.
     weight : (n,) ndarray
         Robust weights.
     unit : float
-        Variance factor of their group.
+        Variance factor of the measurements' group.
     """
     values, axes = np.linalg.eigh(cofactors)
     along = np.einsum("nji,nj->ni", axes, residual)

@@ -1,4 +1,4 @@
-"""Simultaneous adjustment of a three-line in-orbit calibration (paper 003) and tests for omitted terms.
+"""Simultaneous in-orbit calibration of three-line cameras (paper 003, Mo et al. 2015); omitted terms are tested.
 
 The unknowns are the interior orientation of each camera and the attitude bias of each field.
 
@@ -679,7 +679,7 @@ class _Problem:
         return np.concatenate([a + r.point for a, f in zip(first, self.fields, strict=False) for r in f.rays.values()])
 
     def judged(self, state: _Iteration, solution: _Solved) -> tuple[Array, ...]:
-        """Return the standardised residuals of the M image points, (M, 2)."""
+        """Return the standardised residuals of the M image points of all fields, as a tuple of one array (M, 2)."""
         image = solution.equations.residuals.image
         return (
             reweighting.standardised_packets(image, solution.cofactors, state.weights.image, state.factor["image"]),

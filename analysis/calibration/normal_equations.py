@@ -50,8 +50,8 @@ class SharedNoise:
     parts : mapping of str to tuple of Part
         Error models of the attitude and station readings of each field. Station corrections are along the axes of the
         ITRS.
-    met : mapping of (str, str) to Corrections
-        Corrections of the rays of each (field, line); lines without times have none.
+    corrections : mapping of (str, str) to Corrections
+        Corrections of the rays of each (field, line), as functions of the unknowns; lines without times have none.
     spans : tuple of (int, int)
         Index of the first unknown of each field, and one beyond its last.
     groups : mapping of str to ndarray of int
@@ -61,7 +61,7 @@ class SharedNoise:
     """
 
     parts: Mapping[str, tuple[Part, ...]]
-    met: Mapping[tuple[str, str], Corrections]
+    corrections: Mapping[tuple[str, str], Corrections]
     spans: tuple[tuple[int, int], ...]
     groups: Mapping[str, NDArray[np.intp]]
     precision: sparse.csr_matrix
@@ -70,7 +70,7 @@ class SharedNoise:
     def of(cls, fields: Sequence[CalibrationField], noise: Noise) -> SharedNoise:
         """Return the shared noise of all rays with times; it is empty without times or without intervals."""
         parts: dict[str, tuple[Part, ...]] = {}
-        met: dict[tuple[str, str], Corrections] = {}
+        corrections: dict[tuple[str, str], Corrections] = {}
         spans, blocks, column = [], [], 0
         groups: dict[str, list[NDArray[np.intp]]] = {}
         for site in fields:
@@ -85,10 +85,12 @@ class SharedNoise:
                 groups.setdefault(term.group, []).append(np.arange(column, column + support.size))
                 column += support.size
             parts[site.name] = tuple(field_parts)
-            met |= {(site.name, line): Corrections(tuple(field_parts), np.eye(3), time) for line, time in times.items()}
+            corrections |= {
+                (site.name, line): Corrections(tuple(field_parts), np.eye(3), time) for line, time in times.items()
+            }
             spans.append((begin, column))
         precision = sparse.csr_matrix(sparse.block_diag(blocks)) if blocks else sparse.csr_matrix((0, 0))
-        return cls(parts, met, tuple(spans), {k: np.concatenate(v) for k, v in groups.items()}, precision)
+        return cls(parts, corrections, tuple(spans), {k: np.concatenate(v) for k, v in groups.items()}, precision)
 
     @property
     def size(self) -> int:
@@ -109,7 +111,7 @@ class SharedNoise:
         shared : (K,) ndarray
             Values of the K unknowns of the shared noise.
         """
-        return _moved(rays, self.met.get((name, line)), shared)
+        return _moved(rays, self.corrections.get((name, line)), shared)
 
     def corrected_at(self, name: str, rays: Rays, shared: Array) -> Rays:
         """Return any rays of a field with attitude and station corrected by the shared noise.
@@ -140,10 +142,10 @@ class SharedNoise:
         by : Partials
             Derivatives of the misclosures.
         """
-        count, met = len(white), self.met.get((name, line))
-        if met is None:
+        count, corrections = len(white), self.corrections.get((name, line))
+        if corrections is None:
             return sparse.csr_matrix((2 * count, self.size))
-        slopes, columns = met.slopes(white @ by.attitude, -white @ by.ground), met.columns
+        slopes, columns = corrections.slopes(white @ by.attitude, -white @ by.ground), corrections.columns
         indices = np.repeat(columns[:, None], 2, axis=1).ravel()
         starts = columns.shape[1] * np.arange(2 * count + 1)
         return sparse.csr_matrix((slopes.ravel(), indices, starts), shape=(2 * count, self.size))
@@ -154,13 +156,13 @@ def _law(term: NoiseTerm, interval: float) -> Law:
     return Law(term.group, "walk" if term.walks else "white", (term.sigma,) * 3, interval)
 
 
-def _moved(rays: Rays, met: Corrections | None, shared: Array) -> Rays:
+def _moved(rays: Rays, corrections: Corrections | None, shared: Array) -> Rays:
     """Return rays with attitude and station corrected by the shared noise; unchanged without corrections."""
-    if met is None or not met.parts:
+    if corrections is None or not corrections.parts:
         return rays
-    rotation, shift = met.at(shared)
+    rotation, shift = corrections.at(shared)
     rotations = Rotation.from_rotvec(rotation).as_matrix()
-    return replace(rays, attitude=rays.attitude @ rotations, station=rays.station + shift @ met.axes.T)
+    return replace(rays, attitude=rays.attitude @ rotations, station=rays.station + shift @ corrections.axes.T)
 
 
 _CHUNK = 512
@@ -324,7 +326,11 @@ class Equations:
 
     @cached_property
     def shared_inverse(self) -> tuple[Array, ...]:
-        """Covariance (s, s) of the s shared-noise unknowns of each field, for known other unknowns."""
+        """Covariance (s, s), for each field, of its s unknowns of shared noise, given all other unknowns.
+
+        These unknowns model errors of attitude and station readings, which are common to many observations of the
+        field.
+        """
         return tuple(_inverse(self.shared_normal[a:b, a:b].toarray()) for a, b in self.shared.spans)
 
     def image_cofactors(self, covariance: Array) -> Array:

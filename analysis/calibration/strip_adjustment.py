@@ -1,9 +1,9 @@
 """Strip adjustment of attitude and station within one pass without ground control; stepwise calibration.
 
-**Strip adjustment** (paper 003's check flow). Points that several lines see (tie points, including the check points)
-connect the attitudes of different exposures: rays that do not intersect reveal attitude errors. The unknowns are the
-errors of the readings, with their a-priori sigmas as priors, and the points; cameras and attitude bias come from a
-calibration.
+**Strip adjustment** (check flow of paper 003, Mo et al. 2015). Points that several lines see (tie points,
+including the check points) connect the attitudes of different exposures: rays that do not intersect reveal attitude
+errors. The unknowns are the errors of the readings, with their a-priori sigmas as priors, and the points; cameras and
+attitude bias come from a calibration.
 
 Tie points do not determine the datum. With lines that look forward and backward by a, which see a point T seconds
 before and after the nadir line, all rays still intersect when

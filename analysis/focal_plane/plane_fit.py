@@ -10,11 +10,11 @@ A small rotation (wx, wy, wz) lifts a point by wx Y' - wy X'; the correction is 
 the shift (0, 0, piston), and wz = -(measured level of the line). `FocalPlaneFit.correction` is the finite rotation for
 which this holds exactly.
 
-**Shims** under a focal-plane assembly (paper 004, section 2). The assembly rests on pads at its mounting holes. The
-pads' normal n points from the camera's structure into the assembly, so a thicker shim moves the assembly along +n.
-Shims realise the part of a rigid motion that they can: the lift along n and the tilts about axes in the mounting
-surface. The rotation about n and the slide in the surface are set by hand, within the clearance of the screws in their
-holes.
+**Shims** under a focal-plane assembly (paper 004, Li et al. 2020, section 2). The assembly rests on pads at its
+mounting holes. The pads' normal n points from the camera's structure into the assembly, so a thicker shim moves the
+assembly along +n. Shims realise the part of a rigid motion that they can: the lift along n and the tilts about axes in
+the mounting surface. The rotation about n and the slide in the surface are set by hand, within the clearance of the
+screws in their holes.
 
 In an off-axis camera n is inclined against the focal plane's normal Z' by an angle i, and the two parts mix. With the
 inclination about X', n = (0, sin i, cos i), and a required tilt w about Y', a rotation of w sin i about n is needed.

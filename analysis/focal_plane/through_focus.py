@@ -155,7 +155,10 @@ class _Lobe:
         return np.asarray(present.sum(axis=1))
 
     def _values(self) -> tuple[Array, Array]:
-        """Return the values of B fitted curves at Z positions, and derivatives with respect to p, x0, a, (B, Z, 3)."""
+        """Return the values of B fitted curves at their Z focus positions, (B, Z), and their derivatives, (B, Z, 3).
+
+        The derivatives are with respect to the peak value p, the position x0 of the vertex and the width parameter a.
+        """
         distance = self.x - self.x0[:, None]
         p, a = self.p[:, None], self.a[:, None]
         u = a * distance**2

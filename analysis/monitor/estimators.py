@@ -233,7 +233,10 @@ def _pair(camera: CameraCalibration) -> tuple[int, int]:
 
 @dataclass(frozen=True)
 class LeastSquares(PerCameraEstimator):
-    """Weighted least-squares (Gauss-Markov) estimate of the four motions of each camera that paper 001 considers.
+    """Weighted least-squares (Gauss-Markov) estimate of four motions of each camera.
+
+    They are those of paper 001 (Wang et al. 2018): shifts of the line CCD along its X and Y axes, its rotation about Z,
+    and a relative change of the camera's scale.
 
     The computation is in `analysis.monitor.model_fit`.
     """

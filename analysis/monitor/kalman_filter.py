@@ -149,7 +149,7 @@ class SeriesFilter:
         True if there are readings of parameters among those of spots.
     steps : tuple of Step
         Steps known in addition to the prior.
-    unfound : bool
+    include_undetected : bool
         True to include jumps too small to be detected, where their rate is known.
     before_s : float
         Time before the first reading of spots in which bodies may have jumped, s; 0 if there is none.
@@ -167,7 +167,7 @@ class SeriesFilter:
     stepping: tuple[int, ...] = ()
     parameters_read: bool = False
     steps: tuple[Step, ...] = ()
-    unfound: bool = True
+    include_undetected: bool = True
     before_s: float = 0.0
     leaving_out: bool = True
     candidates: tuple[Candidate, ...] = field(init=False, default=())
@@ -232,7 +232,7 @@ class SeriesFilter:
 
         Dimensions: m motions that jump at a known rate.
         """
-        indices = [k for k, law in enumerate(self.stated.laws) if law.every_s is not None and self.unfound]
+        indices = [k for k, law in enumerate(self.stated.laws) if law.every_s is not None and self.include_undetected]
         return np.array(indices, int)
 
     @cached_property
@@ -624,7 +624,7 @@ class SeriesFilter:
     @cached_property
     def jumping_bodies(self) -> tuple[JumpingBody, ...]:
         """Bodies whose jumps have a known rate (mean time between two jumps)."""
-        return jumping_bodies(self.stated, self.candidates) if self.unfound else ()
+        return jumping_bodies(self.stated, self.candidates) if self.include_undetected else ()
 
     def mixture(self, current: FilterState) -> FilterState:
         """Return the filter's state including jumps not yet detected, each weighted by its probability.
@@ -775,7 +775,7 @@ def with_indicated_jumps(
             for level, part, more in zip(levels, score, information, strict=True):
                 part[there], more[there] = scores[:count] @ level, level.T @ (known_of[:count] @ level)
 
-    plain = replace(knowing, unfound=False)
+    plain = replace(knowing, include_undetected=False)
     none = np.zeros(0)
     smoothed(
         plain, replace(start, undetected=none), observed, none, [none] * len(observed), knowing.parameters_of, note
@@ -1025,12 +1025,25 @@ def _step_informations(how: SeriesFilter, interval: float, noise: Array) -> Arra
 
 
 def _test(spots: Array, information: Array, chance: float) -> tuple[Array, float]:
-    """Return the test for jumps of one candidate: the matrix that whitens its score, (r, q), and the limit.
+    """Return the test for jumps of one candidate: the matrix that whitens its score, and the limit of the chi-square.
 
-    A candidate is a set of r motions. The matrix turns a score into independent numbers of unit variance, whose sum of
-    squares is compared with the limit.
+    A candidate is a set of motions of one body that may jump. Its score is the sum of the prediction errors after the
+    jump, weighted by their inverse covariance.
 
-    Dimensions: r motions of the body that may jump, q values that readings can contain (outputs).
+    Parameters
+    ----------
+    spots : (q, m) ndarray
+        Derivatives of the q components of the readings with respect to the m motions of the candidate.
+    information : (q, q) ndarray
+        Information (inverse covariance) of the readings on a step of these components.
+    chance : float
+        False-alarm probability of the test.
+
+    Returns
+    -------
+    tuple of (r, q) ndarray and float
+        Matrix that turns the q weighted prediction errors into r <= m independent numbers of unit variance, and the
+        limit of their sum of squares, above which a jump is detected.
     """
     values, vectors = np.linalg.eigh(spots.T @ information @ spots)
     seen = values > UNOBSERVABLE * values.max()

@@ -451,7 +451,7 @@ class Elasticity:
         Relative change of a quantity's sigma divided by the relative change of the number.
     doubled : (Q,) ndarray
         Sigma of the error if the real number is twice as large but the estimator still assumes the original prior.
-    told : (Q,) ndarray
+    doubled_in_prior : (Q,) ndarray
         Sigma of the error if the number is twice as large in reality and in the estimator's prior.
     """
 
@@ -461,7 +461,7 @@ class Elasticity:
     bodies: tuple[str, ...]
     elasticity: Array
     doubled: Array
-    told: Array
+    doubled_in_prior: Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -546,7 +546,7 @@ def elasticities(rows: Array, stated: Disturbances, noise: Array, gain: Array) -
                 bodies=tuple(dict.fromkeys(stated.bodies[k] for k in indices)),
                 elasticity=shares[:, indices].sum(axis=1) / safe,
                 doubled=np.sqrt(np.maximum(doubled, 0.0)),
-                told=posterior_sigma(rows, stated.scaled(factors), noise),
+                doubled_in_prior=posterior_sigma(rows, stated.scaled(factors), noise),
             )
         )
     return tuple(sorted(out, key=lambda elasticity: -float(elasticity.elasticity[0])))

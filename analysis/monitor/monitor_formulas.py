@@ -229,7 +229,7 @@ def coefficients(name: str, geometry: MonitorGeometry) -> Array:
 def paper_single(
     before: ArrayLike, after: ArrayLike, covariance: ArrayLike, geometry: MonitorGeometry
 ) -> CameraParameters:
-    """Return the changes by eq. (2), (3), (5), (7) of paper 001 as printed, with the arctangent.
+    """Return the changes by eq. (2), (3), (5), (7) of paper 001 (Wang et al. 2018) as printed, with the arctangent.
 
     Parameters
     ----------
@@ -254,7 +254,7 @@ def paper_single(
 def paper_joint(
     before: ArrayLike, after: ArrayLike, covariance: ArrayLike, geometry: MonitorGeometry
 ) -> CameraParameters:
-    """Return the changes by the last column of Table 1 of paper 001, as printed.
+    """Return the changes by the last column of Table 1 of paper 001 (Wang et al. 2018), as printed.
 
     The table does not define the sign of Y_L; each row takes the sign that agrees with the single-change formula beside
     it.

@@ -25,7 +25,7 @@ from analysis.spots.spot_template import SpotTemplate
 from optics.numerics.extension_table import ExtensionTable
 
 PAIR = ("left", "right")
-"""Names of the channels at the +Y and at the -Y end of a line, which paper 001 numbers 1 and 2."""
+"""Names of the channels at the +Y and at the -Y end of a line, which paper 001 (Wang et al. 2018) numbers 1 and 2."""
 
 
 @shows()
@@ -36,7 +36,7 @@ class CameraCalibration:
     Attributes
     ----------
     geometry : MonitorGeometry
-        Geometry for the formulas of paper 001.
+        Geometry for the formulas of paper 001 (Wang et al. 2018).
     look_rad : float
         Nominal look angle about the base's Y, rad.
     spot_jacobian : (2 n, P) ndarray

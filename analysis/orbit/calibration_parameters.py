@@ -555,8 +555,8 @@ def index(names: Sequence[str], name: str) -> int:
 
 WORST = 1e-4
 """Image motion of a start value of unknown accuracy, in metres: 15 px of 6.5 um, 32 arcsec, 75 m on the ground, as
-without any calibration (paper 003: 100 m class). With a camera mounted askew by one arc minute the pitch becomes
-observable, but only to 400 px with sixty points of 0.3 px.
+without any calibration (paper 003, Mo et al. 2015: 100 m class). With a camera mounted askew by one arc minute the
+pitch becomes observable, but only to 400 px with sixty points of 0.3 px.
 """
 LOST = 3e3
 """Largest ratio of a combination's standard deviation, as image motion, to the noise of a single image point. Above it

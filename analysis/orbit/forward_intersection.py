@@ -24,12 +24,12 @@ unit variance make z a stationary second-order autoregression with the double ro
 covariance is 3 (-rho)^n (n + (1 + rho^2) / (1 - rho^2)), and the precision matrix of a segment of it has five
 diagonals.
 
-**Third differences** assess an orbit or attitude series (paper 003, Table 2). A third difference x[k+3] - 3 x[k+2] + 3
-x[k+1] - x[k] removes a smooth motion, up to its third derivative times dt^3, and leaves noise: white noise with
-standard deviation s gives it the RMS s sqrt(1 + 9 + 9 + 1) = s sqrt(20), and neighbours correlate by -15/20. It is
-blind to a bias, a drift or noise that is slower than a few samples, and data that were smoothed before look better than
-they are. The smooth part is not always small: along a circular orbit at 500 km the third derivative is 8.4e-3 m/s^3, so
-8 mm at 1 s but 8 m at 10 s.
+**Third differences** assess an orbit or attitude series (paper 003, Mo et al. 2015, Table 2). A third difference
+x[k+3] - 3 x[k+2] + 3 x[k+1] - x[k] removes a smooth motion, up to its third derivative times dt^3, and leaves noise:
+white noise with standard deviation s gives it the RMS s sqrt(1 + 9 + 9 + 1) = s sqrt(20), and neighbours correlate by
+-15/20. It is blind to a bias, a drift or noise that is slower than a few samples, and data that were smoothed before
+look better than they are. The smooth part is not always small: along a circular orbit at 500 km the third derivative is
+8.4e-3 m/s^3, so 8 mm at 1 s but 8 m at 10 s.
 
 **CE90 and LE90** are the horizontal radius and the height interval that hold 90 % of the errors, as map standards
 define them: of one point by its covariance, of a set of points with different covariances (for a point drawn from the
@@ -155,7 +155,7 @@ class ThirdDifference:
     Attributes
     ----------
     rms : (k,) ndarray
-        RMS of the third differences of each quantity, in its unit, as in Table 2 of paper 003.
+        RMS of the third differences of each quantity, in its unit, as in Table 2 of paper 003 (Mo et al. 2015).
     white_sigma : (k,) ndarray
         rms / sqrt(20), the standard deviation of one sample if the noise is white.
     """

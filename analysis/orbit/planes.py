@@ -1,4 +1,6 @@
-"""Planes in which CCD lines photograph at one moment (paper 000, eqs. 1-5), and their angles (eqs. 6-7).
+"""Planes in which CCD lines photograph at one moment, and their angles.
+
+The equations are (1) to (5), and for the angles (6) and (7), of paper 000 (Liu and Huang 2014).
 
 **Plane.** The station O and the n >= 3 ground points of the strip that one line sees lie in one plane except for their
 errors. Three fits have the same interface:
@@ -161,7 +163,8 @@ class PlaneFit:
     Attributes
     ----------
     method : {'printed', 'corrected', 'tls'}
-        Method of the fit: equation 5 of paper 000 as printed or with the corrected sign, or total least squares.
+        Method of the fit: equation 5 of paper 000 (Liu and Huang 2014) as printed or with the corrected sign, or total
+        least squares.
     station : Station
         Station that the plane contains.
     strip : Strip
@@ -284,7 +287,10 @@ def fit_plane(station: Station, strip: Strip, method: Method = "tls") -> PlaneFi
 
 
 def _explicit(station: Station, strip: Strip, arm: Array, method: Method) -> PlaneFit:
-    """Fit the plane z = a0 x + a1 y + a2 by eqs. 1 and 5 of paper 000, with the printed or the right sign."""
+    """Fit the plane z = a0 x + a1 y + a2 by eqs. 1 and 5 of paper 000 (Liu and Huang 2014).
+
+    ``method`` selects the sign of eq. 5: "printed", as in the paper, which is a misprint, or "corrected".
+    """
     flat = arm[:, :2]
     matrix = flat.T @ flat
     condition = float(np.linalg.cond(matrix))

@@ -1,9 +1,9 @@
 """Space resection of a camera of two or more lines: attitude and angles from one moment's ground points together.
 
-This is the photogrammetric method that paper 000 compares its planes with. Each point p has a position on its CCD line,
-hence a known direction in the line's frame, (tx, ty, 1) up to length: X flight direction, Y along the line, Z toward
-the scene. Line k is mounted in the body at the look angle look_k, a rotation about the body's Y, positive forward; that
-of one line, the reference, is zero. Its projection centre is at c_k in the line's frame:
+This is the photogrammetric method that paper 000 (Liu and Huang 2014) compares its planes with. Each point p has a
+position on its CCD line, hence a known direction in the line's frame, (tx, ty, 1) up to length: X flight direction, Y
+along the line, Z toward the scene. Line k is mounted in the body at the look angle look_k, a rotation about the body's
+Y, positive forward; that of one line, the reference, is zero. Its projection centre is at c_k in the line's frame:
 
     (tx, ty, 1) ~ Ry(look_k)^T R^T (p - O) - c_k.
 

@@ -1,4 +1,4 @@
-"""Rigorous model of a three-line camera in orbit (paper 003): collinearity at the exposure time.
+"""Rigorous model of a three-line camera in orbit (paper 003, Mo et al. 2015): collinearity at the exposure time.
 
     ground = station + offset + R_body R_bias (position + scale R_camera l),
 

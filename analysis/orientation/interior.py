@@ -79,8 +79,8 @@ TERMS = tuple(_POWER)
 _WIDEST = np.pi / 4
 """Largest plausible angle, in radians: line cameras see a few degrees, and larger values are probably in degrees."""
 _SINGULAR = 1e-9
-"""Smallest determinant of the normal equations of eq. (2) of paper 004, relative to the product of their diagonal
-elements; a determinant of 1e-9 leaves six correct digits.
+"""Smallest determinant of the normal equations of eq. (2) of paper 004 (Li et al. 2020), relative to the product of
+their diagonal elements; a determinant of 1e-9 leaves six correct digits.
 """
 
 
@@ -128,7 +128,9 @@ def readings(position: ArrayLike, angle: ArrayLike) -> tuple[Array, Array]:
 def distortion(
     position: ArrayLike, angle: ArrayLike, principal_distance: ArrayLike, principal_point: ArrayLike = 0.0
 ) -> Array:
-    """Return the distortion of each of N points, in metres: D = L - f tan W + p tan^2 W (paper 004, eq. 1).
+    """Return the distortion of each of N points, in metres: D = L - f tan W + p tan^2 W.
+
+    The equation is (1) of paper 004 (Li et al. 2020).
 
     Parameters
     ----------
@@ -154,7 +156,9 @@ def distortion(
 
 
 def principal_distance_and_point(position: ArrayLike, angle: ArrayLike) -> tuple[Array, Array]:
-    """Return the principal distance f and principal point p of smallest distortion, in metres (paper 004, eq. 2).
+    """Return the principal distance f and principal point p of smallest distortion, in metres.
+
+    The equation is (2) of paper 004 (Li et al. 2020).
 
     Parameters
     ----------
@@ -187,7 +191,7 @@ def principal_distance_and_point(position: ArrayLike, angle: ArrayLike) -> tuple
 
 
 def principal_distance(position: ArrayLike, angle: ArrayLike) -> Array:
-    """Return the balanced principal distance f (...), in metres: paper 004, eq. (3).
+    """Return the balanced principal distance f (...), in metres: paper 004 (Li et al. 2020), eq. (3).
 
     It leaves the smallest distortion with p = 0.
 
@@ -214,7 +218,9 @@ def principal_distance(position: ArrayLike, angle: ArrayLike) -> Array:
 
 
 def principal_point(position: ArrayLike, angle: ArrayLike, principal_distance: ArrayLike) -> Array:
-    """Return the principal point p (...) for a known principal distance f (...), in metres: paper 004, eq. (4).
+    """Return the principal point p (...), in metres, for a known principal distance f (...), in metres.
+
+    The equation is (4) of paper 004 (Li et al. 2020).
 
     Parameters
     ----------
@@ -372,7 +378,8 @@ def _noise_root(noise: Array) -> Array:
 _SIGNIFICANT = 3.0
 """Ratio to its sigma above which a principal point counts as different from zero: false-alarm rate 0.3 %."""
 POINT_TOLERANCE = 10e-6
-"""Largest sigma, in metres, of an observable principal point: about a pixel, the size that paper 004 expects of it."""
+"""Largest sigma, in metres, of an observable principal point: about a pixel, the size that paper 004 (Li et al. 2020)
+expects of it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -728,7 +735,8 @@ def line_orientation(fit: InteriorOrientation) -> LineOrientation:
 
 
 CALIBRATED = ("constant", "principal_distance", "principal_point")
-"""Names of the terms that are subtracted to obtain the distortion: those of eq. (2) of paper 004, with a constant."""
+"""Names of the terms that are subtracted to obtain the distortion: those of eq. (2) of paper 004 (Li et al. 2020), with
+a constant."""
 SMOOTH = (*CALIBRATED, "radial3")
 """Names of the terms of the smooth model (with radial distortion), whose residuals measure the scatter of the points.
 """
@@ -965,7 +973,7 @@ class Distortion:
     def rms_over_sets(self) -> Array:
         """RMS of each of N points' distortion over the kept sets, each set fitted separately, in metres.
 
-        The values are named after Table 2 of paper 004.
+        The values are named after Table 2 of paper 004 (Li et al. 2020).
         """
         out = np.full(self.position.shape, np.nan)
         for s, keep in enumerate(self.means.keep.T):

@@ -1,4 +1,4 @@
-"""Back-propagation network of paper 004 (section 3.3) as a curve fit with one hidden layer of tanh.
+"""Back-propagation network of paper 004 (Li et al. 2020, section 3.3) as a fit with one hidden layer of tanh.
 
 One angle goes in, one value comes out.
 

@@ -4,7 +4,7 @@ Sign, everywhere: **dividing error = reading - true angle**, e(R) = R - phi. A c
 
 The table is stopped at a set of readings; at each of them a reference (indexed polygon and autocollimator) gives the
 true angle, so that every comparison gives e(R) + the error of the reference at that position + noise. The comparisons
-are repeated (paper 004, section 3.3).
+are repeated (paper 004, Li et al. 2020, section 3.3).
 
 1. `CalibrationSeries`: gross errors are rejected by Chauvenet's criterion; mean, RMS of the repeats before and after,
    sigma.

@@ -247,9 +247,16 @@ class Operands:
 
 @dataclass(frozen=True)
 class Passage:
-    """Segment of the beams that passes a surface without touching it, and the side, in y, on which it passes.
+    """Beam segment that must pass a surface without touching it.
 
-    The segment leads from point number ``segment`` of the rays to the next.
+    Attributes
+    ----------
+    segment : int
+        Index of the point of the rays at which the segment begins; it ends at the next point.
+    surface : int
+        Index of the surface.
+    side : float
+        Side of the surface in y on which the segment passes: +1 for +y, -1 for -y.
     """
 
     segment: int
@@ -315,7 +322,8 @@ class MeritFunction:
     operands : Operands
         Targets and limits.
     passages : tuple of Passage
-        Segments of the beams that pass surfaces, with these surfaces and the sides in y.
+        Beam segments that must clear surfaces, each with the surface and the side (+1 for +y, -1 for -y) on which it
+        passes it.
     """
 
     backend: Backend

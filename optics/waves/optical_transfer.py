@@ -667,9 +667,12 @@ class VariedTransfer:
         return float(abs(sum(np.sum(terms.phasors) for terms in self.colours)))
 
     def modulation(self, paths: np.ndarray) -> np.ndarray:
-        """Return the MTF (0 to 1) when the optical paths of the rays exceed those of the known pupil by ``paths``.
+        """Return the MTF (0 to 1) at the one frequency of this object for varied optical paths, (...).
 
-        ``paths`` (..., K N) are for N rays at each of K traced wavelengths, metres.
+        Parameters
+        ----------
+        paths : (..., K N) ndarray
+            Optical paths of N rays at each of K traced wavelengths minus those of the known pupil, metres.
         """
         whole: np.ndarray | int = 0
         for terms in self.colours:

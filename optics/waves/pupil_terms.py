@@ -178,18 +178,21 @@ _CLOSE = 1e-13
 
 @dataclass(frozen=True, eq=False)
 class PupilEdge:
-    """Smooth convex edge that is nearly the unit circle; or S such edges, one for each of S shifts.
+    """Smooth convex pupil edge that is nearly the unit circle, or S such edges, one for each of S shifts.
+
+    A shift displaces a copy of the pupil, whose overlap with the pupil gives the optical transfer function at one
+    frequency; edge number k is that of the pupil to which shift number k applies. Coordinates are in radii of the stop.
 
     Attributes
     ----------
     harmonics : (2H + 1,) or (2H + 1, S) ndarray
-        Complex coefficients c_n, n = -H to H, of the edge's points sum c_n exp(i n a), with a the angle on the stop's
-        rim; c_1 is 1, c_0 and c_-1 are 0.
+        Complex coefficients c_n, n = -H to H, of the edge's points x + iy = sum c_n exp(i n a), with a the angle on the
+        stop's rim, in radians; c_1 is 1, c_0 and c_-1 are 0.
 
     Raises
     ------
     ValueError
-        The edge is too far from the unit circle.
+        The edge is too far from an ellipse: sum n^2 |c_n| exceeds 1 + ``WORST_BEND``.
     """
 
     harmonics: np.ndarray

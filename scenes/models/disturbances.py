@@ -213,7 +213,8 @@ def prior_of_spec(spec: DisturbancesSpec, instrument: Instrument, issue: _Where 
     instrument : Instrument
         Instrument whose bodies move.
     issue : callable or None
-        Function that makes an issue of a problem at a key of a cause; by default an issue of the file itself.
+        Function that returns the error report for a fault, given the cause's name, the key in it and the text of the
+        fault; by default the report points into the disturbances file.
 
     Raises
     ------

@@ -1,6 +1,6 @@
-"""Test with two autocollimators and two mirrors on a turntable: the principle experiment of paper 001 (section 3.1).
+"""Test with two autocollimators and two mirrors on a turntable.
 
-Paper 001 is cited in docs/conventions.md.
+It is the principle experiment of paper 001 (Wang et al. 2018, section 3.1), which is cited in docs/conventions.md.
 """
 
 from __future__ import annotations

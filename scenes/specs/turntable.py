@@ -1,4 +1,4 @@
-"""Turntable test of paper 004 (section 3.3): calibration of a turntable with an unknown dividing error.
+"""Turntable test of paper 004 (Li et al. 2020, section 3.3): calibration of an unknown dividing error.
 
 Dividing error = reading - true angle. With `measured:` the comparisons come from files of a real bench.
 """

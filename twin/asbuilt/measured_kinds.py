@@ -536,7 +536,10 @@ class PositionReadings(MeasuredKind):
         return np.asarray((self._places(view.states) - self.nominal).reshape(len(view.states), -1))
 
     def covariance(self) -> np.ndarray:
-        """Return the covariance of the displacements: the same variance for all coordinates, without correlation."""
+        """Return the covariance of the 3 N coordinates of N bodies' displacements, (3 N, 3 N), in m^2.
+
+        All coordinates have the same variance and are uncorrelated.
+        """
         return np.asarray(self.spec.sigma**2 * np.eye(len(self.labels)))
 
     def biases(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

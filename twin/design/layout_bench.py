@@ -125,9 +125,11 @@ class LayoutFacts:
     before : dict
         Disturbances -> quantity -> prior standard deviation, without any measurement, SI units.
     shares : dict
-        Disturbances -> goal -> cause -> part of the posterior variance due to the cause, SI units squared.
+        Disturbances -> quantity of a goal -> cause -> contribution of the cause to the posterior variance, SI units
+        squared.
     shares_before : dict
-        Disturbances -> quantity -> prior standard deviation, without any measurement, SI units.
+        Disturbances -> quantity of a goal -> cause -> contribution of the cause to the prior variance, without any
+        measurement, SI units squared.
     pupil_share : float
         Fraction of the imaging pupil that its prisms block.
     mass : float

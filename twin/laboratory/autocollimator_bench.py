@@ -1,4 +1,4 @@
-"""Simulated bench of two autocollimators that measure the rotation of two mirrors on a turntable (paper 001).
+"""Simulated bench of two autocollimators that measure two mirrors on a turntable (paper 001, Wang et al. 2018).
 
 Errors of the bench (mounting, focus, turntable) are motions of its bodies. They are drawn from the seed and applied to
 the simulated bench alone: the analysis evaluates the frames with the calibration of the ideal autocollimator and the

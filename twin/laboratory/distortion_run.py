@@ -1,4 +1,6 @@
-"""Interior orientation and distortion by paper 004 (section 3), from the turntable's calibration to distortion.json.
+"""Interior orientation and distortion by paper 004 (Li et al. 2020, section 3).
+
+The run goes from the turntable's calibration to distortion.json.
 
 The analysis gets frames, turntable readings, the calibration of the table and what a laboratory knows beforehand: the
 pixels, their noise, and the energy centroid of a spot minus its chief ray by the camera's design; or spots and readings

@@ -87,7 +87,12 @@ class Site:
     def crossing(self, placement: Pose, height: float) -> np.ndarray:
         """Return the intersection of the chief ray and the chip's surface in the focal-plane frame, (3,), metres.
 
-        ``height`` is that of the chip above the focal-plane assembly, metres.
+        Parameters
+        ----------
+        placement : Pose
+            Position and orientation of the focal-plane assembly in the focal-plane frame.
+        height : float
+            Height of the chip above the assembly, along the assembly's normal, metres.
         """
         normal = placement.rotation[:, 2]
         chip = placement.translation + height * normal

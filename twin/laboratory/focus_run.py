@@ -1,4 +1,4 @@
-"""Focal-plane alignment by paper 004 (section 2), on a simulated bench or from a measured through-focus series.
+"""Focal-plane alignment by paper 004 (Li et al. 2020, section 2), on a simulated bench or from measured series.
 
 A round measures the through-focus MTF in every field and band, fits a weighted plane through best focus and computes
 the shims at the mounting holes. A simulated bench mounts the shims and measures again.

@@ -1,4 +1,6 @@
-"""Turntable test of paper 004 (section 3.3): the dividing error of a table from comparisons with a reference.
+"""Turntable test of paper 004 (Li et al. 2020, section 3.3).
+
+It determines the dividing error of a table from comparisons with a reference.
 
 Five functions are fitted to the comparisons and ranked on angles that no fit has used. The analysis gets the
 comparisons and the certificate of the reference, of a simulated bench or from files of measurements. The true dividing

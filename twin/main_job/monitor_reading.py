@@ -161,8 +161,8 @@ class MonitorReading:
     def from_statement(self) -> dict[str, dict[str, float | None]]:
         """Group -> key -> fraction of the posterior variance due to the prior alone, which remains without image noise.
 
-        The fraction is None for a quantity that no motion of the prior changes. The mapping is empty without a prior
-        and without noise.
+        The fraction is None for a quantity that no motion of the prior changes. The mapping is empty if there is no
+        prior or if the images have no noise.
         """
         prior, noise = self.disturbances, self.recovery.shift_covariance[0]
         if prior is None or not np.any(noise):

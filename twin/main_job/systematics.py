@@ -27,7 +27,8 @@ from twin.monitor.time_series import SmoothedCourse
 from twin.uncertainty.monitor_limits import short_text, unit_text
 
 _FAMILY = 4
-"""Number of motions of a camera that the estimators of paper 001 assume; they come first in a crosstalk table."""
+"""Number of motions of a camera that the estimators of paper 001 (Wang et al. 2018) assume; they come first in a
+crosstalk table."""
 SHOWN = 1e-3
 """Smallest amount of a motion, in its table unit (arcsec, um, ppm or nm), that is reported."""
 
@@ -45,7 +46,7 @@ class Systematics:
     bias : dict of str to (P,) ndarray
         Estimator -> estimate minus true change, to first order, of each of the camera's P changes, in its unit.
     outside : tuple of str
-        Motions of this camera that the estimators of paper 001 do not assume, as text with amounts.
+        Motions of this camera that the estimators of paper 001 (Wang et al. 2018) do not assume, as text with amounts.
     parts : dict of str to (P,) ndarray
         Motion, as text with its amount -> its contribution to the bias of the estimator that the verdict uses; motions
         of other cameras are included where that estimator uses all spots together.

@@ -557,7 +557,7 @@ def motion_models(
 ) -> dict[str, MotionModel]:
     """Return for each estimator whose result is checked by a ray trace the motions that it assumes.
 
-    The motions are either the four of each camera that paper 001 considers, or those of the prior.
+    The motions are either the four of each camera that paper 001 (Wang et al. 2018) considers, or those of the prior.
 
     Parameters
     ----------
@@ -601,7 +601,7 @@ def _prior_states(prior: DisturbancePrior, thermal: ThermalModel, amounts: np.nd
 
 
 def _of_families(cameras: Mapping[str, CameraCalibration], trace: Callable[[Sequence[State]], Retraced]) -> MotionModel:
-    """Return the motion model of the four motions of each camera for which paper 001 derives its formulas."""
+    """Return the model of the four motions of each camera in the formulas of paper 001 (Wang et al. 2018)."""
     families = {name: line_family(name) for name in cameras}
     spot_slices, count = _spots_of(cameras), sum(map(len, families.values()))
     spots, parameters = np.zeros((spot_slices[-1].stop, count)), np.zeros((4 * len(cameras), count))

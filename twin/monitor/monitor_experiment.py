@@ -319,7 +319,10 @@ class MonitorExperiment:
 
     @cached_property
     def _truth_by_family(self) -> dict[str, np.ndarray]:
-        """Camera -> true change of its four parameters, (4, 4), per unit of each of the four motions of paper 001."""
+        """Camera -> true change of its four parameters, (4, 4), per unit of each of four motions.
+
+        They are the motions for which paper 001 (Wang et al. 2018) derives its formulas.
+        """
         names = list(self.instrument.cameras)
         motions = [motion for name in names for motion in line_family(name)]
         jacobians = truth_jacobian(self.instrument, self.backend, motions)
@@ -329,7 +332,7 @@ class MonitorExperiment:
     def cameras(self) -> dict[str, CameraCalibration]:
         """Camera -> its calibration without images: geometry, and Jacobians of spots and parameters.
 
-        The Jacobians are with respect to the four motions that paper 001 considers.
+        The Jacobians are with respect to the four motions that paper 001 (Wang et al. 2018) considers.
         """
         families = {name: line_family(name) for name in self.instrument.cameras}
         spots = spot_jacobian(self.path, [motion for family in families.values() for motion in family])
@@ -410,7 +413,7 @@ class MonitorExperiment:
         return motion_models(self.path, self.sight, self.cameras, self.thermal, prior, known)
 
     def geometry(self, camera: str) -> MonitorGeometry:
-        """Return the calibrated numbers that the formulas of paper 001 use for one camera.
+        """Return the calibrated numbers that the formulas of paper 001 (Wang et al. 2018) use for one camera.
 
         They are principal distance, plate scale, distortion, distance of the area CCDs and pixel pitch. The papers
         leave alpha and beta of their cos^2 undefined; they are taken as the field angles of the area CCDs.

@@ -77,7 +77,7 @@ class ElementaryMotion:
 
 
 def line_family(camera: str) -> tuple[ElementaryMotion, ...]:
-    """Return the four motions for which paper 001 derives its formulas.
+    """Return the four motions for which paper 001 (Wang et al. 2018) derives its formulas.
 
     They are the line CCD shifted along X and Y and rotated about Z, and the optics scaled. The scale enlarges mirrors
     and spacings together and keeps the focal plane in focus, with detectors of unchanged size: it changes the principal

@@ -185,7 +185,7 @@ class ErrorBudget:
     def warmed_focal_planes(self, warmer: float) -> tuple[float, float]:
         """Return the true change of principal distance due to warmer focal planes, and its estimate, in metres.
 
-        The estimate is by eq. (7) of paper 001.
+        The estimate is by eq. (7) of paper 001 (Wang et al. 2018).
 
         Parameters
         ----------

@@ -371,7 +371,7 @@ def diffraction_spots(experiment: MonitorExperiment) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Ghost:
-    """Ghosts on one area CCD with more than GHOSTS of its spot's light.
+    """Ghosts on one area CCD that together have more than the fraction ``GHOSTS`` of the light of its spot.
 
     Attributes
     ----------
@@ -380,8 +380,8 @@ class Ghost:
     source : str
         Channel that the strongest ghost comes from, ``<camera>/<channel>``.
     body : str or None
-        Path of the prism that causes it, the first with a reflecting face that should transmit; None where the ghost
-        met only nominal surfaces in another order.
+        Path of the prism that causes the strongest ghost, the first with a reflecting face that should transmit; None
+        where the ghost met only nominal surfaces in another order.
     text : str
         Warning.
     """

@@ -278,7 +278,7 @@ def _measured(
 def _recover_clean(
     setup: MeasurementSetup, bench: _Calibrated, calibration: MonitorCalibration, channels: Sequence[ChannelFrames]
 ) -> tuple[list[Recovery], SmoothedCourse | None]:
-    """Estimate the changes from frames without artefacts, by the same computation in the same batches as the main job."""
+    """Estimate the changes from frames without artefacts, computed in batches as in the main job."""
     states, count = len(channels[0].after), len(channels[0].after[0].frames)
     centroid = setup.test.analysis.centroid
 

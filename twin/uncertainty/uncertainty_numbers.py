@@ -106,7 +106,7 @@ _ELASTICITY: Record[tuple[Elasticity, int]] = Record(
     ),
     Quantity(
         "doubled_in_prior",
-        lambda one: float(one[0].told[one[1]]),
+        lambda one: float(one[0].doubled_in_prior[one[1]]),
         "standard deviation if the number is twice as large, also in the prior",
     ),
 )

@@ -244,7 +244,8 @@ def _prior_section(limits: MonitorLimits) -> Section:
         largest = sorted(limits.elasticities, key=lambda elasticity: -float(elasticity.elasticity[q]))[:FEW]
         for elasticity in largest:
             size = f"{significant(elasticity.size, 3)} {unit_for_reports(elasticity.unit)}"
-            numbers_of_row = (float(elasticity.elasticity[q]), float(elasticity.doubled[q]), float(elasticity.told[q]))
+            values = (elasticity.elasticity, elasticity.doubled, elasticity.doubled_in_prior)
+            numbers_of_row = [float(value[q]) for value in values]
             rows.append((quantity_text(quantity), elasticity.number.replace("_", " "), size, *numbers_of_row))
     numbers = Table(
         "limits-elasticities",

@@ -14,7 +14,7 @@ _ROW = re.compile(r"^      (\d{3}(?:\.\w+)+):$|^        also: \[(.*)\]$", re.M)
 
 
 def names_in_files() -> list[str]:
-    """Return the ids of all checks of all papers, including further ids, paper by paper.
+    """Return the ids of all checks of all papers, paper by paper, including the additional ids of checks with several.
 
     The files are read as text. An unknown id is therefore reported before anything that computes is imported, and
     before the YAML is parsed, which takes a second.

@@ -1,4 +1,4 @@
-"""Measurement of intersection angles in orbit from ground points (paper 000), as in a file of scenes/orbit."""
+"""Intersection angles in orbit from ground points (paper 000, Liu and Huang 2014), as in a file of scenes/orbit."""
 
 from collections.abc import Mapping, Sequence
 from typing import Annotated

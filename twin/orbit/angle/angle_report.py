@@ -389,7 +389,10 @@ def _moved(what: str) -> str:
 
 
 def _panels(run: SimulatedAngleRun) -> dict[str, list[tuple[str, str]]]:
-    """Return the panels of each sensitivity figure (Figs. 3 to 5 of paper 000): (quantity with an error, angle)."""
+    """Return the panels of each sensitivity figure: (quantity with an error, angle).
+
+    The figures correspond to Figs. 3 to 5 of paper 000 (Liu and Huang 2014).
+    """
     pairs = run.flight.pairs
     out = {"station": [("station", name) for name in pairs]}
     return out | {f"{name}-points": [(line, name) for line in pair] for name, pair in pairs.items()}

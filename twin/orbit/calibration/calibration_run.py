@@ -1,4 +1,4 @@
-"""Calibration of a camera in orbit over fields of points (paper 003).
+"""Calibration of a camera in orbit over fields of points (paper 003, Mo et al. 2015).
 
 All fields are calibrated in one simultaneous adjustment, and each field by itself as in paper 003, from the
 measurements alone; the simulated truth is used only to compare estimates with it. `exported` writes the measurements as
@@ -84,7 +84,7 @@ coefficients of the attitude that the point determines.
 
 @dataclass(frozen=True, eq=False)
 class FieldResult:
-    """Calibration of a single field, with the twelve unknowns of paper 003.
+    """Calibration of a single field, with the twelve unknowns of paper 003 (Mo et al. 2015).
 
     The unknowns are principal distance f and principal point x, y of three lines, and the attitude biases roll, pitch,
     yaw.

@@ -88,7 +88,7 @@ def _rate_priors(campaign: Campaign, passes: Sequence[FieldPass], common: Sequen
 
 
 def calibrated_alone(campaign: Campaign, flight: FieldPass) -> Adjustment:
-    """Calibrate one field by itself, with the unknowns of paper 003 except those that the gauge fixes.
+    """Calibrate one field by itself, with the unknowns of paper 003 (Mo et al. 2015) that the gauge leaves free.
 
     Paper 003 has twelve: principal distance and principal point of three lines, and the attitude biases about three
     axes. A rate of the attitude is added where the attitude drifts.

@@ -211,7 +211,19 @@ def laboratory_errors(campaign: Campaign) -> FrozenMap[str, CheckErrors]:
 def check_point_errors(
     campaign: Campaign, flight: FieldPass, cameras: Mapping[str, LineModel], bias: np.ndarray
 ) -> CheckErrors:
-    """Return the errors at a field's check points, intersected with these cameras and this attitude bias (3,)."""
+    """Intersect a field's check points with the given cameras and attitude bias and return their errors.
+
+    Parameters
+    ----------
+    campaign : Campaign
+        Campaign whose noise weights the rays.
+    flight : FieldPass
+        Pass over the field.
+    cameras : mapping of str to LineModel
+        Line -> camera model.
+    bias : (3,) ndarray
+        Attitude bias (rotations about three axes), radians.
+    """
     return check_errors(intersect(flight.check, cameras, campaign.noise, bias=bias).ground, flight.check_ground)
 
 

@@ -443,8 +443,8 @@ def dihedral_angle(
     """Return the angle between the planes of two lines, in radians, 0 to pi/2.
 
     The plane of a line goes through the station and fits its lines of sight best (total least squares over the whole
-    line, or over the given `pixels` of each line). Ground points of the strips give this angle (paper 000, eqs. 1 to
-    7). It differs from `look_angle` when the lines are not parallel.
+    line, or over the given `pixels` of each line). Ground points of the strips give this angle (paper 000, Liu and
+    Huang 2014, eqs. 1 to 7). It differs from `look_angle` when the lines are not parallel.
     """
     angle = _angle(*(line_normal(camera, pixel) for camera, pixel in zip((a, b), pixels, strict=True)))
     return min(angle, np.pi - angle)

@@ -399,7 +399,21 @@ def _draw_errors(
 
 
 def _sum(series: tuple[Series, ...], seconds: np.ndarray) -> np.ndarray:
-    """Return the sum of several error functions at times (...), in seconds, (..., 3)."""
+    """Return the sum of several error time series at given times.
+
+    Parameters
+    ----------
+    series : tuple of Series
+        Functions of the time that return errors about or along three axes, in the unit of their quantity: metres, m/s
+        or radians.
+    seconds : (...) ndarray
+        Times, in seconds from the orbit's epoch.
+
+    Returns
+    -------
+    (..., 3) ndarray
+        Sum of the errors in the same unit; zero without series.
+    """
     t = np.asarray(seconds, dtype=np.float64)
     return sum((term(t) for term in series), np.zeros((*t.shape, 3)))
 

@@ -785,7 +785,10 @@ def _whole(
     table: Gradient,
     advance: Advance,
 ) -> None:
-    """Store finite differences of the base command's whole results; all runs have the noise of the base job's seed."""
+    """Store derivatives of responses by finite differences of complete runs of the base command.
+
+    All runs use the base job's noise seed.
+    """
     for k, factor in enumerate(factors):
         advance(WHOLE, k, len(factors))
         step = PART * factor.spread

@@ -1,4 +1,4 @@
-"""Checks of the method of paper 000: passes over ground points, equations, assumptions and applications.
+"""Checks of the method of paper 000 (Liu and Huang 2014): passes, equations, assumptions and applications.
 
 A pass is a flight of the satellite over ground control points, from which the angles between its cameras are measured.
 The passes are the tests of the library (scenes/orbit/angle*.yaml). The assumptions concern the light, the projection
@@ -279,7 +279,7 @@ def twisted_passes(context: Context) -> tuple[Passes, Passes]:
 
 @one_blas_thread()
 def run(context: Context) -> Iterator[CheckResult]:
-    """Yield the results of all checks of the equations of paper 000."""
+    """Yield the results of all checks of the equations of paper 000 (Liu and Huang 2014)."""
     context.progress(0.0, "measure ground points")
     planes = Planes(context, make_passes(context))
     checks: Mapping[str, Callable[[Planes], CheckResult]] = {

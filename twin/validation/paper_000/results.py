@@ -1,4 +1,6 @@
-"""Checks of the results of paper 000: Table 1, planes against resection, and the statements about Figs. 3 to 5.
+"""Checks of the results of paper 000 (Liu and Huang 2014).
+
+They are Table 1, planes against resection, and the statements about Figs. 3 to 5.
 
 Each statement of the text is decided by a number. The paper describes the figures in words only: "far more" is taken as
 at least twice, "very near" as within a quarter, "little" as at most a quarter of the largest, and a slope that grows as
@@ -130,7 +132,7 @@ def _at(measured: Measurement, position: Array) -> Measurement:
 
 @one_blas_thread()
 def run_table_1(context: Context) -> Iterator[CheckResult]:
-    """Yield the results of all checks of Table 1 of paper 000."""
+    """Yield the results of all checks of Table 1 of paper 000 (Liu and Huang 2014)."""
     context.progress(0.1, "measure ground points for both methods")
     data = make_data(context)
     same, independent = differences(data.same, data.same), differences(data.light, data.own)
@@ -461,7 +463,7 @@ def answers(measured: Measurement, flight: AnglePass, steps: int = 10, method: M
 
 @one_blas_thread()
 def run_figures(context: Context) -> Iterator[CheckResult]:
-    """Yield the results of all checks of the statements about Figs. 3 to 5 of paper 000."""
+    """Yield the results of all checks of the statements about Figs. 3 to 5 of paper 000 (Liu and Huang 2014)."""
     context.progress(0.0, "move station and points")
     passes = make_passes(context)
     all_answers = [answers(m, passes.flight) for m in passes.measured]

@@ -1,4 +1,4 @@
-"""Checks of paper 001's error budget: Tables 3 to 5, eq. (12) and section 3.2.3, with a figure.
+"""Checks of the error budget of paper 001 (Wang et al. 2018): Tables 3 to 5, eq. (12), section 3.2.3; a figure.
 
 The budget converts errors of the monitor's spots, due to its thermal and mechanical causes, to errors of the cameras'
 parameters.

@@ -1,4 +1,4 @@
-"""Checks of the formulas of paper 001 on rendered images.
+"""Checks of the formulas of paper 001 (Wang et al. 2018) on rendered images.
 
 Single changes of a camera test (1) to (7). The joint form tests superposition (8), symmetry (9), separation (10) and
 (11), the last column of Table 1 for all four changes at once, and the angle of Fig. 4.
@@ -166,7 +166,10 @@ class MonitorImages:
         self.covariance = np.concatenate([p.shift_covariance for p in pieces])
 
     def geometry(self, camera: str) -> MonitorGeometry:
-        """Return a camera's principal distance, field angles and distances, as the formulas of paper 001 use them."""
+        """Return a camera's geometry for the formulas of paper 001 (Wang et al. 2018).
+
+        It contains principal distance, field angles and distances.
+        """
         return self.experiment.calibration.cameras[camera].geometry
 
     @property

@@ -1,4 +1,4 @@
-"""Ranges of validity of the formulas of paper 001.
+"""Ranges of validity of the formulas of paper 001 (Wang et al. 2018).
 
 The errors of estimates from noise-free images are computed for increasing single and joint changes, under defocus, and
 for other pupil offsets, fields and kinds of return reflector, up to where they exceed a tolerance.
@@ -81,7 +81,10 @@ class Bench:
         self.frames = experiment.instrument.spec.autocollimator.frames
 
     def geometry(self, camera: str) -> MonitorGeometry:
-        """Return a camera's principal distance, field angles and distances, as the formulas of paper 001 use them."""
+        """Return a camera's geometry for the formulas of paper 001 (Wang et al. 2018).
+
+        It contains principal distance, field angles and distances.
+        """
         if camera not in self._geometry:
             self._geometry[camera] = self.experiment.geometry(camera)
         return self._geometry[camera]
@@ -317,14 +320,16 @@ _FAR_BOX = 200.0
 class Range(Domain):
     """Range of validity of the formulas for one parameter changed in one direction.
 
-    Sizes are true changes in arcsec and um. The names of the curves are those of ``criterion`` and WINDOW.
+    The size of a change is its true value in arcsec (angles) or um (principal distance). There is an error curve for
+    each set of formulas and kind of limit (``criterion``), and one for the distance of the spots from the edge of the
+    area CCD (WINDOW).
 
     Attributes
     ----------
     parameter : str
         One of NAMES.
     sign : int
-        +1 or -1.
+        Sign of the change, +1 or -1.
     raw : mapping of str to ndarray
         Set of formulas -> N pairs of true change and error from images, (N, 2), for the figure.
     raw_traced : mapping of str to ndarray
@@ -611,7 +616,7 @@ relative to the pinhole, in metres; None if the one in the instrument's file can
 SHIFT = 60e-6
 """Shift of the line CCD for the comparison of return reflectors, metres."""
 CONFOCAL = load_printed("004").number("alignment.confocal_mm") / 1e3
-"""Accuracy with which paper 004 sets the line CCD to the focus, metres."""
+"""Accuracy with which paper 004 (Li et al. 2020) sets the line CCD to the focus, metres."""
 SMALL = {"d_alpha": 2.0, "d_beta": 2.0, "d_gamma": 40.0, "d_f": 1500.0}
 """Parameter -> single change for the comparison of defocused cameras and other fields, in arcsec and um.
 

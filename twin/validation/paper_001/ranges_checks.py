@@ -1,4 +1,4 @@
-"""Checks of the ranges of validity of paper 001's formulas, with their figures, tables and data."""
+"""Checks of the validity ranges of the formulas of paper 001 (Wang et al. 2018), with figures, tables and data."""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""Checks of paper 001's principle experiment (section 3.1), Table 2: two autocollimators, two mirrors on a turntable.
+"""Checks of Table 2 of paper 001 (Wang et al. 2018), its principle experiment (section 3.1).
+
+The experiment has two autocollimators and two mirrors on a turntable.
 
 The rotation "about Z" has to be interpreted. X is up and Y horizontal, so Z is the view of autocollimator 1, along the
 normal of mirror 1: autocollimator 1 cannot observe a rotation about it, and reads its own noise. Mirror 2 rotates about

@@ -1,4 +1,4 @@
-"""Checks of paper 003 over simulated campaigns with seven test fields, with figures and tables.
+"""Checks of paper 003 (Mo et al. 2015) over simulated campaigns with seven test fields, with figures and tables.
 
 A campaign calibrates the camera in orbit from passes over the fields. The checks cover the quality of orbit and
 attitude, the stability of the calibration, Tables 6 and 7, the schemes of parameters (which fields share parameters),

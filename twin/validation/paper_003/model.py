@@ -1,4 +1,4 @@
-"""Checks of the rigorous model of paper 003.
+"""Checks of the rigorous model of paper 003 (Mo et al. 2015).
 
 They use exact points, bright targets on the ground and matched points in rendered images, and points with random
 errors. A figure shows the combination of parameters that the points cannot determine.

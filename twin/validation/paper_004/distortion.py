@@ -1,4 +1,4 @@
-"""Checks of paper 004, sections 3.1 and 3.3: equations (1) to (4), Table 2 and the sources of error.
+"""Checks of paper 004 (Li et al. 2020), sections 3.1 and 3.3: eqs. (1) to (4), Table 2 and sources of error.
 
 Distortion tests use rendered collimator spots and exact chief rays. Measured values are positions of spots in rendered
 images and angles from the readings of a compensated turntable. True values are chief rays of the as-built camera traced

@@ -1,4 +1,4 @@
-"""Checks of paper 004's focal-plane alignment: coupling of the adjustments, MTF, accuracy and result."""
+"""Checks of the focal-plane alignment of paper 004 (Li et al. 2020): coupling, MTF, accuracy and result."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Checks of paper 004, sections 3.2 and 3.3: the turntable's dividing error, its repeated readings and its fits."""
+"""Checks of paper 004 (Li et al. 2020), sections 3.2 and 3.3: dividing error, repeated readings and fits."""
 
 from __future__ import annotations
 
