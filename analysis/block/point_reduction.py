@@ -55,11 +55,10 @@ class Packets(Protocol):
 
     @property
     def columns(self) -> Indices:
-        """Indices (n, w), among all unknowns, of the w unknowns on which each of the n measurements (packets) depends."""
+        """Indices, among all unknowns, of the w unknowns on which each of n measurements depends, (n, w)."""
 
     def linearised(self, which: Indices, x: Array, ground: Array) -> tuple[Array, Array, Array]:
-        """Return whitened misclosures of k selected measurements, and their derivatives with respect to unknowns and
-        points.
+        """Return whitened misclosures of k measurements, and their derivatives with respect to unknowns and points.
 
         Each measurement gives one packet of d equations. The misclosures are (k, d), the derivatives (k, d, w) with
         respect to the w unknowns of `columns` and (k, d, 3) with respect to the ground points.
@@ -75,7 +74,15 @@ class Packets(Protocol):
         """
 
     def taken(self, which: Indices, point: Indices) -> Packets:
-        """Return selected measurements (indices `which`) as a new set, with the given indices of their ground points."""
+        """Return selected measurements as a new set.
+
+        Parameters
+        ----------
+        which : (k,) ndarray of int
+            Indices of the measurements.
+        point : (k,) ndarray of int
+            New indices of their ground points.
+        """
 
 
 @dataclass(frozen=True, eq=False)

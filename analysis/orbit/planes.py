@@ -714,7 +714,8 @@ def line_frame(plane: PlaneFit, tangent: ArrayLike, bend: float = 0.0) -> LineFr
     slope = float(spread @ (measured - measured.mean()) / (spread @ spread)) if np.any(spread) else 0.0
     if abs(abs(slope) - 1.0) > 0.1:
         raise AngleError(
-            f"central ray: the points subtend {abs(slope):.3g} times the angle of their tangents; are these wrong?"
+            f"central ray: the angle between the points from their coordinates is {abs(slope):.3g} times that from the"
+            " given tangents (1 is expected); check the tangents"
         )
     # the sigma of a point's angle is its sigma over its distance
     weight = np.sum(arm**2, axis=1) / np.trace(strip.covariance, axis1=1, axis2=2)

@@ -180,7 +180,8 @@ def nodal_deformation(
     weight = _cells(points[:, :2], aperture, spacing)
     rotation, shift, size = _similarity(points, moves, weight)
     if abs(size - 1.0) > MAX_SCALE_CHANGE:
-        raise NodesError(f"the nodes' displacements scale the face by {100.0 * (size - 1.0):.3g} %", _CHECK)
+        text = f"the nodes' displacements scale the face by {100.0 * (size - 1.0):.3g} %"
+        raise NodesError(f"{text}, more than {100.0 * MAX_SCALE_CHANGE:g} %: check their unit", _CHECK)
     # positions of the nodes in the moved frame, and their heights above the nominal surface
     positions = (points + moves - shift) @ rotation
     change = positions[:, 2] - surface.scaled(size).sag(positions[:, 0], positions[:, 1])

@@ -471,7 +471,8 @@ def _terms(lens: Prescription, surface: LensSurface, shape: Surface) -> dict[str
         last = max(shape.figure.terms, default=0)
         if last > LAST_NOLL:
             problem = "Zernike terms, or a polynomial, of a higher order than a camera's file allows"
-            raise lens.error(problem, surface.line, f"Z{last}", f"Z1 to Z{LAST_NOLL}, polynomials to order 7")
+            allowed = f"Noll terms Z1 to Z{LAST_NOLL}, and x-y polynomials up to order 7"
+            raise lens.error(problem, surface.line, f"Z{last}", allowed)
         given = {f"Z{j}": a for j, a in shape.figure.terms.items()}
         x0, y0 = shape.figure.centre
         terms.append(ZernikeSag(radius=shape.figure.radius, x0=x0, y0=y0, **given))

@@ -153,7 +153,8 @@ def run_asbuilt(
             data = bench.measured(true, rng)
         except PhysicalError as error:
             allowed = "another seed, or smaller standard deviations"
-            raise test.error(f"the drawn instrument has no light: {error}", ("simulate",), allowed=allowed) from error
+            text = f"the randomly drawn as-built instrument lets no light through: {error}"
+            raise test.error(text, ("simulate",), allowed=allowed) from error
     state = bench.estimate(data)
     require_agreement(bench, state)
     advance("state", 1, 4)

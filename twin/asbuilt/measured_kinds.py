@@ -449,9 +449,10 @@ class SpotReadings(MeasuredKind):
                     spots[row["camera"], row["channel"]] = (float(row["row_px"]), float(row["column_px"]))
                 except (KeyError, TypeError, ValueError) as error:
                     raise self.wrong(
-                        f"line {rows.line_num}: not a spot ({error!r})",
+                        f"line {rows.line_num}: {','.join(map(str, row.values()))} is not camera, channel and position"
+                        f" of a spot ({error!r})",
                         "file",
-                        "columns camera, channel, row_px, column_px",
+                        "columns camera, channel, row_px, column_px; positions are numbers",
                         str(path),
                     ) from error
         return spots

@@ -370,7 +370,7 @@ class DistortionBench:
             raise BenchError(
                 f"the camera's beam cannot be traced: {error}",
                 ("collimator",),
-                "a wider collimator, or smaller `as_built`",
+                "a wider collimator, or smaller errors in `as_built`",
             ) from error
         known, true = (interpolated(offset, half_field, field_angle) for offset in offsets)
         return cls(setup, path, camera.as_built, ccd, images, field_angle, centre_direction, known, true)

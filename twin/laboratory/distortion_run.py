@@ -404,16 +404,16 @@ def measure_files(spec: MeasuredDistortionSpec, seed: int) -> DistortionRun:
 
 def _check_region(files: DistortionFiles, readings: SpotReadings, series: CalibrationSeries, zero: float) -> None:
     """Raise InputError if a reading lies outside of the calibrated region of the turntable."""
-    allowed = f"{calibrated_text(series.angle)}, where the turntable is calibrated"
+    allowed = f"{calibrated_text(series.angle)}, the calibrated range"
     if not covered(series.angle, zero):
         shown = f"{np.degrees(files.zero):.9g} deg"
-        raise files.error("outside of the calibrated readings", ("zero",), found=shown, allowed=allowed)
+        raise files.error("the turntable is not calibrated at this reading", ("zero",), found=shown, allowed=allowed)
     beyond = ~covered(series.angle, readings.reading) & (readings.lines > 0)
     if np.any(beyond):
         place = np.argwhere(beyond)[0]
         shown = f"{np.degrees(readings.reading[tuple(place)]):.9g} deg"
         line = int(readings.lines[tuple(place)])
-        text = "outside of the calibrated readings"
+        text = "the turntable is not calibrated at this reading"
         raise InputError(Issue(text, readings.file.file, line, (readings.head,), shown, allowed))
 
 

@@ -473,7 +473,10 @@ def _scatter_figure(run: SimulatedAngleRun) -> Figure:
 
 
 def _ellipse_of_passes(axes: Axes, scatter: Scatter) -> None:
-    """Draw two angles and the ellipse that should hold 95% of the passes."""
+    """Plot two angles estimated from each pass against each other, with the ellipse that contains 95 % of the passes.
+
+    The ellipse is computed by error propagation, about the true angles.
+    """
     error, phase = (scatter.values - scatter.truth) / ARCSEC, np.linspace(0.0, 2.0 * np.pi, 181)
     root = np.linalg.cholesky(scatter.covariance[:2, :2]) / ARCSEC
     ellipse = np.sqrt(5.991) * root @ np.stack([np.cos(phase), np.sin(phase)])

@@ -51,7 +51,7 @@ GROUP: Record[GroupTest] = Record(
     Quantity(
         "variance_ratio",
         lambda group: group.ratio if np.isfinite(group.ratio) else None,
-        "variance of the residuals over that of the sigmas",
+        "variance of the residuals over that expected from the sigmas",
         "variance ratio",
         2,
     ),
@@ -210,8 +210,8 @@ def _sections(run: BlockRun) -> tuple[Section, ...]:
     groups = GROUP.table(
         "groups",
         "Observations and laws",
-        "Variance of the residuals over that of the sigmas, with the redundancy of the group. Each law of the readings'"
-        " errors is a group.",
+        "Variance of the residuals over that expected from the sigmas, and redundancy, for each group. Readings with"
+        " the same error model are a group.",
         {name: GROUP(group) for name, group in run.adjustment.groups.items()},
         label="group",
     )

@@ -219,7 +219,8 @@ def _limits(run: CalibrationRun) -> str:
     texts = ", ".join(f"{name} {value:.2g} m" for name, value in sorted(parts.items(), key=lambda v: -v[1]) if value)
     return (
         f"Error budget on the ground at nadir (1σ) of a single ray to a single point of {flight.name}: {texts}. "
-        "The largest of these limits the result. More points reduce it, except for slow errors of the attitude."
+        "The largest of these errors limits the accuracy. More points reduce all of them but slow errors of the"
+        " attitude."
     )
 
 

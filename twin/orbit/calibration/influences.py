@@ -382,7 +382,7 @@ def drift_warnings(campaign: Campaign, drift: AttitudeDrift) -> list[str]:
             "the attitude drifts during the passes, or errors of image points are correlated along the lines: residuals"
             f" of neighbouring exposures are correlated (p = {p_value:.1g}). The sigmas include a random walk of"
             f" {drift.assumed.walk / ARCSEC:.2g} arcsec in a second and rates of {rate:.2g} arcsec in"
-            f" {drift.seconds:.0f} s, estimated from these residuals: state errors.star_tracker.drift and walk"
+            f" {drift.seconds:.0f} s, estimated from these residuals: specify errors.star_tracker.drift and walk"
         ]
     name, ratio = drift.most
     spec, undetected = campaign.spec, drift.undetected_sigmas or 0.0
@@ -393,9 +393,9 @@ def drift_warnings(campaign: Campaign, drift: AttitudeDrift) -> list[str]:
     ):
         least = float(np.min(drift.detectable)) / ARCSEC if drift.detectable is not None else np.inf
         return [
-            f"the file does not state a drift of the attitude within a pass: 1 arcsec in {drift.seconds:.0f} s changes"
+            f"the file specifies no drift of the attitude within a pass: 1 arcsec in {drift.seconds:.0f} s changes"
             f" {name} by {ratio:.2g} of its sigmas, and the residuals show a drift only above {least:.2g} arcsec:"
-            " state errors.star_tracker.drift, [0 arcsec, 0 arcsec, 0 arcsec] where there is none"
+            " specify errors.star_tracker.drift, [0 arcsec, 0 arcsec, 0 arcsec] where there is none"
         ]
     return []
 

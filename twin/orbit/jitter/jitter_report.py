@@ -201,7 +201,7 @@ def _course(jitter: PassJitter, suffix: str, head: str) -> Section:
     figure = SvgFigure(
         f"course{suffix}",
         "Attitude over time",
-        "Fast part of the attitude, without its mean and without blind frequencies.",
+        "Fast part of the attitude, without its mean and without the frequencies that the lines cannot observe.",
         svg.drawn("jitter-course", _course_figure, jitter),
     )
     return Section(f"Attitude over time{head}", (), (figure, full))

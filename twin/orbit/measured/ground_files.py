@@ -278,8 +278,8 @@ def _of_header(spec: GroundFileSpec, header: str) -> str:
         problem, allowed = "the header names a projected system", "a geographic system: latitude, longitude, height"
         raise spec.error(problem, ("file",), found=crs.name, allowed=allowed)
     if not same:
-        allowed = f"{crs.name}, as the file's header says, or none"
-        raise spec.error("the file's header names another coordinate system", ("crs",), found=spec.crs, allowed=allowed)
+        problem, allowed = f"the file's header names {crs.name}, not the specified system", f"{crs.name}, or no key crs"
+        raise spec.error(problem, ("crs",), found=spec.crs, allowed=allowed)
     return spec.crs or header
 
 
