@@ -36,7 +36,7 @@ ARCMIN = 60.0 * ARCSEC
 """One minute of arc, in radians."""
 
 UM_PER_M, MM_PER_M = 1e6, 1e3
-"""Micrometres and millimetres in a metre."""
+"""Micrometres in a metre, and millimetres in a metre."""
 
 
 class MeasurementError(Exception):
@@ -69,7 +69,10 @@ PER_SI: Mapping[str, float] = {
 """Number of each unit in one SI unit. A unit that is not listed is printed after the unscaled number."""
 
 LONGEST, MOST, FEW = 70, 400, 4
-"""Greatest number of characters of one value and of the whole text; most elements of an array printed one by one."""
+"""Limits of the short texts of ``__repr__``: greatest number of characters of one value, and of the whole text.
+
+The third number is the greatest number of elements of an array or list that are printed one by one.
+"""
 
 _FIELD = re.compile(r"(?P<path>[\w.]+)(?: \[(?P<unit>[^\]]+)\])?")
 _SI_ENDING = re.compile(r"_(rad|m|s)$")

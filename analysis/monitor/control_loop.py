@@ -36,11 +36,11 @@ DECAYING = 1.0 - 1e-12
 The margin to 1 covers rounding for loops that are marginally stable.
 """
 _LEAST, _MOST = 1e-6, 1e6
-"""Gain margins that are as bad and as good as any."""
+"""Gain margins (factors) at which the search ends: a smaller one counts as 0, a larger one as infinite."""
 _CLOSE = 1e-12
 """Relative accuracy to which a gain margin is computed."""
 _SETTLING, _WATCHED = 400, 400
-"""Readings before a limit cycle is looked at, and for which it is."""
+"""Numbers of simulated readings in the search for limit cycles: those for settling, then those examined."""
 _OFFSETS = 41
 """Number of constant values of the uncorrected quantity, spread over one step, for which limit cycles are searched."""
 

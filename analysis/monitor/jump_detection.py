@@ -52,7 +52,12 @@ _UNLIKELY = 1e-4
 _AHEAD = 100.0
 """Length of time after the end of a series, in units of its length, over which a forecast includes further jumps."""
 _AGAIN, _TWO_VALUED = 1.0, 1.5
-"""For a smoother: weight of the repeated uncertainty of a detected jump in the spots, and of the jump's own square."""
+"""Factors of a smoother's additional variance around a detected jump.
+
+The first multiplies the part of the jump's variance that the spots observe, which counts twice: filter and smoother
+both use the readings. The second multiplies the square of the jump, as the state between the readings around it is one
+of two values.
+"""
 _INFLATIONS = np.logspace(0.0, 8.0, 161)
 """Factors by which the prior variance of a jump is increased in the search for the variance of the largest likelihood.
 """

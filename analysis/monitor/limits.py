@@ -102,8 +102,11 @@ def quantities(cameras: Mapping[str, CameraCalibration], ground: GroundGeometry 
 
 
 _UNMOVED, _NEGLIGIBLE = 1e-7, 1e-9
-"""Fractions of the effect of a motion on a camera (angles and relative changes alike), and of the largest effect of any
-motion, below which derivatives are rounding."""
+"""Thresholds below which the derivative of a camera's parameter with respect to a motion is rounding error.
+
+The first is relative to the whole effect of this motion on the cameras (angles and relative changes alike), the second
+to the largest effect of any motion.
+"""
 
 
 def unchanged_quantities(

@@ -138,7 +138,10 @@ class MonitorCalibration:
 
 
 ANGLE_GROUP, GROUND_GROUP = "intersection_angle", "ground"
-"""Keys of files for the readings of two cameras together; those of one camera are under its name."""
+"""Keys, in result files, of changes computed from two cameras: their intersection angle, and ground errors.
+
+Changes of one camera are under its name.
+"""
 _PER_SI: Mapping[str, float] = MappingProxyType(
     {"arcsec": 1 / ARCSEC, "m": 1.0, "mm": 1e3, "um": UM_PER_M, "nm": 1e9, "ppm": 1e6, "percent": 1e2}
 )

@@ -54,7 +54,11 @@ LOUD = 1.3
 A median over an image exceeds it by chance only with a deviation of 6 sigma.
 """
 NOISE, BEFORE, AFTER = "noise", "before", "shape"
-"""Causes: noise of the frames, the shape of the spots before, their shape after alone."""
+"""Names of the causes of a warning that the sigmas of spot positions are not valid.
+
+They are noise of the frames that is too large, a shape of the spots before the change that differs from the calibrated
+one, and a shape after the change that alone differs.
+"""
 
 
 @dataclass(frozen=True)

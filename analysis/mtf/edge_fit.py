@@ -317,7 +317,10 @@ _LARGEST_GAP = 0.3
 # Gauss-Newton steps of a straight line: in uneven light, which is correlated with the line, and in even light.
 _LINE_STEPS = (4, 2)
 OVERSAMPLING, COARSE = 4, 2
-"""Knots of the edge-spread function per pixel: final, and coarse while the line is fitted to avoid fitting noise."""
+"""Knots of the edge-spread function per pixel: in the final fit, and in the fits that determine the edge's line.
+
+The latter has fewer, so that it does not follow the noise.
+"""
 HIGHEST_ORDER = 5
 """Highest order of the polynomial that follows a curved edge, that of ISO 12233:2023."""
 FALSE_ALARM = 1e-4

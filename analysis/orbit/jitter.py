@@ -557,8 +557,9 @@ class _Products:
 
 
 _FINE, _PADDED = 16, 4
-"""Grid moments per period of the highest frequency, and transformed frequencies per resolution element: an oscillation
-loses at most 3 % of its power by either.
+"""Sampling of the periodogram: grid times per period of the highest frequency, and frequencies per resolution.
+
+The resolution is the inverse of the length of the series. An oscillation loses at most 3 % of its power by either.
 """
 _WIDEST = 2**18
 """Largest number of resolution elements (inverse of the observed time span) over which the Fourier transform of the

@@ -49,7 +49,11 @@ MARGIN_PX = 40
 _TAPER_PX = 4
 _CORE = 0.05
 _LOOKS, _FILLS = 3, 40
-"""Number of passes that estimate the light's band of frequencies, and iterations of filling in each."""
+"""Numbers of iterations that fill missing pixels from a band-limited image.
+
+The first is the number of estimates of the band of the light's frequencies, the second the number of fillings with
+each.
+"""
 _UNEVEN = 0.5
 """Rms of an image's slopes, in sigmas of a pixel, from which on they belong to the background.
 

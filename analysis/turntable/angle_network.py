@@ -21,8 +21,10 @@ Curve = Callable[[Array], Array]
 
 HIDDEN, RESTARTS = 20, 4
 DECAY, GAIN = 1e-2, 5.0
-"""Weight decay, and the standard deviation to which angles are scaled: steep enough starts for a curve with many turns.
-Chosen on simulated turntables, seeds 0 to 3 of a model like that of scenes/lab/turntable.yaml.
+"""Weight decay of the network, and standard deviation to which its input angles are scaled.
+
+The scale makes the network's initial curves steep enough for an error with many turns. Both were chosen on simulated
+turntables, seeds 0 to 3 of a model like that of scenes/lab/turntable.yaml.
 """
 FLATTEST = 0.1
 """Smallest curvature of the network's loss, in units of the decay, that its linearisation uses. Between 0.1 and 1 the

@@ -782,7 +782,10 @@ def _spacing(surface: Any) -> float:
 _PUPIL_SCALE = ("PUPLSCAL", "PIXELSCL", "PIXSCALE")
 """FITS keys with metres per pixel of pupils, as POPPY writes and reads them."""
 _LARGEST_PIXEL, _LARGEST = 1.0, 10.0
-"""Metres; beyond them a unit is wrong or a file is damaged."""
+"""Largest plausible pixel size in a pupil, and largest plausible wavefront error, both in metres.
+
+Beyond them a unit is wrong or a file is damaged.
+"""
 
 
 def read_map(path: Path, *, wavelength: float | None = None) -> WavefrontMap:

@@ -283,8 +283,11 @@ it cannot represent; below it these pixels do not separate the terms.
 _CHUNK = 50_000
 """Number of pixels processed at a time, which limits the memory for large maps."""
 _TRIES, _NEAR, _STEP = 400, 1.5, 0.75
-"""Circles through three points of the edge that are tried; pixels from one of them within which a point is on it, at
-first and when it is refined: a step lies within half a pixel of the edge.
+"""Constants of the search for a circular edge of a pupil.
+
+They are the number of circles through three random points of the edge that are tried, and the distance from a circle,
+in pixels, within which a point lies on it: first, and when the circle is refined. The steps of a digital edge lie
+within half a pixel of it.
 """
 _SPECK = 0.02
 """Smallest area of a connected illuminated region, relative to the largest; smaller regions are ignored as specks."""

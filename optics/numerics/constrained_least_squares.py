@@ -18,8 +18,9 @@ from scipy.linalg import solve_triangular
 from scipy.optimize import nnls
 
 _FIRST_DAMPING, _LEAST_DAMPING, _MOST_DAMPING = 1e-6, 1e-20, 1e6
-"""Damping relative to the squared norms of the Jacobian's columns: at the start, at least, and where the search gives
-up.
+"""Damping relative to the squared norms of the Jacobian's columns.
+
+They are the first damping, the smallest one, and the one above which the search ends without a better point.
 """
 _RIDGE = 1e-12
 """Number added to the unit diagonal of the dual problem, as constraints may be dependent or contradictory."""

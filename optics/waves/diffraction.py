@@ -43,18 +43,20 @@ The work of computing the samples grows with the cube of the number of points.
 """
 
 _BEYOND, _BEYOND_IF_LOOSE = 4.0, 3.0
-"""Distance by which samples extend beyond each end of the grid, in Nyquist distances: for errors of 2e-12 and of 1e-8.
+"""Distances by which samples extend beyond each end of the grid, in multiples of the Nyquist distance.
+
+They give interpolation errors of at most `_TIGHT` and of `_LOOSE`.
 """
 
 _TIGHT, _LOOSE = 2e-12, 1e-8
-"""Largest error at the grid points of a unit wave that is interpolated from its samples: normal and loose."""
+"""Largest errors at the grid points of a unit wave interpolated from its samples: normal and loose accuracy."""
 
 _OVER = 1.35
 """Factor of the Nyquist number in the number of samples that is tried first."""
 _MORE, _MORE_IF_LOOSE = 22, 14
-"""Numbers added to ``_OVER`` times the Nyquist number to give the first number of samples that is tried.
+"""Numbers of samples added to ``_OVER`` times the Nyquist number, which gives the first number that is tried.
 
-They are for errors of 2e-12 and of 1e-8.
+They are for interpolation errors of at most `_TIGHT` and of `_LOOSE`.
 """
 
 _BAND_RATIO = 1.1

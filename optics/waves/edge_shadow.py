@@ -48,7 +48,10 @@ MOST_PIECES = 160
 """Largest number of polygons of a shadow: the time of a transfer function grows with the square of their number."""
 
 _WINDOW, _WINDOW_SIDES = 1.2, 16
-"""Radius and number of corners of the polygon about the unit disk to which outlines are clipped, on the stop."""
+"""Radius, in radii of the stop, and number of corners of a polygon around the stop to which outlines are clipped.
+
+Outlines outside the stop have no effect on its light.
+"""
 
 _STEPS, _CLOSE = 12, 1e-9
 """Largest number of Newton steps for a corner, and tolerance of its position in radii of the stop."""

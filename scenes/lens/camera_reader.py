@@ -104,7 +104,7 @@ def with_flat_image(lens: Prescription) -> Prescription:
 PITCH = 7e-6
 """Default pixel pitch of the line CCD, in metres."""
 LARGEST_TILT, TURNED = math.radians(45.0), 1e-12
-"""Largest tilt of an image about x, in radians, and largest sine of its tilt about y that is only rounding."""
+"""Largest tilt of an image about x, in radians, and largest sine of its tilt about y that counts as rounding error."""
 FAR = 1e6
 """Distance beyond which an object is at infinity, in metres: programs write 1e9 millimetres and more for infinity."""
 SAME = 1e-9

@@ -51,8 +51,10 @@ _LAST = 0.999
 """Fraction of the path to the image up to which bodies count: at its end all rays meet."""
 
 _WINDOW, _WINDOW_SIDES = 1.05, 8
-"""Relative radius and sides of the polygon around the stop's disk to which outlines are clipped before their rays are
-found exactly."""
+"""Radius, in radii of the stop, and number of sides of a polygon around the stop to which outlines are clipped.
+
+Clipping comes before their exact rays are traced, which are needed near the stop only.
+"""
 
 _STEPS = 4
 

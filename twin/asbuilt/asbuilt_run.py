@@ -35,7 +35,11 @@ WORST_FACTOR = 9.0
 It corresponds to residuals of three sigma on average.
 """
 _INSTRUMENT, _POSTERIOR, _PRIOR, _MOVE, _MADE = range(5)
-"""Random streams."""
+"""Numbers of the random streams of a seed.
+
+They are for the simulated instrument, the states of the posterior, those of the prior, the choice of the next move, and
+the errors of making that move.
+"""
 ALONG = tuple((float(x), 0.0) for x in np.linspace(-1.0, 1.0, 11))
 """Fields (x, y), as fractions of the half field, at which the wavefront along the line is plotted."""
 _DRAW = 7e4

@@ -28,7 +28,7 @@ from twin.framework.report import Report, Section, answer
 FREE_FOCUS = 100.0 * UNKNOWN_FOCUS
 """Standard deviation, metres, so large that a focus with it counts as unknown before the measurement."""
 ANOTHER, NONE = 3, 4
-"""Exit codes: another reading than the stated one explains the data; none does."""
+"""Exit codes if another orientation of the maps than the specified one explains the data, and if none does."""
 
 
 @dataclass(frozen=True, eq=False)

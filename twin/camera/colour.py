@@ -40,7 +40,9 @@ FOCUS_RINGS = 6
 """Number of rings of the quadrature over the stop with which the best focus of a wavelength is found."""
 
 WINDOW, PSF_POINTS = 24.0, 129
-"""Smallest side of a point image's window, in units of the longest wavelength times the F-number, and samples per side.
+"""Smallest side of the window of a point image, in units of the longest wavelength times the F-number.
+
+The second is the number of samples along a side of the window.
 """
 
 

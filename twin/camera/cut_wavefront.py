@@ -35,13 +35,14 @@ _SHADOW_NODES = 6
 """Quadrature nodes along each side of a shadow's box."""
 
 _ASTRAY, _DARK_DEGREE = 2.0, 12
-"""Limit of the departure of rays in the shadow from the mean wavefront, in peak-to-valleys of its illuminated part.
+"""Treatment of rays in the shadow that depart far from the wavefront.
 
-Beyond it, their wavefront is replaced by a polynomial of the second number's degree.
+The first is the largest accepted departure from the mean wavefront, in units of the peak-to-valley of its illuminated
+part. Beyond it, the wavefront in the shadow is replaced by a smooth polynomial, of which the second is the degree.
 """
 
 _FINER_RINGS, _FINER_NODES = 4, 2
-"""Additional rings and nodes of the finer quadrature, which checks the results."""
+"""Additional rings, and additional nodes per side of a shadow, of a finer quadrature that checks the results."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -74,9 +74,10 @@ RELATIVE_OF_SIGMAS = 1e-6
 They are computed from matrices with a condition number of 1e4 and more.
 """
 PIXEL_SHARE, GREY_LEVELS = 1e-4, 2
-"""Largest fraction of the pixels, and difference in grey levels, by which frames may differ on another processor.
+"""Largest fraction of pixels that may differ between frames of two processors, and largest difference in DN.
 
-The expected photons of these pixels lie, within rounding, where the random number of photons changes by one.
+Where the expected photons of a pixel lie, within rounding, at a value where the random number of photons changes by
+one, the frames differ.
 """
 PICTURE_LEVELS = 4
 """Largest difference of rendered figures that counts as rounding, in grey levels of 255.

@@ -47,7 +47,10 @@ LEAST_BENEFIT = 1e-3
 It is the change of the ratio of a sigma to its goal over the parameter's whole range, relative to the largest ratio.
 """
 ROOM, ROOM_STEP = 8, 0.06
-"""Number of draws of the idle parameters to make room for a step, and their rms change relative to the ranges."""
+"""Number of random changes of idle parameters that are tried to make a step feasible, and their rms size.
+
+The size is relative to the ranges of the parameters.
+"""
 _KEPT = 0.2  # share of the predicted improvement above which the box grows
 _ORDER = 2  # order of the differences: accurate to 1 %, which suffices for a step
 

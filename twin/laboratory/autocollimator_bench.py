@@ -598,7 +598,7 @@ CALIBRATION_POINTS = 9
 DRAWS = 4000
 """Number of random benches from which the spread of the readings is computed, without rendering images."""
 _BENCH, _PATTERN, _READINGS, _FRAMES = range(4)
-"""Numbers of the random streams of the seed."""
+"""Numbers of the random streams of the seed: errors of the bench, pixel patterns, readings, and noise of frames."""
 
 
 def series_per_axis(spec: AutocollimatorTestSpec) -> tuple[Series, ...]:

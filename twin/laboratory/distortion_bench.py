@@ -233,7 +233,11 @@ BLUR = 3.0
 """Pixels around the pinhole's geometric image that the centroid's window must also contain."""
 
 _BENCH, _SETTING, _READING, _PATTERN, _NOISE = range(10, 15)
-"""Numbers of the random streams of the seed; those below 10 belong to the turntable."""
+"""Numbers of the random streams of the seed; those below 10 belong to the turntable.
+
+They are for the bench's misalignment, the settings of the table, the reference's readings, the pattern of the pixels,
+and the noise of frames.
+"""
 
 
 @dataclass(frozen=True, eq=False)

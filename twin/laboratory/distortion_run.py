@@ -66,7 +66,7 @@ _EXACT = 1e-9
 """Nominal noise given to the true positions, metres, because a fit needs a weight; the estimates do not depend on it.
 """
 _GREY, _SPOT_PIXEL = 2.0, 33.0
-"""Bytes per pixel of a frame, and of the mean image of a spot."""
+"""Memory per pixel, in bytes: of a frame, and of the mean image of a spot with its fit."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -25,7 +25,7 @@ from twin.laboratory.turntable_run import TurntableRun
 Files: TypeAlias = Mapping[str, str | bytes]
 """Path of a file in the export folder -> its contents."""
 COMPARISONS, HELD_OUT, SPOTS = "comparisons.csv", "held_out.csv", "spots.csv"
-"""Names of tables."""
+"""Names of the exported tables: comparisons of a turntable with its reference, held-out ones, and spot positions."""
 
 
 def export_turntable(run: TurntableRun) -> Files:

@@ -51,7 +51,7 @@ from twin.targets.target_images import ALONG, TRACK
 
 _MISSET, _PATTERNS, _LEVEL, _SETTING, _SCAN = range(5)
 _GREY, _EDGE_PIXEL = 2.0, 57.0
-"""Bytes per pixel of a frame that is kept, and of one of an edge while it is exposed and measured."""
+"""Memory per pixel, in bytes: of a stored frame, and of a frame of an edge while it is exposed and measured."""
 
 
 @dataclass(frozen=True, eq=False)

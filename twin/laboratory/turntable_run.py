@@ -48,7 +48,11 @@ from twin.framework.record import Quantity, Record
 from twin.laboratory.measured_readings import Comparisons, DataFile, read_turntable
 
 _TABLE, _CALIBRATION, _HELD_OUT, _SPREAD = range(4)
-"""Numbers of the random streams of the seed."""
+"""Numbers of the random streams of the seed.
+
+They are for the table's dividing error, the comparisons of the calibration, the held-out comparisons, and the random
+offsets of their angles.
+"""
 _FIXED_POINT_STEPS = 8
 """Fixed-point iterations from a true angle to a reading; they leave less than rounding errors."""
 

@@ -23,7 +23,10 @@ from twin.live.computer import BeforeKey, Computer, ComputerLost, Kind
 MOST_CLIENTS = 8
 """Largest number of connected pages."""
 RATE, BURST = 400.0, 2000
-"""Messages per second that a page may send, and largest burst: four times the rate of the fastest pointer."""
+"""Messages per second that a page may send on average, and largest number at once (burst).
+
+The rate is four times that of the fastest pointer.
+"""
 BAD_MESSAGES = 20
 """Number of invalid messages after which a page is disconnected."""
 MOST_RECORDED = 20_000
@@ -37,7 +40,7 @@ STOP_TIMEOUT = 10.0
 SEND_TIMEOUT = 20.0
 """Time that a page may take to receive one answer, in seconds."""
 POLICY_VIOLATION, TRY_AGAIN = 1008, 1013
-"""Codes with which a WebSocket is closed."""
+"""Codes with which the server closes a WebSocket: the page violates a rule, or it may try again later."""
 
 
 RESTARTED_TEXT = "{}; it is being restarted, and the knobs are kept"

@@ -193,7 +193,7 @@ ANSWER_TIMEOUT = 60.0
 KEEP_ALIVE = 30.0
 """Idle time between an answer and the next request, in seconds."""
 MOST_UNAUTHENTICATED, MOST_OF_ONE_ADDRESS = 128, 64
-"""Largest number of unauthenticated connections, in all and of one address."""
+"""Largest numbers of connections that have not been authenticated yet: in all, and from one address."""
 MOST_AUTHENTICATED = 64
 """Largest number of authenticated connections without a WebSocket: eight pages of a browser open six each."""
 ACCEPT_BACKLOG = 16

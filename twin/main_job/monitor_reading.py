@@ -387,7 +387,10 @@ def worst_checks(readings: Iterable[MonitorReading]) -> tuple[SelfCheck, ...]:
 
 
 SHARE_DECIMALS, OFF_DECIMALS = 3, 1
-"""Decimals of shares, and of linearity errors in sigmas: rounding errors seldom change numbers rounded so."""
+"""Decimals to which fractions of variances, and linearity errors in sigmas, are rounded in results.
+
+Rounding errors of the computation then rarely change a number.
+"""
 READING_DECIMALS = 6
 """Number of decimals to which files give an estimated change divided by its sigma."""
 _TEST_KEYS: Mapping[str, Callable[[Consistency], Any]] = {

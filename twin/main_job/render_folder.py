@@ -253,7 +253,10 @@ if TYPE_CHECKING:
 LIMITS = "limits"
 """Name of the figure on what limits the accuracy of the estimated changes."""
 SUMMARY, SCENE, IRRADIANCE = "summary", "scene", "irradiance"
-"""Drawings that are files of bytes, not figures of the report: summary.png, scene.glb, irradiance.nc."""
+"""Names of the drawings that are files of their own, not figures of the report.
+
+The files are summary.png, scene.glb and irradiance.nc.
+"""
 APART = (SUMMARY, SCENE, IRRADIANCE)
 LOADED = (SCENE, IRRADIANCE)
 """Drawings that need the libraries trimesh and h5netcdf, which nothing else in a run uses.

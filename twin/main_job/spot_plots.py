@@ -267,7 +267,7 @@ def _motion_panel(axes: Axes, values: np.ndarray, names: Sequence[str], norm: Sy
 WIDTH, DPI = 14.0, 100
 """Width of the picture in inches, and dots per inch: 1400 px wide."""
 NOTE, LONGEST_NOTE = 0.85, 150
-"""Height of a note's line, in rows of the table, and number of characters that fit in the width."""
+"""Height of a line of notes below the table, in heights of a table row, and number of characters per line."""
 FIRST = 0.22
 """Right edge of the column of true values, as a fraction of the picture's width."""
 REACH = 2.2

@@ -156,7 +156,10 @@ _MOST_WAVES = 1e6
 """Largest plausible wavefront error, in waves rms; a larger one means that the result is wrong."""
 
 _FEW, _APART = quadrature.even_disk(500), 0.02
-"""Points of the stop for a check of the area of shadows against their outlines, and the allowed difference."""
+"""Points of the stop, and allowed difference of fractions of the stop, for a check of the light that bodies block.
+
+The fraction from outlines of shadows is compared with that of the points that are blocked.
+"""
 
 AT_ONCE = 40
 """Number of states (perturbed instruments) traced in one launch, to limit memory: 40 take 60 MB."""

@@ -389,7 +389,7 @@ def _warnings(
 _AS_GOOD = 3.0
 """Difference of log likelihoods (a factor 20 of likelihood) below which the spots do not show which body jumped."""
 MOST_BETWEEN, LARGEST_BETWEEN = 7, 400
-"""Largest number of smoothed times between two times of a course, and in total."""
+"""Largest numbers of smoothed times that are inserted: between two times of a course (time series), and in total."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -28,10 +28,10 @@ STEP_BACK = 1e-5
 """Distance behind a triangle hit by rounding only at which the search for the next surface continues, in metres."""
 
 STRAY, UNLIKELY, GONE = 1, 2, 8
-"""Bits of a path's history, which tell whether it still behaves like its neighbours; a path with none of them does.
+"""Bits of a path's history; a path without any of them behaves like its neighbours.
 
-They are: scattered or diffused somewhere; unit of the number of unlikely directions taken, at most two; escaped to
-infinity.
+STRAY: it was scattered somewhere. UNLIKELY: unit of the number, at most two, of unlikely directions that it took. GONE:
+it has escaped to infinity.
 """
 
 

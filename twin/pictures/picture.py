@@ -183,8 +183,7 @@ def _sensor(mi: Any, view: View) -> Any:
 
 
 BLUR, BLUR_SHARE = (6.0, 16.0), 0.025
-"""Limits of the width over which the light on a flat patch is averaged, pixels, and its ratio to the root of the area.
-"""
+"""Width over which the light on a flat patch is averaged: limits in pixels, and ratio to the root of its area."""
 EXPOSURE = 0.88
 """Factor by which radiance is multiplied before the tone curve."""
 SHOULDER = 0.75

@@ -21,7 +21,7 @@ from twin.study.runs.plan import Plan
 RUN = "run"
 FAILED, MESSAGE, SEED = "failed", "message", "seed"
 DOUBT, MONITOR = "doubt", "render"
-"""Variable with the reason why sigma does not hold, and the base command whose runs have it."""
+"""Name of the variable with the reason why a run's sigma is not valid, and the base command whose runs have it."""
 ROLE = "role"
 """Name of the attribute of every variable of the data set that says: factor, response, sigma or bookkeeping."""
 

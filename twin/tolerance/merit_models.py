@@ -33,7 +33,7 @@ _CLOSE = 1e-4
 _AT_ONCE = 8_000_000
 """Largest number of array elements that a matrix product holds in memory at a time."""
 _MOST_HELD, _FEWEST = 25_000_000, 500
-"""Largest number of elements of a scaled model in memory, and its smallest number of draws."""
+"""Largest number of array elements of a scaled model in memory, and smallest number of draws that it uses."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -178,7 +178,7 @@ MOST_STEPS = 12
 """Largest number of iterations of a camera's adjustments, three times as many as any library camera has needed."""
 
 FIRST_RULE, LARGEST_RULE = 3, 17
-"""Wavelengths of the first and of the last rule over a spectrum."""
+"""Numbers of wavelengths of the first and of the largest quadrature rule over a spectrum that is tried."""
 EVERY = 4
 """Distortion is evaluated at every ``EVERY``-th of the points along the line."""
 _MOVE = 1e-3

@@ -48,8 +48,10 @@ EXACT = 4
 NEAR_MODEL = 0.05
 """Relative difference of a merit's quantile between model and traced cameras above which a warning is given."""
 _PAIR, _DRAWN, _SHOWN, _MODELLED = 6.6e3, 32.0, 120.0, 40.0
-"""Bytes of two numbers that vary together, by which the merits are modelled to the second order; of each camera, of a
-number that varies, of a merit or compensator in the tables, and of a merit of the models.
+"""Estimates of memory, in bytes.
+
+They are for each pair of toleranced numbers in the second-order models; and, for each camera, for each toleranced
+number, for each merit or compensator in the tables, and for each merit of the models.
 """
 
 

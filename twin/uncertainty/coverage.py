@@ -37,10 +37,16 @@ HALF_WIDTHS = tuple(float(np.sqrt(2.0 * gammaincinv(0.5, level))) for level in L
 FALSE = 1e-2
 """Probability that any count of covered intervals is outside its limits although every sigma is right."""
 CHUNK, _PIXELS = 32, 10_000_000
-"""Numbers of states, and of pixels of their images, that are rendered at once (2 GB); results do not depend on them."""
+"""Largest numbers of states, and of pixels of their images, that are rendered together, to limit memory to 2 GB.
+
+Results do not depend on them.
+"""
 STATES = "random states"
 _DRAWN, _DETECTOR, _BEFORE, _AFTER = 9, 10, 11, 12
-"""Numbers of the random streams of the states, of their detectors and of the noise before and after."""
+"""Numbers of the random streams of a seed.
+
+They are for the random states, their detectors, and the image noise before and after the change.
+"""
 
 
 @dataclass(frozen=True, eq=False)

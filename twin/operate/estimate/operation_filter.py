@@ -60,7 +60,7 @@ HEAD_READINGS = 16
 Filtering so many readings again takes as long as saving the state.
 """
 _MODEL, _HEAD = -1, 0
-"""Numbers of the checkpoints that contain the traced model, and the newest state of the estimator."""
+"""Numbers of two checkpoints in the record: the traced model, and the newest state of the estimator."""
 
 
 class Operation:

@@ -339,7 +339,10 @@ def _recorded(
 
 
 WRONG_PIXELS, WRONG_SIGMAS, WRONG_FLOOR = 3.0, 5.0, 1.0
-"""Limits of the error of a correct match: 3 pixels, and 5 of its sigmas plus 1 pixel."""
+"""Limits of the error of a match, above which it counts as wrong.
+
+They are a limit in pixels, and another in sigmas of the match, to which the third number, in pixels, is added.
+"""
 WRONG = f"more than {WRONG_PIXELS:g} px off, or more than {WRONG_SIGMAS:g} sigmas and {WRONG_FLOOR:g} px"
 """Text for reports that defines a wrong match."""
 

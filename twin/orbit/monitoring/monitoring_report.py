@@ -49,7 +49,7 @@ _COLOURS = (svg.BLUE, svg.VERMILION, svg.GREEN, svg.PURPLE, svg.ORANGE, svg.SKY)
 _BESIDE = {"loc": "upper left", "bbox_to_anchor": (1.0, 1.0)}
 """Position of a legend beside the axes, where it does not hide curves."""
 _BODIES, _MOTIONS = 3, 3
-"""Largest numbers of bodies and of motions of an unobservable mode that the report names in its text."""
+"""Largest numbers of bodies, and of motions of each, that the report names for an unobservable mode."""
 _LEAST = 1e-6
 """Size below which values of an unobservable mode are rounding errors and are not reported."""
 

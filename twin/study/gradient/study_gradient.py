@@ -98,10 +98,11 @@ def _rest(motion: Motion) -> Motion:
 
 
 SPOT_REACH, SIGHT_REACH = 1.0, 1e-4
-"""Steps of the derivative of the formulas, px and rad.
+"""Steps of the numerical derivatives of the formulas: of spot shifts in px, and of the line of sight in rad.
 
-They are so small that the error after Richardson's extrapolation is below rounding, and so large that rounding is
-below 1e-11."""
+They are so small that the error after Richardson's extrapolation is below rounding, and so large that rounding is below
+1e-11.
+"""
 SIGHT_SHARE = 5e-3
 """Largest step by which the lines of sight are rotated for a derivative, as a fraction of half the field of a line CCD.
 

@@ -37,7 +37,10 @@ BUDGET = "monitor_pair"
 TABLE_3 = load_printed("001").numbers("table3.spot_arcsec")
 TABLE_4 = load_printed("001").number("table4.spot_arcsec")
 FOCAL_PLANE, LONG_PRISM = "coordinate_thermal", "prism_180_thermal"
-"""Causes whose inputs are also applied by themselves."""
+"""Names of two causes of the error budget whose inputs are also applied by themselves, at three sigmas.
+
+They are the temperatures of the focal planes and of the long prisms.
+"""
 FEW_DRAWS = (FOCAL_PLANE, "central_prism_thermal")
 """Causes with only two or three random numbers per state.
 

@@ -46,7 +46,11 @@ INSTRUMENT = "monitor_pair"
 FRAMES = 9
 PARAMETERS = ("d_alpha", "d_beta", "d_gamma", "d_f")
 SHIFT, TURN, SCALE, PISTON, FACE = 50e-6, 20 * ARCSEC, 20e-6, 50e-6, 4 * ARCSEC
-"""Motions, SI: of the line CCD along X or Y, about Z; growth of the camera; line CCD along Z; turn of a return face."""
+"""Sizes of the motions that test the formulas, in metres, radians, and as a fraction.
+
+They are shifts of the line CCD along X or Y, its rotation about Z, the expansion of the camera, the shift of the line
+CCD along Z, and the rotation of a reflecting face.
+"""
 AMOUNTS = {"d_alpha": SHIFT, "d_beta": SHIFT, "d_gamma": TURN, "d_f": SCALE}
 """Parameter of a camera -> size of the motion that changes it in the simulated states.
 

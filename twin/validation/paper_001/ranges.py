@@ -48,7 +48,11 @@ gradients over the field as well. f and f_x are the focal lengths along and acro
 SHARE = 24
 """Number of images of 96 x 96 pixels that are rendered at once, to limit memory."""
 ROUNDS, NEAR = 3, 1e-3
-"""Refinement steps at most; and how near a point to a limit, relative to the size, makes another one needless."""
+"""Refinement of the crossings of an error curve with its limit.
+
+The first is the largest number of refinement steps; the second the relative distance in size within which an existing
+point makes another one unnecessary.
+"""
 
 Sample = Callable[[np.ndarray], Mapping[str, np.ndarray]]
 """Function from N sizes of a change, (N,), to name -> (N,) errors divided by the allowed error.

@@ -34,7 +34,7 @@ from twin.validation.group import Context, drawing, group_of
 from twin.validation.paper_003.model import FIELDS, all_errors, changed, setup_of, without_light
 
 FULL, FAST = 150, 24
-"""Campaigns."""
+"""Numbers of simulated campaigns in a full and in a fast run of the checks."""
 SCHEMES = {
     1: "Beijing",
     2: "Beijing and Anhui",

@@ -45,10 +45,10 @@ from twin.validation.check import CheckResult, Chosen, rms
 from twin.validation.group import Context, drawing, group_of
 
 FIELDS, IMAGES = "calibrate.yaml", "calibrate_images.yaml"
-"""Files of scenes/orbit: seven fields of drawn points; fields of rendered images."""
+"""Names of the jobs in scenes/orbit: seven fields with simulated image points, and fields with rendered images."""
 FIELD = "Beijing"
 CAMPAIGNS, FAST_CAMPAIGNS = 9, 5
-"""Campaigns of seven fields, in the full and in the fast run, for the errors of yaw over their sigma."""
+"""Numbers of campaigns over seven fields, in a full and a fast run, that compare errors of yaw with their sigma."""
 FAST_SIDE = 380
 """Lines and pixels of a rendered image patch in the fast run."""
 ROUNDS = (1, 3, 10, 30, 100, 300, 1000, 3000)

@@ -41,7 +41,10 @@ ACCURACY_UM = _PRINTED.number("distortion.accuracy_um")
 POINTS, SETS = (_PRINTED.whole(f"distortion.{name}") for name in ("points", "sets"))
 RAW, COMPENSATED = (np.array(_PRINTED.column(f"table2.{name}_um")) for name in ("raw", "compensated"))
 TESTS, FAST_TESTS = 60, 14
-"""Simulated tests: another turntable, calibration, zero, axis, detector and noise in each."""
+"""Numbers of simulated distortion tests in a full and in a fast run.
+
+Each has another turntable, calibration, zero, axis, detector and noise.
+"""
 FEW = 5
 """Step between the points of a reduced set (every fifth point), to check the effect of the number of points."""
 UNEVEN = slice(0, 44)

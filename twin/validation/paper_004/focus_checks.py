@@ -40,7 +40,7 @@ They are the theodolite's 10 arcsec, a panchromatic pixel, and a step of the shi
 """
 TEST = "focus"
 ALIGNMENTS, FAST_ALIGNMENTS = 12, 1
-"""Alignments from random mis-settings."""
+"""Numbers of simulated focal-plane alignments from random initial misalignments, in a full and in a fast run."""
 
 _ALL_LOSSES = "what the scene file assumes beyond the paper, in waves, pixels or line periods, times"
 

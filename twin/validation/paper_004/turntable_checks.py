@@ -28,13 +28,13 @@ REPEATS = load_printed("004").whole("turntable.repeats")
 REPEAT_RMS_ARCSEC = load_printed("004").number("turntable.repeat_rms_arcsec")
 FIT_RMS_ARCSEC = load_printed("004").number("turntable.fit_rms_arcsec")
 TABLES, FAST_TABLES = 1000, 200
-"""Turntables that are calibrated; quick."""
+"""Numbers of simulated turntables that are calibrated, in a full and in a fast run."""
 FURTHER = 1.6
 """Factor on an input (not printed in the paper) for a second calibration of the tables, which shows how the result
 depends on it.
 """
 FITTED, FAST_FITTED = 60, 12
-"""Turntables whose calibration is fitted."""
+"""Numbers of simulated turntables whose calibration is fitted, in a full and in a fast run."""
 NETWORK = "network"
 _REPEATED = tuple(f"004.turntable.{name}" for name in ("repeat", "criterion", "chauvenet", "chauvenet_mean"))
 FIT_NAMES = {name: name.replace("_", " ") for name in FITS} | {"fourier": "Fourier series"}

@@ -29,7 +29,10 @@ from twin.validation.group import Context, group_of
 FINER = 10.0
 """Ratio of the pixel sizes of the coarse (5 m) and the fine (0.5 m) images."""
 IMAGE, FINE = 0.3, 0.1
-"""Errors of an image point, pixels."""
+"""Standard deviations of an image point, pixels, in the main simulation and in a second one.
+
+The second gives the exponent with which the result depends on this error.
+"""
 ERRORS = (0.35, 0.7, 1.4)
 """Standard deviations of the attitude, arcsec, for which both methods are simulated to find the limit."""
 STATED = 0.5
