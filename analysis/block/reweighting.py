@@ -1,4 +1,6 @@
-"""Robust weights of packets of observations, and variance factors of groups, from residuals.
+"""Robust weights of measurements, and variance factors of groups of observations, from residuals.
+
+A packet is the d equations that one measurement of one ground point gives; it has one weight.
 
 The module serves adjustments of any kind: a calibration campaign's (`analysis.calibration`) and a block's.
 """
@@ -75,7 +77,7 @@ class GroupTest:
     def estimated(self) -> float:
         """Next variance factor by Foerstner's estimate, between 1 / `LARGEST_FACTOR` and `LARGEST_FACTOR`.
 
-        It is unbiased for packets of weight 1 and 0; a weight that decreases with the residual makes it too small.
+        It is unbiased for measurements of weight 1 and 0; a weight that decreases with the residual makes it too small.
         """
         return bounded(self.factor * self.ratio) if self.redundancy >= _LEAST_REDUNDANCY else self.factor
 
@@ -179,7 +181,8 @@ class Rule:
     Attributes
     ----------
     packets : {'huber', 'igg', 'accept'} or None
-        Huber's weights, IGG III, or "accept": 1 up to the end of IGG III and 0 beyond; None for unchanged weights.
+        Weights of the measurements (packets of equations): Huber's weights, IGG III, or "accept": 1 up to the end of
+        IGG III and 0 beyond; None for unchanged weights.
     factor : {'median', 'components'} or None
         Factor of the image points from the median of their residuals, or of groups by variance components; None for
         unchanged factors.

@@ -955,7 +955,7 @@ that are to be detected.
 _SIZES = np.geomspace(0.03, 100.0, 71)
 """Simulated sizes of a jump relative to its prior standard deviations, 12 percent apart."""
 _DRAWS, _BEFORE = 400, 20
-"""Number of simulated jumps of each size, and of readings before them, after which the filter is in steady state.
+"""Number of simulated jumps of each size, and of readings before them, which bring the filter to steady state.
 
 With this number of jumps, a fraction of 95 % of detected ones is known to 1.1 %.
 """

@@ -256,8 +256,8 @@ class PlaneFit:
 def fit_plane(station: Station, strip: Strip, method: Method = "tls") -> PlaneFit:
     """Fit a plane through the station to the ground points of one CCD line.
 
-    The methods are total least squares (tls) and z = a0 x + a1 y + a2 by the paper's eq. 5, with the printed or the
-    corrected sign.
+    The methods are total least squares (tls) and z = a0 x + a1 y + a2 by eq. 5 of paper 000 (Liu and Huang 2014), with
+    the printed or the corrected sign.
 
     Raises
     ------
@@ -482,7 +482,7 @@ class PlaneAngles:
     values : (m,) ndarray
         Acute angles by atan2, in radians.
     printed : (m,) ndarray
-        Acute angles by the paper's arccos, in radians.
+        Acute angles by the arccos of paper 000 (Liu and Huang 2014), in radians.
     covariance : (m, m) ndarray
         Covariance from points and station, in rad^2.
     gradient : (m, k, 3) ndarray

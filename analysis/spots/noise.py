@@ -47,7 +47,7 @@ ROUNDING_VARIANCE = 1.0 / 12.0
 FINE = 1.0
 """Rms of normal noise, DN, from which the rounding error is new in every frame: the systematic part is 4e-19 DN^2."""
 COARSE, FEW = 0.3, 3.0
-"""RMS noise, DN, below which rounding errors of a spot are correlated, and the light signal, DN, at which it is taken.
+"""RMS noise, DN, below which rounding errors are correlated, and the light signal, DN, at which it is computed.
 
 Rings and wings of a spot then show the same steps of grey values in all frames, and the rounding error is correlated
 between neighbouring pixels, which `systematic_variance` does not model.

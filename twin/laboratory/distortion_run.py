@@ -156,7 +156,7 @@ class DistortionRun:
 
     @cached_property
     def estimates(self) -> Mapping[str, Estimate]:
-        """Name -> estimate by the paper's equations and by fits with a constant term, all with compensated angles."""
+        """Name -> estimate by equations of paper 004 or by a fit with a constant term, all with compensated angles."""
         return _estimates(self.compensated.fit, self.compensated.smooth, self.compensated.zero)
 
 
@@ -218,10 +218,10 @@ class SimulatedDistortion(DistortionRun):
 def _estimates(
     fit: interior.InteriorOrientation, smooth: interior.InteriorOrientation, zero: float
 ) -> dict[str, Estimate]:
-    """Return name -> estimate by the paper's equations (2), (3) and (4), and by the fits with a constant term.
+    """Return name -> estimate by equations (2), (3) and (4), and by the fits with a constant term.
 
-    Equation (4) uses the principal distance of (3). Equation (2) is also evaluated with the angles counted from `zero`,
-    radians.
+    The equations are those of paper 004 (Li et al. 2020). Equation (4) uses the principal distance of (3). Equation
+    (2) is also evaluated with the angles counted from `zero`, radians.
     """
     position, angles = fit.position, fit.angle
 

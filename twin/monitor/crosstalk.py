@@ -1,8 +1,8 @@
 """Response of every estimator to elementary motions of bodies, compared with the true change of the camera.
 
 An estimator computes the changes of a camera's parameters from the shifts of the monitor's spots. This module gives the
-scale factors of the formulas printed in the paper, and the crosstalk: the change that an estimator reports for one
-parameter although another cause moved the spots.
+scale factors of the formulas printed in paper 001 (Wang et al. 2018), and the crosstalk: the change that an estimator
+reports for one parameter although another cause moved the spots.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ class FormulaFactor:
     Attributes
     ----------
     formula : str
-        Number of the equation or table in the paper.
+        Number of the equation or table in paper 001 (Wang et al. 2018).
     estimator, parameter : str
         Names of the estimator and of the camera parameter in the results.
     motion : str
@@ -69,7 +69,7 @@ class CameraCrosstalk:
     Attributes
     ----------
     motions : tuple of ElementaryMotion
-        Motions, beginning with the four for which the paper derives its formulas.
+        Motions, beginning with the four for which paper 001 (Wang et al. 2018) derives its formulas.
     spot_shift : (2 n, M) ndarray
         Shifts of the spots, in pixels: row and column of the first spot, then of the second, and so on.
     true : (P, M) ndarray
@@ -77,7 +77,7 @@ class CameraCrosstalk:
     readings : mapping of str to (P, M) ndarray
         Estimator -> its estimates of these changes.
     factors : tuple of FormulaFactor
-        Scale factors of the formulas printed in the paper.
+        Scale factors of the formulas printed in that paper.
     observability : ObservabilityReport
         Combinations of the motions that the spots can and cannot separate.
     channels : tuple of str

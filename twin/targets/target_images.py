@@ -512,7 +512,7 @@ class TargetCamera:
         self.region = region
         along = 0.5 * usable * band.pitch * np.array(list(PLACES.values()))
         self.places = np.stack([along, np.full(len(along), band.offset)], axis=-1)
-        """Nominal (along, across) of PLACES, metres."""
+        """Nominal positions (along the line, across it) on the detector of the targets of PLACES, metres."""
         self.directions = path.directions(self.places)
 
     def views(self, state: State) -> dict[str, View]:
