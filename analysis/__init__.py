@@ -146,7 +146,7 @@ _MODULES = {
     "wavefront_maps.pupil_fit": ("Pupil", "find_pupil", "fit_wavefront_map"),
     "wavefront_maps.zernike_table": ("ansi_to_nm", "fringe_to_nm", "nm_to_noll"),
 }
-"""Module of this package -> public names that it defines."""
+"""Public names by the module of this package that defines them; they are imported when first used."""
 
 __all__ = [
     "CameraCalibration",

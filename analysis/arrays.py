@@ -30,13 +30,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 ARCSEC = math.pi / 180 / 3600
-"""One second of arc, rad."""
+"""One second of arc, in radians."""
 
 ARCMIN = 60.0 * ARCSEC
-"""One minute of arc, rad."""
+"""One minute of arc, in radians."""
 
 UM_PER_M, MM_PER_M = 1e6, 1e3
-"""Micrometres and millimetres in a metre."""
+"""Micrometres in a metre, and millimetres in a metre."""
 
 
 class MeasurementError(Exception):
@@ -69,7 +69,10 @@ PER_SI: Mapping[str, float] = {
 """Number of each unit in one SI unit. A unit that is not listed is printed after the unscaled number."""
 
 LONGEST, MOST, FEW = 70, 400, 4
-"""Greatest number of characters of one value and of the whole text; most elements of an array printed one by one."""
+"""Limits of the short texts of ``__repr__``: greatest number of characters of one value, and of the whole text.
+
+The third number is the greatest number of elements of an array or list that are printed one by one.
+"""
 
 _FIELD = re.compile(r"(?P<path>[\w.]+)(?: \[(?P<unit>[^\]]+)\])?")
 _SI_ENDING = re.compile(r"_(rad|m|s)$")
@@ -202,18 +205,20 @@ def _range(values: np.ndarray, unit: str) -> str:
 
 
 class StateArrays:
-    """Base class of dataclasses whose fields are arrays of S states along the first axis.
+    """Base class of dataclasses whose fields are arrays with one element for each of S states along the first axis.
+
+    A state is whatever the rows of a result belong to: an epoch, a measurement or a spot.
 
     A field may also be None, a mapping of arrays, or another result of the same states.
     """
 
     def at(self, states: slice) -> Self:
-        """Return the result of a slice of the states.
+        """Return a result that contains only the selected states.
 
         Parameters
         ----------
         states : slice
-            Range along the first axis.
+            Range of states to keep, along the first axis of all arrays.
         """
         return type(self)(**{name: _at(getattr(self, name), states) for name in _names(self)})
 

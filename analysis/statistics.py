@@ -179,7 +179,7 @@ def robust_variance(squares: ArrayLike) -> float:
     Parameters
     ----------
     squares : (n,) array_like
-        Squared lengths of the residuals.
+        Squared lengths of n residuals.
     """
     # median of chi-square with two degrees of freedom is 2 ln 2
     return float(np.median(np.asarray(squares)) / (2.0 * np.log(2.0)))

@@ -40,7 +40,10 @@ Status = Literal["ok", "note", "failed"]
 
 @dataclass(frozen=True)
 class Check:
-    """Line of the doctor's report. Only the status "failed" makes the exit code 1; "note" is information."""
+    """One line of the doctor's report: name of the check, status and detail.
+
+    The status is "ok", "note" for information, or "failed", which makes the exit code 1.
+    """
 
     name: str
     status: Status

@@ -1,4 +1,7 @@
-"""Command ``python -m twin.lab``: laboratory tests of a camera, simulated or from files of measurements (paper 004)."""
+"""Command ``python -m twin.lab``: laboratory tests of a camera (paper 004, Li et al. 2020).
+
+The tests are simulated, or evaluated from files of measurements.
+"""
 
 from __future__ import annotations
 
@@ -15,7 +18,7 @@ app = program(no_args_is_help=True)
 
 @app.callback()
 def main() -> None:
-    """Test a camera in the laboratory as paper 004 does.
+    """Test a camera in the laboratory as paper 004 (Li et al. 2020) does.
 
     Every image is rendered through the traced camera, noise included, and only images and readings reach the analysis.
 

@@ -16,9 +16,9 @@ from analysis.block.point_reduction import FixedPoints, Heights, LineImage, Pack
 from analysis.orbit.three_line_model import BIAS, DRIFT
 
 OFFSET = ("along", "across", "down")
-"""Axes of an orbit error in the mean body axes of a pass."""
+"""Names of the axes of an orbit error: along track, across track and down, the mean body axes of a pass."""
 DATUM = 1000.0
-"""A-priori sigma, in metres, of a common shift of all control points where one is estimated."""
+"""A-priori standard deviation of the common shift of all control points, in metres, if that shift is an unknown."""
 _FLOOR = 1e-10
 """Lower bound of the eigenvalues of a camera's prior covariance, relative to the largest, which keeps it invertible:
 unknowns that the prior fixes may still change by 1e-5 sigma.
@@ -34,7 +34,7 @@ class Process:
     name : str
         Name such as "PASS attitude walk".
     support : Support
-        Unknowns of the error model.
+        Unknowns of the error model, with their prior precision.
     column : int
         Index of the first unknown among all unknowns of the adjustment.
     kind : str
@@ -67,9 +67,10 @@ class Assembly:
     all_processes : tuple of Process
         All processes, each once.
     changes : mapping of str to (4,) ndarray of int
-        Indices of the unknowns d_alpha, d_beta, d_gamma, d_f of each scene's camera.
+        For the camera of each scene, indices of the unknowns d_alpha, d_beta, d_gamma (rotations about its Y, X and Z
+        axes) and d_f (change of the principal distance).
     units : mapping of str to (4,) ndarray
-        Unit in which each of these unknowns is expressed, in radians and metres.
+        Scale of each of these unknowns: the change, in radians or metres, for a value of 1.
     datum : (0,) or (3,) ndarray of int
         Indices of the unknown common shift of the control points; empty if none is estimated.
     axes : mapping of str to (3, 3) ndarray
@@ -104,7 +105,10 @@ class Assembly:
         return tuple(name or "terrain height" for name in names)
 
     def corrections(self, of: str, times: Array) -> Corrections:
-        """Return the attitude and station corrections of a pass at n times, as functions of the unknowns."""
+        """Return the attitude and station corrections of a pass at n times, as linear functions of the unknowns.
+
+        `of` is the name of the pass, `times` are in seconds. The station is the position of the satellite.
+        """
         parts = []
         for kind in ("attitude", "station"):
             for process in self.processes[kind, of]:
@@ -210,19 +214,22 @@ def _scopes(block: Block, term: Term, times: Mapping[str, Array]) -> dict[str, l
 
 
 def _axes(block: Block, name: str) -> Array:
-    """Return the (3, 3) rotation nearest to the mean attitude of a pass."""
+    """Return the mean body axes of a pass as columns, ITRS: the (3, 3) rotation nearest to its mean attitude."""
     attitudes = [s.rays.attitude for s in block.scenes if s.of == name and len(s.rays.point)]
     attitudes += [f.attitude for f in block.footprints if f.of == name]
     return np.asarray(Rotation.from_matrix(np.concatenate(attitudes)).mean().as_matrix())
 
 
 def _unit(count: int) -> sparse.csr_matrix:
-    """Return a sparse identity matrix."""
+    """Return a sparse identity matrix of the given size."""
     return sparse.csr_matrix(sparse.eye(count))
 
 
 def _cameras(block: Block, priors: list[PriorGroup], size: int) -> tuple[dict[str, Indices], dict[str, Array], int]:
-    """Return indices and units of the unknown camera changes in passes with an image, and the number of unknowns."""
+    """Add the priors of the camera changes to a list and return the indices and units of these unknowns.
+
+    Only passes that have an image by the camera count. The third result is the number of all unknowns so far.
+    """
     order = [block_pass.name for block_pass in block.passes]
     changes: dict[str, Indices] = {}
     units: dict[str, Array] = {}
@@ -257,7 +264,7 @@ def _cameras(block: Block, priors: list[PriorGroup], size: int) -> tuple[dict[st
 
 
 def _alone(block: Block, camera: str) -> CameraPrior:
-    """Return the prior of one camera's changes alone, marginal where cameras have a joint prior."""
+    """Return the prior of one camera's changes; a joint prior of several cameras is marginalised."""
     assert not isinstance(block.monitored, JointCameraPrior)
     return (block.monitored or block.known).get(camera, block.known[camera])
 

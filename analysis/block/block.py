@@ -15,7 +15,7 @@ from analysis.orbit.three_line_model import LineModel, Rays
 
 Scope = Literal["pass", "tracker", "block"]
 SENSORS = ("ties", "control", "monitor", "laser", "terrain", "tracker_angles")
-"""Names of the observations that can be excluded from a block."""
+"""Names of the kinds of observations that can be excluded from a block."""
 
 
 @dataclass(frozen=True)
@@ -72,12 +72,15 @@ class Scene:
 
 @dataclass(frozen=True, eq=False)
 class CameraPrior:
-    """Prior of a camera's d_alpha, d_beta, d_gamma (radians) and d_f (metres) in the T passes of a block.
+    """Prior distribution of the changes of one camera in the T passes of a block.
+
+    The changes are d_alpha, d_beta, d_gamma (rotations about the camera's Y, X and Z axes, in radians) and d_f (change
+    of the principal distance, in metres).
 
     Attributes
     ----------
     mean : (T, 4) ndarray
-        Expected changes, in the order of the block's passes.
+        Expected changes d_alpha, d_beta, d_gamma, d_f, in the order of the block's passes.
     covariance : (4 T, 4 T) ndarray
         Covariance of the changes, pass by pass.
     """
@@ -95,7 +98,8 @@ class JointCameraPrior:
     cameras : tuple of str
         Names of the cameras.
     mean : (C, T, 4) ndarray
-        Expected changes d_alpha, d_beta, d_gamma (radians) and d_f (metres).
+        Expected changes d_alpha, d_beta, d_gamma (rotations about the camera's Y, X and Z axes, in radians) and d_f
+        (principal distance, in metres).
     covariance : (4 T C, 4 T C) ndarray
         Covariance of the changes, camera by camera and within each pass by pass.
     """
@@ -118,7 +122,7 @@ class Points:
     Attributes
     ----------
     ids : (m,) ndarray of str
-        Names of the points.
+        Names of the m points.
     start : (m, 3) ndarray
         Surveyed coordinates of control points, approximate ones of the others, ITRS, in metres.
     role : (m,) ndarray of str
@@ -135,7 +139,7 @@ class Points:
 
 @dataclass(frozen=True, eq=False)
 class Footprints:
-    """Laser footprints of one pass.
+    """Laser altimeter footprints, n of them, of one pass.
 
     Attributes
     ----------
@@ -168,7 +172,7 @@ class Footprints:
     sigma: tuple[float, float]
 
     def taken(self, keep: NDArray[np.bool_]) -> Footprints:
-        """Return the footprints that a mask (n,) selects."""
+        """Return the footprints that a boolean mask, with one element for each footprint, selects."""
         rows = (self.time, self.station, self.attitude, self.aim, self.distance)
         time, station, attitude, aim, distance = (row[keep] for row in rows)
         return Footprints(self.of, self.point[keep], time, station, attitude, aim, distance, self.sigma)
@@ -176,7 +180,7 @@ class Footprints:
 
 @dataclass(frozen=True, eq=False)
 class Terrain:
-    """Terrain model that serves as weak height control.
+    """Terrain model that serves as weak height control of n points.
 
     Attributes
     ----------
@@ -199,7 +203,7 @@ class Terrain:
     common: float
 
     def taken(self, keep: NDArray[np.bool_]) -> Terrain:
-        """Return the model at the points that a mask (n,) selects."""
+        """Return the terrain model at the points that a boolean mask, with one element for each point, selects."""
         return Terrain(self.point[keep], self.place[keep], self.normal[keep], self.sigma[keep], self.common)
 
 
@@ -269,7 +273,7 @@ class Block:
 
     @property
     def sensors(self) -> tuple[str, ...]:
-        """Names of the `SENSORS` that the block has."""
+        """Names of those kinds of observations, out of `SENSORS`, that the block contains."""
         has = {
             "ties": bool(np.any(self.points.role == "tie")),
             "control": bool(np.any(self.points.role == "control")),
@@ -370,7 +374,7 @@ def make_block(
     cameras : mapping of str to LineModel
         Calibrated cameras.
     points : (m, 3) array_like
-        Given coordinates of control points and first guesses of tie points, ITRS, in metres.
+        Given coordinates of control points and first guesses of tie points, m in all, ITRS, in metres.
     control_sigma : (m,) array_like, optional
         Standard deviation of each given coordinate, in metres; inf for tie points. By default all are tie points.
     image_sigma : float
@@ -380,8 +384,8 @@ def make_block(
     station_sigma : float
         Standard deviation of each coordinate of the station, in metres; one error for each pass.
     camera_sigma : (4,) array_like
-        Standard deviations of each camera's d_alpha, d_beta, d_gamma (radians) and d_f (metres), the same change in all
-        passes.
+        Standard deviations of the changes of each camera, which are the same in all passes: rotations d_alpha, d_beta,
+        d_gamma about its Y, X and Z axes (radians) and change d_f of its principal distance (metres).
 
     Returns
     -------

@@ -1,7 +1,7 @@
 """Block adjustment: Gauss-Newton on observations and priors, robust weights, variance components.
 
 Weights and variance factors follow the rules of `reweighting`. Before the adjustment, gross faults of a block are
-detected: points that lie elsewhere than their images, and points seen only once.
+detected: points far from the rays of their image points, and points seen only once.
 
 **Test of the error models** of the readings by serial correlation. With the right model the whitened unknowns e of a
 process are independent, of unit variance; the estimated ones have the covariance S = I - C, with C the covariance of
@@ -40,7 +40,7 @@ FAR = 0.02
 and attitudes are known a hundred times better.
 """
 _NAMED = 8
-"""Largest number of points that an error message lists."""
+"""Largest number of faulty points that an error message lists by name."""
 
 
 def pruned(block: Block) -> Block:
@@ -130,7 +130,7 @@ class BlockAdjustment:
     covariance : (P, P) ndarray
         Covariance of the P unknowns, including the estimated variance factors.
     ground : (m, 3) ndarray
-        Adjusted points, ITRS, in metres; NaN for undetermined points.
+        Adjusted coordinates of the m points, ITRS, in metres; NaN for undetermined points.
     spread : (m, 3, 3) ndarray
         Covariance of the points for known x, in m^2.
     weight : tuple of (n,) ndarray
@@ -183,7 +183,7 @@ class BlockAdjustment:
         return State(self.x, self._filled, self.weight, self.factors)
 
     def point_covariance(self, points: Indices) -> Array:
-        """Return the (k, 3, 3) covariance of selected points, ITRS, in m^2; NaN for undetermined points."""
+        """Return the covariances of k selected points, (k, 3, 3), ITRS, in m^2; NaN for undetermined points."""
         reduction = self.assembly.reduction
         covariance = np.full((len(points), 3, 3), np.nan)
         for rows in reduction.restricted(points).rows(reduction.state_of(points, self.state)):
@@ -197,7 +197,11 @@ class BlockAdjustment:
         return covariance
 
     def change(self, scene: str) -> tuple[Array, Array]:
-        """Return the camera change d_alpha, d_beta, d_gamma, d_f of a scene and its covariance (4, 4), in rad and m."""
+        """Return the change of a scene's camera and its covariance (4, 4), in radians and metres.
+
+        The change is d_alpha, d_beta, d_gamma (rotations about the camera's Y, X and Z axes) and d_f (principal
+        distance).
+        """
         columns, unit = self.assembly.changes[scene], self.assembly.units[scene]
         return unit * self.x[columns], unit[:, None] * self.covariance[np.ix_(columns, columns)] * unit
 
@@ -210,7 +214,7 @@ class BlockAdjustment:
         return (self.x[where], self.covariance[np.ix_(where, where)]) if len(where) else None
 
     def rejected(self) -> tuple[tuple[str, str], ...]:
-        """Return the point and the observation set (scene) of every measurement that the robust weights rejected."""
+        """Return the names of the point and of the observation set (scene) of every rejected measurement."""
         ids = self.assembly.block.points.ids
         return tuple(
             (str(ids[p]), packets.name)
@@ -260,7 +264,7 @@ class _Factor:
             raise BlockError(_SINGULAR) from error
 
     def solve(self, right: Array) -> Array:
-        """Solve the linear system of P equations for right-hand sides (P,) or (P, k)."""
+        """Solve the linear system of P equations for one right-hand side (P,), or for k of them together (P, k)."""
         size = self.size if right.ndim == 1 else self.size[:, None]
         return np.asarray(size * self._solve(size * right))
 
@@ -298,8 +302,8 @@ def adjust_block(
     block : Block
         Images, points, cameras and prior knowledge; see `make_block`.
     robust : {"huber", "reject"}, optional
-        "huber" reduces the weight of large residuals. "reject" leaves out observations that stand out from the others,
-        one good observation in 10 000, and points of which too little is left.
+        "huber" reduces the weight of large residuals. "reject" also excludes outliers (and, by chance, one good
+        observation in 10 000) and points with too few remaining observations.
     variance_components : bool or collection of str
         True to estimate a factor on the variances of every group of observations, or the names of the groups.
     datum : bool
@@ -310,8 +314,8 @@ def adjust_block(
     Returns
     -------
     BlockAdjustment
-        `ground` (m, 3) in metres, `point_covariance`, `change` of the camera of each image, residuals and tests of the
-        variance groups, chi-square and `p_value`.
+        Coordinates `ground` of the m points, (m, 3), in metres, `point_covariance`, `change` of the camera of each
+        image, residuals and tests of the variance groups, chi-square and `p_value`.
 
     Raises
     ------
@@ -376,7 +380,7 @@ def adjust_block(
 
 @dataclass(frozen=True, eq=False)
 class _AdjustmentState(State):
-    """State of an adjustment with the number of Gauss-Newton steps so far."""
+    """Unknowns, points, weights and variance factors of an adjustment, with the number of Gauss-Newton steps so far."""
 
     steps: int = 0
 
@@ -393,7 +397,7 @@ class _Solution:
 
 @dataclass(frozen=True, eq=False)
 class _Problem:
-    """Parts of an adjustment that stay constant during reweighting, with the functions that reweighting calls."""
+    """Constant input of an adjustment during reweighting, with the methods that `reweighting.settled` calls."""
 
     assembly: Assembly
     points: Reduction | SharedReduction
@@ -410,11 +414,11 @@ class _Problem:
         return state, _Solution(reduced, covariance, checked, tests)
 
     def judged(self, state: _AdjustmentState, solution: _Solution) -> tuple[Array, ...]:
-        """Return the standardised residuals of every set of observations."""
+        """Return the standardised residuals of every set of observations, (n, d) for n measurements of d equations."""
         return solution.checked.standard
 
     def tests(self, state: _AdjustmentState, solution: _Solution) -> Mapping[str, GroupTest]:
-        """Return the test of each variance group, by its name."""
+        """Return the chi-square test of the residuals of each variance group, by the name of the group."""
         return solution.tests
 
     def weighed(
@@ -455,7 +459,7 @@ def _solved(
 
 
 def _part_of(covariance: Array) -> Callable[[Indices], Array]:
-    """Return a function from indices of k unknowns to their covariance (k, k)."""
+    """Return a function that takes the indices of k unknowns and returns their covariance (k, k)."""
     return lambda columns: np.asarray(covariance[np.ix_(columns, columns)])
 
 
@@ -480,7 +484,7 @@ def _rows_left(assembly: Assembly, weight: Sequence[Array]) -> NDArray[np.intp]:
 def _tests(
     reduction: Reduction, state: State, covariance: Array, reduced: Reduced, absorbed: Mapping[str, float]
 ) -> dict[str, GroupTest]:
-    """Return the tests of all variance groups, of observations and of priors."""
+    """Return the chi-square tests of all variance groups, both of observations and of priors."""
     counts: dict[str, int] = {}
     for packets, weight in zip(reduction.sets, state.weight, strict=True):
         counts[packets.group] = counts.get(packets.group, 0) + packets.rows * int(np.sum(weight > SETTLED))

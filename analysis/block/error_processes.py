@@ -56,7 +56,7 @@ interval.
 
 
 class BlockError(MeasurementError, ValueError):
-    """Invalid input of a block adjustment, or a block that cannot be solved."""
+    """Error raised for invalid input of a block adjustment, or for a block that cannot be solved."""
 
 
 @dataclass(frozen=True)
@@ -87,7 +87,7 @@ class Law:
     frequency: float = 0.0
 
     def check(self) -> None:
-        """Raise BlockError if a parameter is invalid."""
+        """Raise BlockError if a parameter of the error model is missing, negative or not finite."""
         if self.kind not in KINDS:
             raise BlockError(
                 f"block: {self.group}: the error model must be one of {', '.join(KINDS)}, found {self.kind!r}"
@@ -104,7 +104,7 @@ class Law:
             raise BlockError(f"block: {self.group}: correlation time or period must be positive, found {self.time}")
 
     def spread(self, seconds: float) -> tuple[float, float, float]:
-        """Return the standard deviation of the process about three axes, in rad or m, at a time from its middle.
+        """Return the standard deviation of the process about (or along) three axes, in rad (or m), at a given time.
 
         `seconds` is the time from the middle of the scope (the pass, the passes of a star tracker, or the block).
         """
@@ -122,8 +122,8 @@ class Support:
     law : Law
         Error model.
     numbers : (k,) ndarray of int
-        Numbers of the unknowns of one axis: multiples of the interval if there is one, otherwise 0, 1; for jitter twice
-        the multiple for the cosine, and one more for the sine.
+        Integers that identify the k unknowns of one axis. An unknown at the time j `interval` has the number j; for
+        jitter the cosine's amplitude has 2 j and the sine's 2 j + 1. Models without an interval have 0, or 0 and 1.
     middle : float
         Time at which a rate is zero, in seconds.
     precision : (k, k) csr_matrix
@@ -137,14 +137,14 @@ class Support:
 
     @classmethod
     def of(cls, law: Law, times: Array, middle: float | None = None) -> Support:
-        """Return the unknowns that observations depend on.
+        """Return the unknowns of an error model on which observations at the given times depend.
 
         Parameters
         ----------
         law : Law
             Error model.
         times : (n,) ndarray
-            Times of the observations, in seconds.
+            Times of the n observations, in seconds.
         middle : float, optional
             Time at which a rate and a random walk are zero, in seconds; the middle of the times by default.
 
@@ -336,14 +336,16 @@ class Corrections:
         return rotation, shift
 
     def slopes(self, by_turn: Array, by_station: Array) -> Array:
-        """Return the derivatives of d equations per time with respect to the w unknowns that act then, (n, d, w).
+        """Return the derivatives (n, d, w) of d equations at each of n times with respect to w unknowns.
+
+        The w unknowns of a time are those on which the corrections at that time depend (`columns`).
 
         Parameters
         ----------
         by_turn : (n, d, 3) ndarray
-            Derivatives with respect to the rotation vector, 1/rad.
+            Derivatives of the equations with respect to the rotation vector of the body, per radian.
         by_station : (n, d, 3) ndarray
-            Derivatives with respect to the station, ITRS, 1/m.
+            Derivatives of the equations with respect to the station (position of the satellite), ITRS, per metre.
         """
         count, depth = by_turn.shape[:2]
         widths = [3 * blend.shape[1] for _, blend in self._blends]

@@ -1,8 +1,8 @@
-"""Connectivity of a block: scenes that share points, and combinations of unknowns that stay open.
+"""Connectivity of a block: scenes that share points, and combinations of unknowns that are not determined.
 
 Every error model of a pass is replaced by one constant here (`simplified`): three rotations and three shifts of each
-pass and the cameras' changes suffice to name what is undetermined. That a slow variation of the attitude is
-undetermined as well would add nothing to the name.
+pass and the cameras' changes suffice to describe what the observations leave undetermined. If a constant is
+undetermined, a slow variation of it is so, too, and listing it would tell the user nothing new.
 """
 
 from __future__ import annotations
@@ -24,13 +24,13 @@ from analysis.orbit.calibration_parameters import echelon, shown
 from analysis.orbit.forward_intersection import level_axes
 
 _SHOWN = 0.25
-"""Smallest coefficient of an unknown that is listed in a combination, relative to the largest coefficient."""
+"""Smallest coefficient at which an unknown is listed in a linear combination, relative to the largest coefficient."""
 _MOST_UNKNOWNS = 6
-"""Largest number of unknowns of one combination that are listed."""
+"""Largest number of unknowns that are listed for one linear combination."""
 _NOTHING = 1e-3
-"""Ratio of the prior's sigma to that of the observations below which the observations determine nothing."""
+"""Ratio of a combination's prior sigma to its sigma from the observations below which the latter determine nothing."""
 _MOST = 12
-"""Largest number of combinations that are listed, the least determined first."""
+"""Largest number of weakly determined linear combinations of unknowns that are listed, the least determined first."""
 
 
 @dataclass(frozen=True)
@@ -78,9 +78,9 @@ def network_of(block: Block) -> Network:
 
 
 def simplified(block: Block) -> Block:
-    """Return the block with one constant rotation and one constant shift of each pass.
+    """Return the block with its error models replaced by one constant rotation and one constant shift of each pass.
 
-    Their sigmas are those of all error models together.
+    Their variances are the sums of those of all error models at the ends of the longest pass.
     """
     spans: dict[str, list[float]] = {}
     for scene in block.scenes:
@@ -99,7 +99,7 @@ def simplified(block: Block) -> Block:
 
 @dataclass(frozen=True)
 class OpenCombination:
-    """Combination of unknowns that the observations determine less well than the priors.
+    """Linear combination of unknowns that the observations determine less well than the priors.
 
     Attributes
     ----------
@@ -122,7 +122,7 @@ class OpenCombination:
 
 
 def open_combinations(adjustment: BlockAdjustment) -> tuple[OpenCombination, ...]:
-    """Return the combinations of a block's unknowns that only the priors determine, the least determined first.
+    """Return the linear combinations of a block's unknowns that only the priors determine, the weakest first.
 
     Combinations that the observations do not determine (to less than a thousandth of the prior's weight) and those that
     they determine weakly are two separate spaces. In each space, a combination has an unknown that is in no other one

@@ -1,8 +1,9 @@
 """Normal equations of observations and priors with the ground points eliminated, in pieces of bounded memory.
 
 **Packets.** A packet is the d equations that one measurement of one ground point gives: they depend on the point p and
-on w of the unknowns x. Packet sets of one kind are linearised together and whitened by their a-priori covariance: miss
-+ by_x dx + by_point dp. The elimination knows nothing of cameras.
+on w of the unknowns x. Packet sets of one kind are linearised together and whitened by their a-priori covariance; a
+packet is then its misclosure, the derivatives with respect to x times a step of x, and those with respect to p times a
+step of p. The elimination knows nothing of cameras.
 
 **Elimination.** A ground point occurs only in its own packets, so that its (3, 3) block is inverted alone (Schur
 complement). Points whose packets depend on the same unknowns in the same order form a bundle: their equations make one
@@ -38,47 +39,55 @@ class Packets(Protocol):
 
     @property
     def name(self) -> str:
-        """Name of the set, such as that of the scene, for messages."""
+        """Name of the set of observations, such as that of the scene, for messages."""
 
     @property
     def group(self) -> str:
-        """Name of the variance group, whose measurements share one variance factor."""
+        """Name of the variance group of the set; measurements of a group share one variance factor."""
 
     @property
     def rows(self) -> int:
-        """Number d of equations of each packet."""
+        """Number d of equations of each packet (measurement of a ground point)."""
 
     @property
     def point(self) -> Indices:
-        """Index (n,) of the ground point that each packet observes."""
+        """Index of the ground point that each of the n measurements (packets) observes, (n,)."""
 
     @property
     def columns(self) -> Indices:
-        """Indices (n, w), among all unknowns, of the w unknowns on which each of the n packets depends."""
+        """Indices, among all unknowns, of the w unknowns on which each of n measurements depends, (n, w)."""
 
     def linearised(self, which: Indices, x: Array, ground: Array) -> tuple[Array, Array, Array]:
-        """Return whitened misclosures of packets, and their derivatives with respect to unknowns and points.
+        """Return whitened misclosures of k measurements, and their derivatives with respect to unknowns and points.
 
-        For k packets of d equations the misclosures are (k, d), the derivatives (k, d, w) with respect to the w
-        unknowns of `columns` and (k, d, 3) with respect to the ground points.
+        Each measurement gives one packet of d equations. The misclosures are (k, d), the derivatives (k, d, w) with
+        respect to the w unknowns of `columns` and (k, d, 3) with respect to the ground points.
 
         Parameters
         ----------
         which : (k,) ndarray of int
-            Indices of packets.
+            Indices of the measurements.
         x : (P,) ndarray
             Values of all P unknowns.
         ground : (k, 3) ndarray
-            Points of these packets, ITRS, in metres.
+            Ground points of these measurements, ITRS, in metres.
         """
 
     def taken(self, which: Indices, point: Indices) -> Packets:
-        """Return selected packets (indices `which`) as a new set, with the given indices of their ground points."""
+        """Return selected measurements as a new set.
+
+        Parameters
+        ----------
+        which : (k,) ndarray of int
+            Indices of the measurements.
+        point : (k,) ndarray of int
+            New indices of their ground points.
+        """
 
 
 @dataclass(frozen=True, eq=False)
 class LineImage:
-    """Image points of one line camera in one pass.
+    """Image points of one line camera in one pass, n in number.
 
     Attributes
     ----------
@@ -93,9 +102,10 @@ class LineImage:
     corrections : Corrections
         Corrections of the readings.
     change : (4,) ndarray of int
-        Indices, among all unknowns, of the camera's changes d_alpha, d_beta, d_gamma, d_f.
+        Indices, among all unknowns, of the camera's changes d_alpha, d_beta, d_gamma (rotations about its Y, X and Z
+        axes) and d_f (principal distance).
     unit : (4,) ndarray
-        Unit of each of these unknowns, in radians and metres.
+        Scale of each of these unknowns: the change, in radians or metres, for a value of 1.
     group : str
         Variance group.
     """
@@ -112,7 +122,7 @@ class LineImage:
 
     @property
     def point(self) -> Indices:
-        """Index (n,) of the ground point of each packet."""
+        """Index of the ground point that each of the n image points shows, (n,)."""
         return self.rays.point
 
     @property
@@ -154,7 +164,7 @@ class LineImage:
 
 @dataclass(frozen=True, eq=False)
 class Pointings:
-    """Laser altimeter footprints: range, and direction of the beam in the body frame.
+    """Laser altimeter footprints, n of them: range, and direction of the beam in the body frame.
 
     Attributes
     ----------
@@ -192,7 +202,7 @@ class Pointings:
 
     @property
     def columns(self) -> Indices:
-        """Indices (n, w) of the unknowns, corrections of the readings, on which each footprint depends."""
+        """Indices (n, w) of the w unknowns, corrections of the readings, on which each of n footprints depends."""
         return self.corrections.columns
 
     def linearised(self, which: Indices, x: Array, ground: Array) -> tuple[Array, Array, Array]:
@@ -240,7 +250,7 @@ class Pointings:
 
 @dataclass(frozen=True, eq=False)
 class FixedPoints:
-    """Surveyed coordinates of control points as observations, with a common shift as an optional unknown.
+    """Surveyed coordinates of n control points as observations, with a common shift as an optional unknown.
 
     Attributes
     ----------
@@ -269,7 +279,7 @@ class FixedPoints:
 
     @property
     def columns(self) -> Indices:
-        """Indices of the unknown common shift for each control point, (n, 3), or (n, 0) if it is not estimated."""
+        """Indices of the common shift for each of n control points, (n, 3), or (n, 0) if it is not estimated."""
         return np.broadcast_to(self.datum, (len(self.point), len(self.datum)))
 
     def linearised(self, which: Indices, x: Array, ground: Array) -> tuple[Array, Array, Array]:
@@ -286,7 +296,7 @@ class FixedPoints:
 
 @dataclass(frozen=True, eq=False)
 class Heights:
-    """Terrain model heights at points, with a common error of the model.
+    """Terrain model heights at n points, with a common error of the model.
 
     Attributes
     ----------
@@ -303,7 +313,7 @@ class Heights:
     common : (1,) ndarray of int
         Index, among all unknowns, of the model's common height error.
     unit : float
-        Unit of the common error, in metres.
+        Scale of that unknown: the common height error, in metres, for a value of 1.
     group : str
         Variance group.
     """
@@ -320,7 +330,7 @@ class Heights:
 
     @property
     def columns(self) -> Indices:
-        """Index (n, 1) of the unknown common height error for each point."""
+        """Index of the unknown common height error for each of n points, (n, 1)."""
         return np.broadcast_to(self.common, (len(self.point), 1))
 
     def linearised(self, which: Indices, x: Array, ground: Array) -> tuple[Array, Array, Array]:
@@ -372,7 +382,7 @@ class PriorGroup:
 
 @dataclass(frozen=True, eq=False)
 class Bundle:
-    """Ground points whose measurements depend on the same unknowns, so that they are eliminated together.
+    """Group of n ground points that depend on the same unknowns, so that they are eliminated together.
 
     Attributes
     ----------
@@ -495,7 +505,7 @@ class Checked:
 
 @dataclass(frozen=True, eq=False)
 class Reduction:
-    """Observation equations and priors of a block, which eliminates the ground points from them.
+    """Observation equations and priors of a block, with methods that eliminate the ground points from them.
 
     Attributes
     ----------
@@ -571,7 +581,7 @@ class Reduction:
 
     @cached_property
     def seen(self) -> NDArray[np.bool_]:
-        """Mask (m,) of the points that have at least one measurement."""
+        """Mask of those of the m ground points that have at least one measurement, (m,)."""
         mask = np.zeros(self.count, bool)
         for packets in self.sets:
             mask[packets.point] = True
@@ -625,7 +635,7 @@ class Reduction:
         return self.with_priors(self.eliminated(state), state)
 
     def with_priors(self, equations: Eliminated, state: State) -> Reduced:
-        """Return normal equations of measurements with the priors added to them."""
+        """Return the normal equations of the measurements with the priors of the unknowns added."""
         gradient = np.zeros(self.size)
         for prior in self.priors:
             pull = prior.precision @ (state.x[prior.columns] - prior.mean) / state.factor.get(prior.group, 1.0)
@@ -675,7 +685,7 @@ class Reduction:
         return sparse.csc_matrix((np.concatenate(values), where), shape=(self.size, self.size))
 
     def prior_square(self, x: Array, factor: Mapping[str, float]) -> dict[str, float]:
-        """Return the weighted sum of squares of the priors of each group."""
+        """Return, for each variance group, the sum of squared residuals of its priors, weighted by their precision."""
         squares: dict[str, float] = {}
         for prior in self.priors:
             deviation = x[prior.columns] - prior.mean
@@ -684,7 +694,7 @@ class Reduction:
         return squares
 
     def point_steps(self, state: State, equations: Eliminated, step: Array) -> Array:
-        """Return the (m, 3) steps of the points that correspond to a step of the unknowns, in metres.
+        """Return the steps of the m points, (m, 3), in metres, that correspond to a step of the unknowns.
 
         Parameters
         ----------
@@ -710,7 +720,7 @@ class Reduction:
         state : State
             State at which the equations are linearised.
         spread : (m, 3, 3) ndarray
-            Covariance of the points for known x, in m^2.
+            Covariances of the m points for known unknowns x, in m^2.
         covariance : callable
             Function from the indices of w unknowns to their covariance (w, w).
         """
@@ -760,13 +770,17 @@ class Reduction:
         return Reduction(sets, (), self.size, len(points))
 
     def state_of(self, points: Indices, state: State) -> State:
-        """Return a state for the reduction restricted to selected points: their coordinates and weights."""
+        """Return the part of a state that concerns selected points: coordinates and weights of their measurements."""
         weight = tuple(w[which] for w, which in zip(state.weight, self.packets_at(points), strict=True))
         return State(state.x, state.ground[points], weight, state.factor)
 
 
 def _distinct(rows: Indices) -> tuple[Indices, Indices]:
-    """Return an index of each of the k distinct rows of integers (n, w), and the number of each row among them."""
+    """Return the distinct rows of a table of integers with n rows: an example of each, and the class of every row.
+
+    The first array (k,) has the index of one row of each of the k distinct kinds, the second (n,) the kind, 0 to k - 1,
+    of each row.
+    """
     if not rows.shape[1]:
         return np.zeros(1, np.intp), np.zeros(len(rows), np.intp)
     # hashes by random odd factors almost surely differ for different rows; collisions are checked below
@@ -827,32 +841,33 @@ class Pool(Protocol):
         """Number of worker processes."""
 
     def hold(self, things: Sequence[Any]) -> Sequence[Any]:
-        """Send each object to a process and return handles, which serve as the first argument of work."""
+        """Send each object to one process and return handles that stand for it in the arguments of `results`."""
 
     def results(self, work: Callable[[tuple[Any, ...]], Any], arguments: Sequence[tuple[Any, ...]]) -> list[Any]:
-        """Return the results of a function for each of the arguments, in their order."""
+        """Run a function for each of the arguments in the processes and return the results in the same order."""
 
 
 @dataclass(frozen=True, eq=False)
 class SharedReduction:
     """Observation equations of a block distributed over processes by ground points.
 
-    The methods are those of `Reduction`.
+    The methods are those of `Reduction`. A share is the part of the points that one process holds, with their
+    measurements.
 
     Attributes
     ----------
     whole : Reduction
-        Packets and priors of the block.
+        Packets (each the equations of one measurement of one ground point) and priors of the block.
     pool : Pool
         Processes that hold the shares.
     points : tuple of (m_k,) ndarray of int
-        Indices of the points of each share (the part of one process).
+        Indices of the m_k points of each share k.
     packets : tuple of tuple of ndarray of int
         Indices of the measurements of each share, by set of observations.
     held : tuple
-        Handle of each share.
+        Handle of each share's data in its process.
     columns : tuple of (w_k,) ndarray of int
-        Indices of the unknowns on which the measurements of each share depend.
+        Indices of the w_k unknowns on which the measurements of each share k depend.
     """
 
     whole: Reduction
@@ -881,7 +896,7 @@ class SharedReduction:
         return cls(whole, pool, points, packets, held, columns)
 
     def _states(self, state: State) -> list[State]:
-        """Return the part of a state that each share needs."""
+        """Return the part of a state (unknowns, points, weights) that each process needs for its share."""
         return [
             State(
                 state.x,
@@ -945,7 +960,7 @@ def _eliminated(arguments: tuple[Reduction, State]) -> Eliminated:
 
 
 def _stepped(arguments: tuple[Reduction, State, Array, Array, Array]) -> Array:
-    """Return the steps of the points of a process's share, (m, 3), in metres."""
+    """Return the steps of the m ground points of a process's share, (m, 3), in metres."""
     share, state, spread, start, step = arguments
     no_data = sparse.csc_matrix((0, 0))
     return share.point_steps(state, Eliminated(no_data, np.zeros(0), spread, start, {}), step)

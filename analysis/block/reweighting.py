@@ -1,4 +1,6 @@
-"""Robust weights of packets of observations, and variance factors of groups, from residuals.
+"""Robust weights of measurements, and variance factors of groups of observations, from residuals.
+
+A packet is the d equations that one measurement of one ground point gives; it has one weight.
 
 The module serves adjustments of any kind: a calibration campaign's (`analysis.calibration`) and a block's.
 """
@@ -75,7 +77,7 @@ class GroupTest:
     def estimated(self) -> float:
         """Next variance factor by Foerstner's estimate, between 1 / `LARGEST_FACTOR` and `LARGEST_FACTOR`.
 
-        It is unbiased for packets of weight 1 and 0; a weight that decreases with the residual makes it too small.
+        It is unbiased for measurements of weight 1 and 0; a weight that decreases with the residual makes it too small.
         """
         return bounded(self.factor * self.ratio) if self.redundancy >= _LEAST_REDUNDANCY else self.factor
 
@@ -89,7 +91,7 @@ class GroupTest:
 
 
 class UnsettledError(MeasurementError, ValueError):
-    """Error for robust weights or variance factors that do not converge."""
+    """Error raised if robust weights or variance factors do not converge."""
 
 
 def standardised_packets(residual: Array, cofactors: Array, weight: Array, unit: float) -> Array:
@@ -106,11 +108,11 @@ def standardised_packets(residual: Array, cofactors: Array, weight: Array, unit:
     residual : (n, d) ndarray
         Whitened residuals.
     cofactors : (n, d, d) ndarray
-        Covariance of the adjusted packets, whitened.
+        Covariances of the adjusted measurements, whitened by the a-priori covariances.
     weight : (n,) ndarray
         Robust weights.
     unit : float
-        Variance factor of their group.
+        Variance factor of the measurements' group.
     """
     values, axes = np.linalg.eigh(cofactors)
     along = np.einsum("nji,nj->ni", axes, residual)
@@ -123,7 +125,7 @@ def standardised_packets(residual: Array, cofactors: Array, weight: Array, unit:
 
 
 def robust_weights(standard: Array, kind: Robust | Literal["accept"]) -> Array:
-    """Return the robust weights of n measurements from their standardised residuals (n, d); d = 2 for image points.
+    """Return the robust weights of n measurements of d equations from their standardised residuals, (n, d).
 
     The weights are Huber's, IGG III, which decrease to zero, or "accept": 1 up to that zero and 0 beyond.
 
@@ -146,7 +148,10 @@ def robust_weights(standard: Array, kind: Robust | Literal["accept"]) -> Array:
 
 
 def limits(rows: int) -> tuple[float, float]:
-    """Return the norms of d standardised residuals above which a measurement is down-weighted and rejected."""
+    """Return the norms of a measurement's standardised residuals above which it is down-weighted and rejected.
+
+    The first norm is exceeded by 5 %, the second by 1e-4 of good measurements of `rows` equations.
+    """
     return float(np.sqrt(chi2.isf(0.05, rows))), float(np.sqrt(chi2.isf(1e-4, rows)))
 
 
@@ -176,7 +181,8 @@ class Rule:
     Attributes
     ----------
     packets : {'huber', 'igg', 'accept'} or None
-        Huber's weights, IGG III, or "accept": 1 up to the end of IGG III and 0 beyond; None for unchanged weights.
+        Weights of the measurements (packets of equations): Huber's weights, IGG III, or "accept": 1 up to the end of
+        IGG III and 0 beyond; None for unchanged weights.
     factor : {'median', 'components'} or None
         Factor of the image points from the median of their residuals, or of groups by variance components; None for
         unchanged factors.
@@ -211,10 +217,10 @@ class Reweighted(Protocol[S, T]):
     """Interface of an adjustment that `settled` reweights, with states of type S and solutions of type T."""
 
     def solve(self, at: S, screening: bool) -> tuple[S, T]:
-        """Return state and solution for the weights of a state; a rough solution suffices while screening."""
+        """Return state and solution of the adjustment with fixed weights; a rough solution suffices while screening."""
 
     def judged(self, at: S, found: T) -> tuple[Array, ...]:
-        """Return the standardised residuals of each set of observations."""
+        """Return the standardised residuals of each set of observations, (n, d) for n measurements of d equations."""
 
     def tests(self, at: S, found: T) -> Mapping[str, GroupTest]:
         """Return the test of the residuals' variance of each group of observations, by its name."""
@@ -239,7 +245,7 @@ def settled(problem: Reweighted[S, T], state: S, rule: Rule) -> tuple[S, T]:
     Raises
     ------
     UnsettledError
-        They do not converge.
+        The weights or the variance factors do not converge.
     """
     factors: list[Mapping[str, float]] = []
     for round_number in range(_ROUNDS):

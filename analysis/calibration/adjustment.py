@@ -1,4 +1,4 @@
-"""Simultaneous adjustment of a three-line in-orbit calibration (paper 003) and tests for omitted terms.
+"""Simultaneous in-orbit calibration of three-line cameras (paper 003, Mo et al. 2015); omitted terms are tested.
 
 The unknowns are the interior orientation of each camera and the attitude bias of each field.
 
@@ -46,7 +46,7 @@ run.
 _WAVES = 4
 """Largest number of cosines that describe slow variations of x, and of y, along a line."""
 _POINTS_PER_WAVE = 4
-"""Number of image points that each cosine requires."""
+"""Smallest number of image points for each cosine that describes slow variations along a line."""
 _RANK = 1e-9
 """Smallest eigenvalue of the gradient's covariance S, relative to the largest, of a combination of omitted terms that
 residuals can show. A term that the estimated unknowns imitate exactly has the eigenvalue zero.
@@ -67,7 +67,7 @@ class Rates:
 
     @classmethod
     def of(cls, fields: Sequence[calibration_parameters.CalibrationField]) -> Rates:
-        """Return rates for all fields whose rays have times."""
+        """Return the attitude drift rates, as terms to test, of all fields whose rays have times."""
         times = {f.name: [r.time for r in f.rays.values() if r.time is not None and r.point.size] for f in fields}
         return cls({name: float(np.mean(np.concatenate(rows))) for name, rows in times.items() if rows})
 
@@ -100,7 +100,7 @@ class Rates:
 
 @dataclass(frozen=True, eq=False)
 class SlowVariations:
-    """Slow variations of x and y along the time of each line of each field, in metres in the image.
+    """Slow variations of the image coordinates x and y with time, for each line of each field, in metres.
 
     They are cosines of up to four half periods, without the constant.
 
@@ -115,7 +115,7 @@ class SlowVariations:
 
     @classmethod
     def of(cls, fields: Sequence[calibration_parameters.CalibrationField]) -> SlowVariations:
-        """Return the slow variations of all lines with times and enough points."""
+        """Return the slow variations, as terms to test, of all lines whose rays have times and enough points."""
         waves: dict[tuple[str, str], tuple[float, float, int, int]] = {}
         first = 0
         for site in fields:
@@ -184,7 +184,7 @@ class OmittedTermsTest:
     Attributes
     ----------
     terms : Rates, SlowVariations or Steps
-        The omitted terms, G in number.
+        The G terms that the adjustment did not estimate.
     score : (G,) ndarray
         Gradient of half the sum of squares with respect to the terms, where they are zero.
     cofactor : (G, G) ndarray
@@ -236,12 +236,12 @@ class OmittedTermsTest:
 
     @property
     def degrees_of_freedom(self) -> int:
-        """Number of combinations of the terms that the residuals can show."""
+        """Number of linear combinations of the omitted terms that the residuals can show."""
         return int(np.linalg.matrix_rank(self._unit, tol=1e-6, hermitian=True)) if len(self.score) else 0
 
     @property
     def chi_square(self) -> float:
-        """Chi-square of all terms together."""
+        """Chi-square of the test that all omitted terms are zero."""
         return float(self.score @ self._inverse @ self.score) if len(self.score) else 0.0
 
     @property
@@ -251,7 +251,7 @@ class OmittedTermsTest:
 
     @property
     def _largest(self) -> float:
-        """Largest diagonal element of the cofactor matrix."""
+        """Largest variance of the gradient's components, the diagonal elements of the cofactor matrix."""
         return float(np.diag(self.cofactor).max(initial=0.0))
 
     @property
@@ -261,12 +261,12 @@ class OmittedTermsTest:
 
     @property
     def _unit(self) -> Array:
-        """Cofactor matrix scaled to unit diagonal."""
+        """Covariance of the gradient (the cofactor matrix) scaled to unit diagonal, (G, G) for G terms."""
         return np.asarray(self.cofactor / self._size / self._size[:, None])
 
     @property
     def _inverse(self) -> Array:
-        """Pseudo-inverse of the cofactor matrix."""
+        """Pseudo-inverse of the cofactor matrix (covariance of the gradient), (G, G) for G terms."""
         inner = np.linalg.pinv(self._unit, rcond=1e-6, hermitian=True)
         return np.asarray(inner / self._size / self._size[:, None])
 
@@ -276,17 +276,17 @@ FARTHEST = 2e3
 no datum moves half of the points farther: an arc minute is 150 m, one second of a clock 7 km.
 """
 _EXPECTED = 20.0
-"""Distance between points and the rays of their image points, in sigmas due to the start values, above which the points
-are not those in the image.
+"""Largest plausible distance between points and the rays of their image points, in sigmas due to the start values;
+beyond it the points are not those in the image.
 """
 
 
 class FarPointsError(calibration_parameters.CalibrationError):
-    """Points that lie kilometres from where their image points look, or that contradict each other."""
+    """Error raised for ground points that are kilometres off their image points' rays, or contradict each other."""
 
 
 class NoiseError(calibration_parameters.CalibrationError):
-    """Noise of a single image point that exceeds what is to be estimated.
+    """Error raised if the noise of a single image point exceeds the changes that are to be estimated.
 
     Attributes
     ----------
@@ -378,7 +378,7 @@ def check_places(
 
 
 def _mean_square(covariance: Array) -> Array:
-    """Return the (n,) mean variance over both axes of covariances (n, 2, 2)."""
+    """Return the mean variance over both axes of n covariances (n, 2, 2), as (n,)."""
     return np.asarray(0.5 * np.trace(covariance, axis1=1, axis2=2))
 
 
@@ -396,11 +396,11 @@ class Adjustment:
         Covariance from the a-priori sigmas times `factors`, and from the start values where these fix undetermined
         combinations. Fixed unknowns count as exact: their rows and columns are zero.
     gauge : Gauge
-        Gauge of the adjustment.
+        Rule by which undetermined combinations of unknowns were fixed.
     open : tuple of Combination
-        Combinations that the gauge fixed.
+        Undetermined linear combinations of unknowns, which the gauge fixed.
     weak : tuple of Combination
-        Combinations of low strength that were estimated nevertheless.
+        Linear combinations that the measurements determine only weakly, but that were estimated.
     prior_share : (P,) ndarray
         Fraction, 0 to 1, of each variance that is due to the sigmas of the start values and not to the measurements.
     follow : (P, H) ndarray
@@ -408,11 +408,11 @@ class Adjustment:
     cameras : mapping of str to LineModel
         Cameras with the adjusted interior orientation, in the reference state.
     ground : mapping of str to (m, 3) ndarray
-        Adjusted points of each field, in metres; NaN for rejected points.
+        Adjusted coordinates of the m points of each field, ITRS, in metres; NaN for rejected points.
     ground_covariance : mapping of str to (m, 3, 3) ndarray
         Covariance of the points of each field, in m^2; NaN for rejected points.
     residual : mapping of str to mapping of str to (n, 2) ndarray
-        Standardised residuals of the image points of each field and line.
+        Standardised residuals of the n image points of each field and line.
     weight : mapping of str to mapping of str to (n,) ndarray
         Robust weights of the image points of each field and line.
     chi_square : float
@@ -428,7 +428,7 @@ class Adjustment:
         Total number of Gauss-Newton steps.
     fields : sequence of CalibrationField
         Fields that were adjusted.
-    unseen : callable
+    omitted_terms_test : callable
         Function that tests the residuals for omitted terms.
     """
 
@@ -455,7 +455,7 @@ class Adjustment:
 
     @property
     def sigma(self) -> dict[str, float]:
-        """Standard deviation of each unknown; 0 for fixed unknowns."""
+        """Standard deviation of each unknown by its name, in metres or radians; 0 for fixed unknowns."""
         return dict(zip(self.names, np.sqrt(np.diag(self.covariance)).tolist(), strict=True))
 
     @cached_property
@@ -465,7 +465,7 @@ class Adjustment:
 
     @cached_property
     def slow_variations(self) -> OmittedTermsTest:
-        """Test for errors that vary slowly along the lines."""
+        """Test of the residuals for image errors that vary slowly along the lines."""
         return self.omitted_terms_test(SlowVariations.of(self.fields))
 
     def sigma_with(self, start: Mapping[str, float]) -> dict[str, float]:
@@ -522,7 +522,7 @@ _CONVERGED = 1e-6
 ends it, too.
 """
 _HUBER_ROUNDS = 6
-"""Number of first rounds with Huber weights before those of IGG III."""
+"""Number of first rounds of reweighting with Huber's weights, before the weights of IGG III are used."""
 
 
 def adjust(
@@ -538,7 +538,7 @@ def adjust(
     variance_components: bool | Collection[str] = False,
     iterations: int = 20,
 ) -> Adjustment:
-    """Adjust all fields simultaneously.
+    """Calibrate line cameras by one simultaneous least-squares adjustment of all passes over test fields.
 
     Parameters
     ----------
@@ -610,7 +610,7 @@ def adjust(
 def _adjusted(
     problem: _Problem, state: _Iteration, robust: reweighting.Robust | None, variance_components: bool
 ) -> Adjustment:
-    """Return the solution with converged weights and factors."""
+    """Iterate weights and variance factors to convergence and return the solution."""
     if robust and variance_components:
         # Detect gross errors against the scatter of the others first. Variance components then need good points with
         # full weight, because weights that fall with the residual would look like smaller noise.
@@ -660,7 +660,7 @@ class _Solved:
 
 @dataclass(frozen=True, eq=False)
 class _Problem:
-    """Constant part of the adjustment during the iteration."""
+    """Input of the adjustment that stays constant during the iteration, with the methods that `reweighting` calls."""
 
     fields: Sequence[calibration_parameters.CalibrationField]
     cameras: Mapping[str, LineModel]
@@ -679,14 +679,14 @@ class _Problem:
         return np.concatenate([a + r.point for a, f in zip(first, self.fields, strict=False) for r in f.rays.values()])
 
     def judged(self, state: _Iteration, solution: _Solved) -> tuple[Array, ...]:
-        """Return the standardised residuals of the M image points, (M, 2)."""
+        """Return the standardised residuals of the M image points of all fields, as a tuple of one array (M, 2)."""
         image = solution.equations.residuals.image
         return (
             reweighting.standardised_packets(image, solution.cofactors, state.weights.image, state.factor["image"]),
         )
 
     def tests(self, state: _Iteration, solution: _Solved) -> dict[str, reweighting.GroupTest]:
-        """Return the test of the residuals' variance of each group of observations, by its name."""
+        """Return the chi-square test of the residuals of each variance group, by the name of the group."""
         return solution.equations.tests(solution.covariance, solution.cofactors, state.weights, self.priors)
 
     def weighed(self, state: _Iteration, weight: tuple[Array, ...], factor: Mapping[str, float]) -> _Iteration:
@@ -697,7 +697,7 @@ class _Problem:
         return replace(state, weights=Weights(np.where(lost[self.place], 0.0, weight[0]), factor), lost=lost)
 
     def equations(self, state: _Iteration, omitted: OmittedTerms | None = None) -> Equations:
-        """Return the equations at a state, optionally with omitted terms as unknowns."""
+        """Return the equations linearised at a state, optionally with omitted terms as further unknowns."""
         return assemble(
             self.fields,
             self.cameras,
@@ -860,7 +860,9 @@ class _Problem:
 
 
 def _scores(equations: Equations, standard: Array, weights: Weights) -> Array:
-    """Return the correction of the normal matrix to the covariance of its right side, for Huber's weights, (P, P).
+    """Return the covariance of the right side of the normal equations minus the normal matrix, (P, P).
+
+    The two are equal for weights of 1 and differ with Huber's weights; P is the number of unknowns.
 
     An image point of weight w counts with the variance w in the normal matrix, as if it had that uncertainty. The
     actual variance of a gross error is the square of the limit, whatever its size (Huber 1981, asymptotic covariance).

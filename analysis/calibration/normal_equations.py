@@ -50,8 +50,8 @@ class SharedNoise:
     parts : mapping of str to tuple of Part
         Error models of the attitude and station readings of each field. Station corrections are along the axes of the
         ITRS.
-    met : mapping of (str, str) to Corrections
-        Corrections of the rays of each (field, line); lines without times have none.
+    corrections : mapping of (str, str) to Corrections
+        Corrections of the rays of each (field, line), as functions of the unknowns; lines without times have none.
     spans : tuple of (int, int)
         Index of the first unknown of each field, and one beyond its last.
     groups : mapping of str to ndarray of int
@@ -61,7 +61,7 @@ class SharedNoise:
     """
 
     parts: Mapping[str, tuple[Part, ...]]
-    met: Mapping[tuple[str, str], Corrections]
+    corrections: Mapping[tuple[str, str], Corrections]
     spans: tuple[tuple[int, int], ...]
     groups: Mapping[str, NDArray[np.intp]]
     precision: sparse.csr_matrix
@@ -70,7 +70,7 @@ class SharedNoise:
     def of(cls, fields: Sequence[CalibrationField], noise: Noise) -> SharedNoise:
         """Return the shared noise of all rays with times; it is empty without times or without intervals."""
         parts: dict[str, tuple[Part, ...]] = {}
-        met: dict[tuple[str, str], Corrections] = {}
+        corrections: dict[tuple[str, str], Corrections] = {}
         spans, blocks, column = [], [], 0
         groups: dict[str, list[NDArray[np.intp]]] = {}
         for site in fields:
@@ -85,14 +85,16 @@ class SharedNoise:
                 groups.setdefault(term.group, []).append(np.arange(column, column + support.size))
                 column += support.size
             parts[site.name] = tuple(field_parts)
-            met |= {(site.name, line): Corrections(tuple(field_parts), np.eye(3), time) for line, time in times.items()}
+            corrections |= {
+                (site.name, line): Corrections(tuple(field_parts), np.eye(3), time) for line, time in times.items()
+            }
             spans.append((begin, column))
         precision = sparse.csr_matrix(sparse.block_diag(blocks)) if blocks else sparse.csr_matrix((0, 0))
-        return cls(parts, met, tuple(spans), {k: np.concatenate(v) for k, v in groups.items()}, precision)
+        return cls(parts, corrections, tuple(spans), {k: np.concatenate(v) for k, v in groups.items()}, precision)
 
     @property
     def size(self) -> int:
-        """Number of unknowns, K."""
+        """Number K of unknowns of the shared noise."""
         return self.precision.shape[0]
 
     def corrected(self, name: str, line: str, rays: Rays, shared: Array) -> Rays:
@@ -109,7 +111,7 @@ class SharedNoise:
         shared : (K,) ndarray
             Values of the K unknowns of the shared noise.
         """
-        return _moved(rays, self.met.get((name, line)), shared)
+        return _moved(rays, self.corrections.get((name, line)), shared)
 
     def corrected_at(self, name: str, rays: Rays, shared: Array) -> Rays:
         """Return any rays of a field with attitude and station corrected by the shared noise.
@@ -140,10 +142,10 @@ class SharedNoise:
         by : Partials
             Derivatives of the misclosures.
         """
-        count, met = len(white), self.met.get((name, line))
-        if met is None:
+        count, corrections = len(white), self.corrections.get((name, line))
+        if corrections is None:
             return sparse.csr_matrix((2 * count, self.size))
-        slopes, columns = met.slopes(white @ by.attitude, -white @ by.ground), met.columns
+        slopes, columns = corrections.slopes(white @ by.attitude, -white @ by.ground), corrections.columns
         indices = np.repeat(columns[:, None], 2, axis=1).ravel()
         starts = columns.shape[1] * np.arange(2 * count + 1)
         return sparse.csr_matrix((slopes.ravel(), indices, starts), shape=(2 * count, self.size))
@@ -154,13 +156,13 @@ def _law(term: NoiseTerm, interval: float) -> Law:
     return Law(term.group, "walk" if term.walks else "white", (term.sigma,) * 3, interval)
 
 
-def _moved(rays: Rays, met: Corrections | None, shared: Array) -> Rays:
+def _moved(rays: Rays, corrections: Corrections | None, shared: Array) -> Rays:
     """Return rays with attitude and station corrected by the shared noise; unchanged without corrections."""
-    if met is None or not met.parts:
+    if corrections is None or not corrections.parts:
         return rays
-    rotation, shift = met.at(shared)
+    rotation, shift = corrections.at(shared)
     rotations = Rotation.from_rotvec(rotation).as_matrix()
-    return replace(rays, attitude=rays.attitude @ rotations, station=rays.station + shift @ met.axes.T)
+    return replace(rays, attitude=rays.attitude @ rotations, station=rays.station + shift @ corrections.axes.T)
 
 
 _CHUNK = 512
@@ -324,7 +326,11 @@ class Equations:
 
     @cached_property
     def shared_inverse(self) -> tuple[Array, ...]:
-        """Covariance (s, s) of the s shared-noise unknowns of each field, for known other unknowns."""
+        """Covariance (s, s), for each field, of its s unknowns of shared noise, given all other unknowns.
+
+        These unknowns model errors of attitude and station readings, which are common to many observations of the
+        field.
+        """
         return tuple(_inverse(self.shared_normal[a:b, a:b].toarray()) for a, b in self.shared.spans)
 
     def image_cofactors(self, covariance: Array) -> Array:
@@ -338,7 +344,7 @@ class Equations:
         return np.asarray(cofactors)
 
     def point_covariance(self, covariance: Array) -> Array:
-        """Return the (m, 3, 3) covariance of the adjusted ground points, zero for fixed points."""
+        """Return the covariances of the m adjusted ground points, (m, 3, 3), in m^2; zero for fixed points."""
         by_x, by_z = self._carried
         derivatives = np.asarray(by_x.toarray() + by_z @ self.follow).reshape(len(self.movable), 3, len(covariance))
         total = self.point_inverse.data + derivatives @ covariance @ np.swapaxes(derivatives, 1, 2)
@@ -349,7 +355,7 @@ class Equations:
     def tests(
         self, covariance: Array, cofactors: Array, weights: Weights, priors: Sequence[Prior]
     ) -> dict[str, GroupTest]:
-        """Return the tests of the variance groups after an adjustment.
+        """Return the chi-square tests of the residuals of each variance group after an adjustment, by its name.
 
         Parameters
         ----------
@@ -395,12 +401,18 @@ class Equations:
 
     @cached_property
     def _carried(self) -> tuple[sparse.csr_matrix, sparse.csr_matrix]:
-        """Negative derivatives of point coordinates with respect to unknowns, (3m, P), and shared noise, (3m, S)."""
+        """Negative derivatives of the m ground points' coordinates with respect to all unknowns.
+
+        They are (3m, P) for the P unknowns and (3m, S) for the S unknowns of the shared noise, while the points follow
+        them.
+        """
         both, count = (self.point_inverse @ self.cross).tocsc(), self.design.shape[1]
         return both[:, :count].tocsr(), both[:, count:].tocsr()
 
     def _of_shared(self, rows: sparse.csr_matrix, spans: Sequence[tuple[int, int]], size: int) -> Array:
-        """Return the diagonal blocks (n, size, size) of A C A', with C the covariance of the shared-noise unknowns.
+        """Return the n diagonal blocks of A C A', with the covariance C of the S shared-noise unknowns.
+
+        The result is (n, size, size).
 
         A is the matrix `rows`, (n size, S). C is for known other unknowns.
         """
@@ -477,11 +489,11 @@ def assemble(
 
 
 class OmittedTermsModel(Protocol):
-    """Interface of terms that are omitted from the model."""
+    """Interface of error terms (drift rates, slow variations, steps) that an adjustment does not estimate but tests."""
 
     @property
     def size(self) -> int:
-        """Number of omitted terms."""
+        """Number of terms that are omitted from the model and tested."""
 
     def columns(self, field: CalibrationField, line: str, rays: Rays, by: Partials) -> Array:
         """Return the derivatives of n image points' misclosures (x, y) with respect to the terms, (n, 2, size).
@@ -535,7 +547,7 @@ def _reduce(
     weights: Weights,
     shared: SharedNoise,
 ) -> Equations:
-    """Eliminate ground points and shared noise from the whitened equations."""
+    """Return the normal equations of the unknowns, with ground points and shared noise eliminated."""
     exact = np.concatenate([f.control & ~np.any(f.covariance, axis=(1, 2)) for f in fields])
     control = np.concatenate([f.control for f in fields]) & ~exact
     total, count = len(exact), rows.design.shape[1]
@@ -634,7 +646,7 @@ def _root(inverse: Array, used: NDArray[np.bool_]) -> Array:
 
 
 def _blocks(blocks: Array) -> sparse.bsr_matrix:
-    """Return a block diagonal matrix (3m, 3m) from blocks (m, 3, 3)."""
+    """Return a block diagonal matrix (3m, 3m) from m blocks (m, 3, 3)."""
     count = len(blocks)
     return sparse.bsr_matrix((blocks, np.arange(count), np.arange(count + 1)), shape=(3 * count, 3 * count))
 
@@ -659,7 +671,10 @@ def _point_blocks(point: Array, place: NDArray[np.intp], weight: Array, count: i
 
 
 def _padded(rows: sparse.coo_matrix, size: int) -> tuple[Array, NDArray[np.intp]]:
-    """Return a sparse matrix of n groups of `size` rows in dense form: values (n, size, w) and columns (n, w)."""
+    """Return a sparse matrix of n groups of `size` rows in dense form: values (n, size, w) and columns (n, w).
+
+    w is the largest number of columns in which a group has entries.
+    """
     count, width = rows.shape[0] // size, rows.shape[1]
     key = (rows.row // size).astype(np.int64) * width + rows.col
     used, slot = np.unique(key, return_inverse=True)

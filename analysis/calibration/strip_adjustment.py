@@ -1,9 +1,9 @@
 """Strip adjustment of attitude and station within one pass without ground control; stepwise calibration.
 
-**Strip adjustment** (paper 003's check flow). Points that several lines see (tie points, including the check points)
-connect the attitudes of different exposures: rays that do not intersect reveal attitude errors. The unknowns are the
-errors of the readings, with their a-priori sigmas as priors, and the points; cameras and attitude bias come from a
-calibration.
+**Strip adjustment** (check flow of paper 003, Mo et al. 2015). Points that several lines see (tie points,
+including the check points) connect the attitudes of different exposures: rays that do not intersect reveal attitude
+errors. The unknowns are the errors of the readings, with their a-priori sigmas as priors, and the points; cameras and
+attitude bias come from a calibration.
 
 Tie points do not determine the datum. With lines that look forward and backward by a, which see a point T seconds
 before and after the nadir line, all rays still intersect when
@@ -54,9 +54,9 @@ from analysis.orbit.three_line_model import BIAS, LineModel, Rays, bias_rotation
 
 _NAME = "strip"
 _STEPS = 10
-"""Largest number of Gauss-Newton steps."""
+"""Largest number of Gauss-Newton steps of a strip adjustment."""
 _CONVERGED = 1e-6
-"""Largest step of a converged iteration, in metres, as in forward intersection."""
+"""Largest step of the ground points, in metres, at which a strip adjustment counts as converged."""
 
 
 @dataclass(frozen=True)
@@ -85,7 +85,7 @@ class StripAdjustment:
     Attributes
     ----------
     ground : (m, 3) ndarray
-        Points, ITRS, in metres; NaN where fewer than two rays see one.
+        Coordinates of the m points, ITRS, in metres; NaN where fewer than two rays see one.
     covariance : (m, 3, 3) ndarray
         Covariance of the points, including the remaining errors of attitude and station, in m^2.
     datum : tuple of Datum
@@ -129,7 +129,7 @@ class StripAdjustment:
 def adjust_strip(
     rays: Mapping[str, Rays], cameras: Mapping[str, LineModel], noise: Noise, *, bias: ArrayLike = (0.0, 0.0, 0.0)
 ) -> StripAdjustment:
-    """Adjust one pass on its tie points.
+    """Estimate attitude and station errors within one pass from tie points, without ground control.
 
     Time is linear in the number of points, memory quadratic in the number of readings near rays: 800 attitude readings
     take 50 MB.
@@ -184,7 +184,7 @@ def adjust_strip(
 def _solved(
     site: CalibrationField, cameras: Mapping[str, LineModel], noise: Noise, shared: SharedNoise
 ) -> tuple[State, Equations]:
-    """Return the converged state of readings and points, and the equations."""
+    """Iterate a strip adjustment to convergence and return the state of readings and points, with the equations."""
     fixed = (np.array([-1]),) * 5
     parameters = Parameters((), np.zeros(0), np.zeros(0), {(_NAME, k): fixed for k in site.rays})
     state = State(np.zeros(0), (site.ground,), np.zeros(shared.size))
@@ -339,7 +339,7 @@ def stepwise(
 
 
 def _used(parameters: Parameters, name: str, line: str) -> Array:
-    """Return the columns of the interior orientation of a line that are unknowns."""
+    """Return the indices, among all unknowns, of those elements of a line's interior orientation that are estimated."""
     columns = parameters.columns[name, line][0]
     return columns[columns >= 0]
 
@@ -352,7 +352,7 @@ def _alternate(
     Returns
     -------
     tuple of ((P,) ndarray, list of float)
-        Total step, and largest step of each round.
+        Total step of the P unknowns, and largest step of each round.
     """
     inverses = [solved(normal[np.ix_(b, b)], np.eye(len(b))) for b in blocks]
     total, gradient = np.zeros(len(normal)), right.copy()

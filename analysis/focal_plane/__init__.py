@@ -1,1 +1,1 @@
-"""Focal-plane alignment: best focus from through-focus curves, the plane through it, and shims (paper 004)."""
+"""Focal-plane alignment (paper 004, Li et al. 2020): best focus, the plane through the foci, and shims."""

@@ -10,11 +10,11 @@ A small rotation (wx, wy, wz) lifts a point by wx Y' - wy X'; the correction is 
 the shift (0, 0, piston), and wz = -(measured level of the line). `FocalPlaneFit.correction` is the finite rotation for
 which this holds exactly.
 
-**Shims** under a focal-plane assembly (paper 004, section 2). The assembly rests on pads at its mounting holes. The
-pads' normal n points from the camera's structure into the assembly, so a thicker shim moves the assembly along +n.
-Shims realise the part of a rigid motion that they can: the lift along n and the tilts about axes in the mounting
-surface. The rotation about n and the slide in the surface are set by hand, within the clearance of the screws in their
-holes.
+**Shims** under a focal-plane assembly (paper 004, Li et al. 2020, section 2). The assembly rests on pads at its
+mounting holes. The pads' normal n points from the camera's structure into the assembly, so a thicker shim moves the
+assembly along +n. Shims realise the part of a rigid motion that they can: the lift along n and the tilts about axes in
+the mounting surface. The rotation about n and the slide in the surface are set by hand, within the clearance of the
+screws in their holes.
 
 In an off-axis camera n is inclined against the focal plane's normal Z' by an angle i, and the two parts mix. With the
 inclination about X', n = (0, sin i, cos i), and a required tilt w about Y', a rotation of w sin i about n is needed.
@@ -94,7 +94,7 @@ class RigidMotion:
 
     @property
     def matrix(self) -> Array:
-        """Rotation matrix (3, 3)."""
+        """Rotation matrix (3, 3) of the motion, in the assembly's frame."""
         return np.asarray(Rotation.from_rotvec(self.rotation).as_matrix())
 
     @property
@@ -107,16 +107,16 @@ class RigidMotion:
         return float(np.arctan2(-line[0], line[1]))
 
     def moved(self, point: ArrayLike) -> Array:
-        """Return points (..., 3) after the motion, in metres."""
+        """Return the positions of points of the assembly, (..., 3), after the motion, in metres."""
         return np.asarray(np.asarray(point, np.float64) @ self.matrix.T + self.shift)
 
     def displacement(self, point: ArrayLike) -> Array:
-        """Return the displacements of points (..., 3), in metres."""
+        """Return the displacements of points of the assembly, (..., 3), due to the motion, in metres."""
         return self.moved(point) - np.asarray(point, np.float64)
 
 
 class ObservabilityError(MeasurementError, ValueError):
-    """Measured positions that do not determine piston and both slopes."""
+    """Error raised for measured positions that do not determine piston and both slopes of the focal plane."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -245,7 +245,7 @@ def fit_focal_plane(
     Parameters
     ----------
     position : (N, 2) array_like
-        Positions X', Y' in the focal plane, in metres.
+        Positions X', Y' of N measurements in the focal plane, in metres.
     defocus : (N,) array_like
         Best focus minus detector along +Z', in metres.
     sigma : float or (N,) array_like
@@ -303,7 +303,7 @@ def fit_focal_plane(
     freedom = len(height) - 3
 
     def solve(extra: float) -> tuple[Array, Array, float]:
-        """Parameters, covariance and weighted chi-square with an extra scatter."""
+        """Return parameters, covariance and weighted chi-square of the plane for a given extra scatter, in metres."""
         root = 1.0 / np.sqrt(spread**2 + extra**2)
         inverse = statistics.gain(design * root[:, None])
         parameters = inverse @ (height * root)
@@ -367,7 +367,7 @@ _LEAST_WIDTH = 1e-3
 
 
 class ShimError(MeasurementError, ValueError):
-    """Motion that cannot be realised with this mount and these shims.
+    """Error raised for a motion that cannot be realised with this mount and these shims.
 
     Attributes
     ----------
@@ -385,12 +385,12 @@ class ShimError(MeasurementError, ValueError):
 
 @dataclass(frozen=True, eq=False)
 class Mount:
-    """Mounting of the assembly on its pads.
+    """Mounting of a focal-plane assembly on the pads at its screw holes, where shims are inserted.
 
     Attributes
     ----------
     holes : (H, 3) ndarray
-        Centres of the pads in O'-X'Y'Z', in metres.
+        Centres of the H pads in the assembly's frame O'-X'Y'Z', in metres.
     normal : (3,) ndarray
         Unit vector from the structure into the assembly.
     clearance : float
@@ -411,7 +411,7 @@ class Mount:
         Parameters
         ----------
         holes : (H, 3) array_like
-            Centres of the pads in O'-X'Y'Z', in metres.
+            Centres of the H pads in the assembly's frame O'-X'Y'Z', in metres.
         normal : (3,) array_like
             Direction from the structure into the assembly, of any length.
         clearance : float
@@ -458,7 +458,7 @@ class ShimPlan:
     wanted : RigidMotion
         Required motion.
     change : (H,) ndarray
-        Exact change of thickness at each hole, in metres; positive is thicker.
+        Exact change of the shim's thickness at each of the H holes, in metres; positive is thicker.
     change_covariance : (H, H) ndarray
         Covariance of the changes from that of the required motion, without rounding, in m^2.
     rounded_change : (H,) ndarray
@@ -489,7 +489,7 @@ class ShimPlan:
 
     @property
     def change_sigma(self) -> Array:
-        """Standard deviations (H,) of the exact changes, in metres."""
+        """Standard deviations of the exact changes of thickness at the H holes, (H,), in metres."""
         return np.sqrt(np.diag(self.change_covariance))
 
     @property
@@ -519,7 +519,7 @@ def shim_plan(correction: RigidMotion, mount: Mount, present: ArrayLike) -> Shim
     mount : Mount
         Mounting of the assembly.
     present : float or (H,) array_like
-        Present thickness of the shims, in metres.
+        Present thickness of the shims, in metres: one value, or one for each of H holes.
 
     Raises
     ------

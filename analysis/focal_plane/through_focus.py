@@ -6,11 +6,12 @@ is flatter. To fourth order all these curves have nearly the same form,
 
     v = p (1 - u + q u^2),    u = a (z - z0)^2,
 
-with q = 0.30 for a slit pupil (a sinc), 1/3 for a round pupil at low frequencies (2 J1(x)/x), and 0.29 to 0.33 for
-Hopkins' exact curves of an F/9.2 pupil at 650 nm, 71.4 and 17.9 cycles/mm (first zeros at 0.29 and 0.71 mm of defocus).
-So q is a constant and not a fourth unknown: a free q would cost precision, and q = 0 (the parabola) causes a bias where
-the points are asymmetric about the peak. Largest bias over the phases of the steps, in um, with points down to half of
-the peak, and sigma for values accurate to 2 % of the peak:
+of the value v (MTF), with the peak value p, the position z0 of the vertex, the width parameter a, and q = 0.30 for a
+slit pupil (a sinc), 1/3 for a round pupil at low frequencies (2 J1(x)/x), and 0.29 to 0.33 for Hopkins' exact curves of
+an F/9.2 pupil at 650 nm, 71.4 and 17.9 cycles/mm (first zeros at 0.29 and 0.71 mm of defocus). So q is a constant and
+not a fourth unknown: a free q would cost precision, and q = 0 (the parabola) causes a bias where the points are
+asymmetric about the peak. Largest bias over the phases of the steps, in um, with points down to half of the peak, and
+sigma for values accurate to 2 % of the peak:
 
 | scan | parabola | q = 0.3 | sigma |
 |---|---|---|---|
@@ -37,13 +38,14 @@ from analysis.arrays import Array, MeasurementError
 from analysis.statistics import chance_beyond
 
 QUARTIC = 0.3
-"""Fourth-order coefficient q of the fitted curve p (1 - u + q u^2), with u the scaled square of the defocus."""
+"""Coefficient q of the fitted curve p (1 - u + q u^2), u = a (z - z0)^2: peak value p at defocus z0, width parameter a.
+"""
 FRACTION = 0.5
-"""Fraction of the peak above which the fitted curve uses points."""
+"""Fraction of the peak value above which points of a through-focus curve are used in the fit."""
 LEAST_POINTS = 5
 """Smallest number of different focus positions to which a through-focus curve is fitted."""
 WIDEST_FRACTION = 0.3
-"""Fraction of the peak to which the window may extend if it holds too few points."""
+"""Smallest fraction of the peak value down to which points are used if there are too few above `FRACTION`."""
 _ROUNDS, _NEWTON_STEPS = 12, 4
 _AT_REST = 1e-6
 """Relative change in a step below which a curve has converged; further rounds would change it only by rounding."""
@@ -133,7 +135,10 @@ class _Lobe:
         return mask
 
     def window(self, fraction: float) -> NDArray[np.bool_]:
-        """Return a mask of the measured points, (B, Z), at which the fitted curve exceeds a fraction of its peak."""
+        """Return a mask of the points at which the fitted curve exceeds a fraction of its peak, (B, Z).
+
+        B is the number of curves, Z that of focus positions.
+        """
         distance = np.abs(self.x - self.x0[:, None]) * self.scale[:, None]
         return (distance <= self.reach(fraction)[:, None]) & (self.weight > 0)
 
@@ -150,7 +155,10 @@ class _Lobe:
         return np.asarray(present.sum(axis=1))
 
     def _values(self) -> tuple[Array, Array]:
-        """Return the values of B fitted curves at Z positions, and derivatives with respect to p, x0, a, (B, Z, 3)."""
+        """Return the values of B fitted curves at their Z focus positions, (B, Z), and their derivatives, (B, Z, 3).
+
+        The derivatives are with respect to the peak value p, the position x0 of the vertex and the width parameter a.
+        """
         distance = self.x - self.x0[:, None]
         p, a = self.p[:, None], self.a[:, None]
         u = a * distance**2
@@ -195,7 +203,8 @@ class _Lobe:
     def skew(self, mask: NDArray[np.bool_]) -> tuple[Array, Array]:
         """Return the shift of the vertex of B curves if an asymmetry is fitted as well, and the sigma of the shift.
 
-        The skewed curve has different widths on both sides of its peak, u = a (z - z0)^2 (1 +- k), to first order of k.
+        The skewed curve has different widths on both sides of its peak, u = a (z - z0)^2 (1 +- k), to first order of
+        the asymmetry k.
         """
         value, slope = self._values()
         odd = slope[:, :, 2] * np.sign(self.x - self.x0[:, None])
@@ -253,11 +262,11 @@ _REMEDY = {
     "flat": "no curvature above the noise; scan a wider range or lower the noise (more frames or edge rows)",
     "not finite": "a position or a value is not finite; exclude the point or set its sigma to infinity",
 }
-"""Message for each reason, with the remedy."""
+"""Error message, with a remedy, for each reason why a through-focus curve has no usable vertex."""
 
 
 class FocusError(MeasurementError, ValueError):
-    """Curve without a usable vertex; the message says what to change.
+    """Error raised for a through-focus curve without a usable vertex; the message says what to change.
 
     Attributes
     ----------
@@ -272,7 +281,7 @@ class FocusError(MeasurementError, ValueError):
 
     @property
     def reason(self) -> str:
-        """Reason of the first faulty curve."""
+        """Reason why the first faulty curve has no usable vertex, such as "flat"."""
         return next(iter(self.faults.values()))
 
 
@@ -283,7 +292,7 @@ class FocusVertex:
     Attributes
     ----------
     position : float
-        Position of the vertex.
+        Position of the vertex (best focus), in the unit of the positions.
     sigma : float
         Standard deviation of the position from the given sigmas, not scaled by chi-square.
     peak, peak_sigma : float
@@ -319,7 +328,7 @@ class FocusVertices:
     Attributes
     ----------
     used : (..., Z) ndarray of bool
-        True for points that were used.
+        True for those of the Z focus positions of each curve that were used.
     fault : (...) ndarray of str
         Reason for a missing vertex, whose numbers are NaN; empty otherwise.
     covariance : (..., 3, 3) ndarray
@@ -340,7 +349,7 @@ class FocusVertices:
     covariance: Array
 
     def at(self, *index: int) -> FocusVertex:
-        """Return the vertex of one curve."""
+        """Return the vertex of one of the curves, given by its index along the leading axes."""
         values = {field.name: getattr(self, field.name)[index] for field in fields(FocusVertex)}
         return FocusVertex(**{name: value if value.ndim else value.item() for name, value in values.items()})
 
@@ -547,7 +556,7 @@ def _faults(
 
 
 def _contrast(model: _Lobe, mask: NDArray[np.bool_]) -> Array:
-    """Return the mean of each curve's selected points minus that of all its others, in sigmas, (B,)."""
+    """Return the mean of the selected points of each of B curves minus that of its other points, (B,), in sigmas."""
     inside, outside = np.where(mask, model.weight, 0.0), np.where(mask, 0.0, model.weight)
     sums = [np.maximum(part.sum(axis=1), 1e-300) for part in (inside, outside)]
     means = [(part * model.v).sum(axis=1) / total for part, total in zip((inside, outside), sums, strict=True)]
@@ -566,7 +575,7 @@ def _trend(model: _Lobe, mask: NDArray[np.bool_]) -> Array:
 def _raise(
     fault: NDArray[np.str_], shape: tuple[int, ...], z: Array, weight: Array, vertex: Array, reach: Array
 ) -> None:
-    """Raise FocusError, naming the first few, if curves are faulty."""
+    """Raise FocusError for curves without a usable vertex; the message names the first few with their reasons."""
     bad = np.flatnonzero(fault != "")
     if not bad.size:
         return
@@ -591,7 +600,7 @@ def _raise(
 
 
 def _check(where: Array, data: Array, spread: Array) -> None:
-    """Raise ValueError for invalid arguments."""
+    """Raise ValueError if positions, values and sigmas have shapes that do not match, or a sigma is not positive."""
     if data.ndim < 1 or where.shape[-1:] != data.shape[-1:]:
         raise ValueError(f"through focus: position {where.shape} and value {data.shape} must end in the same Z points")
     try:

@@ -133,7 +133,7 @@ def no_such_page(path: Path, page: int, count: int, choose: str) -> ImageError:
 
 PNG_MAGIC, JPEG_MAGIC = b"\x89PNG\r\n\x1a\n", b"\xff\xd8\xff"
 _PNG_CHANNELS = {0: 1, 2: 3, 3: 3, 4: 4, 6: 4}
-"""Number of decoded channels by the colour type of a PNG."""
+"""Number of channels after decoding, for each colour type of the PNG format."""
 
 
 def png_header(path: Path) -> ImageHeader:
@@ -217,7 +217,7 @@ FITS_MAGIC = b"SIMPLE  ="
 _SCIENCE = "SCI"
 _MJD_ZERO = datetime(1858, 11, 17, tzinfo=UTC)
 _NOT_IMAGES = {"ERR", "DQ", "VAR", "MASK", "WHT", "UNCERT", "BPM", "QUALITY"}
-"""Names of extensions that accompany an image."""
+"""Names of FITS extensions that accompany an image, such as errors, masks and weights."""
 
 
 @contextmanager
@@ -238,7 +238,7 @@ def _opened(path: Path) -> Iterator[Any]:
 
 
 def _images(units: Any) -> list[Any]:
-    """Return the units of a FITS file that are images; if some are named as the measurement, only these."""
+    """Return the image units of a FITS file; if some are named as the measurement (not error or mask), only these."""
     from astropy.io import fits
 
     kinds = (fits.PrimaryHDU, fits.ImageHDU, fits.CompImageHDU)
@@ -330,7 +330,7 @@ def fits_time(path: Path) -> datetime | None:
 
 
 def fits_cards(path: Path, number: int) -> dict[str, Any]:
-    """Return keyword -> value of the FITS header of the unit that contains a plane.
+    """Return the keywords and values of the FITS header of the unit that contains a plane.
 
     Parameters
     ----------
@@ -356,15 +356,7 @@ def fits_cards(path: Path, number: int) -> dict[str, Any]:
 
 
 def fits_planes(path: Path, pages: Iterable[int]) -> Iterator[NDArray[Any]]:
-    """Yield planes (rows, columns) of physical values.
-
-    Parameters
-    ----------
-    path : Path
-        Path of the file.
-    pages : iterable of int
-        Numbers of the planes.
-    """
+    """Yield image planes (rows, columns) of a FITS file as physical values (BZERO + BSCALE times stored)."""
     with _opened(path) as units:
         planes = _planes(units)
         for number in pages:
@@ -376,10 +368,10 @@ def fits_planes(path: Path, pages: Iterable[int]) -> Iterator[NDArray[Any]]:
 tifffile.logger().addHandler(logging.NullHandler())
 
 TIFF_MAGIC = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
-"""First four bytes of a TIFF."""
+"""First four bytes of a TIFF or BigTIFF of either byte order."""
 _ICC_PROFILE, _ORIENTATION, _EXIF = 34675, 274, 34665
 _AXES = {"YX": (0, 1, None), "YXS": (0, 1, 2), "SYX": (1, 2, 0)}
-"""Positions of rows, columns and channels among the axes of a page."""
+"""Positions of rows, columns and channels among the axes of a TIFF page, by the name of the axes' order."""
 _GREY = {"MINISWHITE", "MINISBLACK", "RGB"}
 _OTHERS = {
     "PALETTE": "numbers of a palette's colours",
@@ -515,7 +507,7 @@ MOST_BYTES = 1 << 29
 MOST_PIXELS = 4_000_000
 """Largest number of pixels of a region: the fits need some 250 bytes for each."""
 MOST_STACKED = 16_000_000
-"""Largest number of pixels of a region in all pages together."""
+"""Largest number of pixels of a region, summed over all pages."""
 _LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
 _LARGEST_GAMMA = 5.0
 _GZIP = b"\x1f\x8b"

@@ -36,15 +36,13 @@ from optics.numerics.array_math import covariance_root
 Predict = Callable[[Array], Array]
 """Function that predicts the error-free measurements (S, D) of states (S, M), in SI units.
 
-S is the number of states, D of measured numbers (group after group), M of motions. The result is NaN where the light is
-lost.
-
-Dimensions: S states, D measured numbers, M motions.
+S is the number of states, D of measured numbers (all groups one after the other), M of motions. The result is NaN where
+the light is lost.
 """
 Slope = Callable[[Array], Array]
-"""Function from one state (M,) to the derivatives (D, M) of the measurements.
+"""Function from one state (M,) to the derivatives (D, M) of the measurements with respect to its motions.
 
-Dimensions: M motions, D measured numbers.
+D is the number of measured numbers, M of motions; derivatives are in SI units.
 """
 
 FALSE_ALARM = 1e-3
@@ -55,7 +53,10 @@ STEP_TOLERANCE = 0.01
 MOST_STEPS = 20
 _SHORTEST = 2.0**-8
 _MOST_EXCLUDED = 1.0 / 3.0
-"""Largest fraction of a group's blocks that are excluded: with more the measurement itself is in doubt."""
+"""Largest fraction of the blocks of one measurement that may be excluded as gross errors.
+
+With more, the measurement itself is in doubt. A block is the numbers that one gross error would affect together.
+"""
 _NO_RANK = 1e-9
 
 
@@ -81,7 +82,7 @@ class StatePrior:
 
     @classmethod
     def of(cls, labels: Sequence[str], covariance: Array, mean: Array | None = None) -> StatePrior:
-        """Return the prior with a given covariance.
+        """Return the normal prior of a state from its covariance and mean.
 
         Parameters
         ----------
@@ -116,7 +117,7 @@ class StatePrior:
 class MeasuredGroup:
     """Measured numbers of one measurement with the covariance of their errors and possible biases.
 
-    Dimensions: B biases.
+    Dimensions: D measured numbers, B biases.
 
     Attributes
     ----------
@@ -205,7 +206,7 @@ class MeasuredGroup:
 
 @dataclass(frozen=True)
 class ConsistencyTest:
-    """Chi-square test of some numbers against their prediction by all others, the prior and the instrument.
+    """Chi-square test of a set of measured numbers against their prediction by all others, the prior and the model.
 
     Attributes
     ----------
@@ -231,9 +232,10 @@ class ConsistencyTest:
         return cls(name, float(chi_square), degrees, p_value)
 
     def passes(self, looks: int = 1, false_alarm: float = FALSE_ALARM) -> bool:
-        """Return True if the numbers are consistent with their prediction.
+        """Return True if the measured numbers are consistent with their prediction.
 
-        The probability ``false_alarm`` is shared among ``looks`` groups that are tested together.
+        The false-alarm probability ``false_alarm`` is divided by the number ``looks`` of groups that are tested
+        together.
         """
         return not self.degrees or self.chi_square <= float(limit_of(false_alarm / max(1, looks), self.degrees))
 
@@ -260,7 +262,7 @@ class StateEstimate:
     residual : (R,) ndarray
         Whitened residuals.
     whole : ConsistencyTest
-        Test of everything together.
+        Chi-square test of all measurements together.
     measurements : tuple of ConsistencyTest
         Test of each measurement against its prediction by all others.
     blocks : dict of str to tuple of ConsistencyTest
@@ -413,7 +415,7 @@ def _gauss_newton(
     unit: Array,
     out: dict[str, list[str]],
 ) -> StateEstimate:
-    """Return the estimate by Gauss-Newton steps from a start, without the excluded blocks."""
+    """Return the estimate of the state by Gauss-Newton steps, without the excluded blocks of measured numbers."""
     whiteners = [group.whitener(out.get(group.name, ())) for group in groups]
     values = np.concatenate([group.values for group in groups])
 
@@ -500,10 +502,11 @@ def _tested(
 
 
 def _consistency(name: str, residual: Array, spread: Array, rows: Array) -> ConsistencyTest:
-    """Return the test whether some whitened numbers agree with all others.
+    """Return the chi-square test of a set of whitened measured numbers against their prediction from all others.
 
-    Its chi-square is the reduction of the total chi-square by a mean shift of these numbers, rows (R, K). It equals the
-    chi-square of these numbers about their prediction from all others.
+    The chi-square is the reduction of the total chi-square if these numbers may have an arbitrary shift (mean-shift
+    outlier model). ``rows``, (R, K), has a column for each of the K tested numbers with its effect on all whitened
+    ones.
 
     Dimensions: R whitened measured numbers, K numbers tested.
     """
@@ -616,7 +619,7 @@ _TINY = 1e-6
 
 @dataclass(frozen=True, eq=False)
 class Actuators:
-    """Actuators of an instrument.
+    """Limits, step sizes and errors of the actuators of an instrument.
 
     Attributes
     ----------
@@ -712,10 +715,11 @@ def best_move(residual: Array, slope: Array, actuators: Actuators) -> NextMove:
 def merit_reduction(
     spread: Array, slope: Array, actuators: Actuators, response: Array, candidates: Mapping[str, Array]
 ) -> dict[str, float]:
-    """Return the expected reduction of the merit, after the following move, by one more measurement of each kind.
+    """Return the expected reduction of the merit after the next move by one more measurement of each kind.
 
-    The uncertainty of the state matters only where actuators could correct it: tr(H D P D' H) with H the projection on
-    their range.
+    The uncertainty of the state matters only where actuators could correct it: the expected merit has the part tr(H D P
+    D' H), with the covariance P of the state, the derivatives D of the merit's numbers, and the projection H on the
+    range of the actuators' effects A.
 
     Dimensions: U independent units of the prior, R numbers of the merit, C actuators, N numbers.
 
@@ -728,7 +732,7 @@ def merit_reduction(
     actuators : Actuators
         Actuators of the instrument; their steps are ignored, their limits only exclude those that cannot move.
     response : (R, C) ndarray
-        Derivatives A with respect to the actuators.
+        Derivatives A of the merit's numbers with respect to the actuators.
     candidates : dict of str to (N, U) ndarray
         Whitened derivatives of each candidate measurement with respect to the units, by name.
     """

@@ -74,7 +74,7 @@ def checked_positions(positions: ArrayLike, count: int | None, what: str) -> Arr
 
 
 def checked_templates(templates: ArrayLike, what: str) -> Array:
-    """Return templates (n, k, k) as float64.
+    """Return n templates of k x k pixels, (n, k, k), as float64.
 
     Raises
     ------
@@ -96,7 +96,7 @@ def checked_templates(templates: ArrayLike, what: str) -> Array:
 
 
 class Reason(IntEnum):
-    """Verdict on a match: accepted, or the reason why it is not; `text` describes it."""
+    """Code of the verdict on a match: accepted, or the reason for its rejection; `text` describes it."""
 
     ACCEPTED = 0
     TEMPLATE = 1
@@ -117,7 +117,7 @@ class Reason(IntEnum):
 
     @property
     def text(self) -> str:
-        """Description of the reason."""
+        """Description of the verdict in a few words."""
         return _TEXTS[self]
 
 
@@ -239,7 +239,11 @@ class MatchOptions:
 
     @property
     def parameters(self) -> int:
-        """Number of unknowns of a fit: position, affine matrix, offset, gain and sharpness."""
+        """Number of unknowns of a fit.
+
+        They are 2 of the position, 4 of the affine matrix, offset, gain and, if a difference in sharpness is fitted, 2
+        more.
+        """
         return 8 + 2 * self.sharpness
 
 
@@ -260,7 +264,7 @@ def distinct_points(image: ArrayLike, count: int, *, spacing: float, border: int
     Parameters
     ----------
     image : (H, W) array_like
-        Image of any real type. Close to pixels that are not finite there are no points.
+        Image of H rows and W columns, of any real type. Close to pixels that are not finite there are no points.
     count : int
         Largest number of points.
     spacing : float
@@ -415,9 +419,9 @@ def search(image: ArrayLike, templates: ArrayLike, predicted: ArrayLike, reach: 
     Parameters
     ----------
     image : (H, W) array_like
-        Image of any real type.
+        Image of H rows and W columns, of any real type.
     templates : (n, k, k) array_like
-        Templates in the image's geometry; k odd.
+        Templates of k x k pixels, n of them, in the image's geometry; k odd.
     predicted : (n, 2) array_like
         Expected row and column of their middles; the search starts from the nearest pixel.
     reach : int

@@ -90,8 +90,9 @@ _HELD = 0.3
 position.
 """
 _ONE_WAY = 0.1
-"""Curvature, relative to the best direction, below which structure runs along one direction: sharp across it, it
-prevents the choice of a low-pass, which otherwise leaves little of the noise's energy.
+"""Curvature of the sum of squares along the worst direction, relative to that along the best, below which the texture
+of a window counts as running along one direction. As it is sharp across, no low-pass can be chosen that would
+otherwise remove the noise's energy.
 """
 _EQUAL = 0.6
 """Smallest noise ratio for locking: template and image have the same noise, of which interpolation passes two thirds.
@@ -124,9 +125,10 @@ class TemplateNoise:
     share: Array
 
     def covariance(self, good: NDArray[np.bool_]) -> Array:
-        """Return the covariance (n, 2, 2), in px^2, that allows for bias and locking by template noise.
+        """Return the part of the position covariances due to template noise (bias and locking), (n, 2, 2), in px^2.
 
-        The ratio of template noise to residuals is estimated from the points selected by the mask `good` (n,).
+        There are n points. The ratio of template noise to residuals is estimated from those selected by the mask `good`
+        (n,).
         """
         noise_ratios = self.share[good & np.isfinite(self.share)]
         if not len(noise_ratios):
@@ -136,7 +138,10 @@ class TemplateNoise:
         return np.asarray(lean[:, :, None] * lean[:, None] + lock @ np.swapaxes(lock, 1, 2))
 
     def _lock(self, share: float) -> Array:
-        """Return the displacement of row and column by template noise along each axis, (n, 2, 2), in pixels."""
+        """Return the displacement of n positions due to template noise along each axis, (n, 2, 2), in pixels.
+
+        `share` is the ratio of the variance of the template noise to that of the residuals.
+        """
         energy = share * self.energy[:, None, None] * np.eye(2)
         determined = np.isfinite(self.inverse[:, :2, :2]).all(axis=(1, 2)) & np.isfinite(self.energy)
         out = np.full_like(self.inverse[:, :2, :2], np.nan)
@@ -222,7 +227,9 @@ def template_noise(
 def _bend(
     stack: SplineStack, which: NDArray[np.intp], position: Array, linear: Array, by_geometry: Array, residual: Array
 ) -> Array:
-    """Return the sum over pixels of residuals times second derivatives with respect to the q unknowns, (n, q, q).
+    """Return the sum over pixels of residuals times second derivatives of the model, (n, q, q).
+
+    There are n fits, and the derivatives are with respect to their q unknowns.
 
     Second derivatives of the position in the template with respect to the unknowns multiply sums of residuals times
     slopes, which are 0.
@@ -248,7 +255,9 @@ def _bend(
 
 
 def _inverse(square: Array, curvature: Array) -> Array:
-    """Return the inverse curvature of the sum of squares in q unknowns, (n, q, q); NaN with too little curvature.
+    """Return the inverse curvature of the sum of squares of n fits in q unknowns, (n, q, q).
+
+    It is NaN where there is too little curvature.
 
     It is inverted within the range of the normal matrix.
     """
@@ -270,7 +279,7 @@ def _inverse(square: Array, curvature: Array) -> Array:
 def _force(position: Array, linear: Array, smoothing: Array, by_geometry: Array) -> Array:
     """Return the expected gradient of the sum of squares due to white template noise of unit variance, (n, q).
 
-    The variance is that in the image, after the gain; q is the number of unknowns.
+    The gradient is with respect to the q unknowns of n fits. The variance is that in the image, after the gain.
     """
     mean, wave = np.moveaxis(np.array([_noise_gain(float(radius)) for radius in smoothing]), 1, 0)
     phase = 2.0 * np.pi * position
@@ -309,7 +318,7 @@ def noise_energy(factors: Array, smoothing: float) -> Array:
     Parameters
     ----------
     factors : (n, 1) or (n, 3) ndarray
-        Gain and, optionally, sharpness along rows and columns.
+        Gain and, optionally, sharpness along rows and columns, of n fits.
     smoothing : float
         RMS radius of the low-pass, in pixels.
     """
@@ -352,7 +361,7 @@ be an order of magnitude smaller.
 _LONGEST_STEP = 0.7
 """Longest Gauss-Newton step of the position, in pixels."""
 _RIDGE = 1e-11
-"""Relative ridge that keeps singular normal matrices solvable."""
+"""Number added to the diagonal of scaled normal matrices to keep singular ones solvable, relative to the diagonal."""
 _SMOOTHINGS = (0.0, 0.35, 0.7, 1.1, 1.7, 2.6)
 """RMS radii of the Gaussians that may smooth a template, in pixels; those up to a ninth of the window's side are used.
 """
@@ -366,7 +375,7 @@ _INTERPOLATION = 0.004
 
 @dataclass(frozen=True, eq=False)
 class Fits:
-    """Fitted points; values are NaN where the window could not be fitted at all.
+    """Least-squares matches of n points; values are NaN where the window could not be fitted at all.
 
     Attributes
     ----------
@@ -417,7 +426,7 @@ class Fits:
     scales: WindowScales
 
     def covariance(self, good: NDArray[np.bool_] | None = None) -> Array:
-        """Return the (n, 2, 2) covariance of positions, in px^2.
+        """Return the covariance of row and column of each of n positions, (n, 2, 2), in px^2.
 
         Parameters
         ----------
@@ -428,7 +437,10 @@ class Fits:
         return noise + relief
 
     def covariances(self, good: NDArray[np.bool_] | None = None) -> tuple[Array, Array]:
-        """Return two parts of the covariance of positions: noise with interpolation, and relief within the window."""
+        """Return two parts of the covariance of n positions, each (n, 2, 2), in px^2: due to noise and due to relief.
+
+        The first includes the interpolation error. Relief means displacements that vary within the window.
+        """
         noise, hidden, tau, _usual = self._parts(good)
         relief = tau[:, None, None] * self.relief.effect
         common = self.reason == Reason.ACCEPTED if good is None else good
@@ -436,9 +448,9 @@ class Fits:
         return noise * hidden[:, None, None] + lean + _INTERPOLATION**2 * np.eye(2), relief
 
     def steps(self, good: NDArray[np.bool_] | None = None) -> tuple[Array, Array]:
-        """Return p-value and power of the test for a step of displacement between halves of a window, each (n,).
+        """Return p-value and power of the test for a displacement step between halves of each of n windows, each (n,).
 
-        See `WindowHalves.judged`.
+        NaN where there is no fit.
         """
         noise, hidden, _tau, typical = self._parts(good)
         # points without a covariance, because of template noise, use the median factor
@@ -448,7 +460,7 @@ class Fits:
         return self.halves.judged(self.spread.variance * coloured * hidden, typical)
 
     def _parts(self, good: NDArray[np.bool_] | None) -> tuple[Array, Array, Array, float]:
-        """Return covariance by residual noise, factor for noise hidden by smoothing, and variances of relief.
+        """Return covariance due to residual noise, factor for noise hidden by smoothing, and variances of relief.
 
         The variances of relief, in px^2, are that of each point and that of a typical point.
         """
@@ -462,7 +474,9 @@ class Fits:
             return np.asarray(np.trace(noise, axis1=1, axis2=2) / np.trace(self.spread.plain, axis1=1, axis2=2))
 
     def _hidden(self) -> Array:
-        """Return the factor (n,) by which noise where grey values change exceeds that in residuals; NaN if unknown.
+        """Return the factor by which the noise at slopes of the grey values exceeds that in the residuals, (n,).
+
+        It is NaN where unknown. A smoothed template hides part of its noise from the residuals.
 
         A smoothed template has one independent value per 4 pi rms^2 pixels. Its noise is in these alone and loses one
         to each unknown, while that of the image is white. With equal noise in both, and where half of the amplitude
@@ -484,9 +498,9 @@ def least_squares(
     Parameters
     ----------
     image : (H, W) array_like
-        Image of any real type.
+        Image of H rows and W columns, of any real type.
     templates : (n, k, k) array_like
-        Templates; k odd.
+        Templates of k x k pixels, n of them; k odd.
     start : (n, 2) array_like
         Start row and column, accurate to a pixel.
     options : MatchOptions, optional
@@ -514,7 +528,7 @@ def least_squares(
 
 
 def _fit(image: NDArray[np.generic], templates: Array, start: Array, options: MatchOptions) -> Fits:
-    """Fit a group of points at once; arguments are those of `least_squares`."""
+    """Fit the positions of a group of points at once; the arguments are those of `least_squares`."""
     count, half = len(templates), templates.shape[1] // 2
     reach = half - options.margin
     row, column = (g.ravel().astype(np.float64) for g in np.mgrid[-reach : reach + 1, -reach : reach + 1])
@@ -694,7 +708,7 @@ def _step(
 
 
 def _solve(design: Array, grey: Array) -> Array:
-    """Solve scaled normal equations with a small ridge."""
+    """Solve the scaled normal equations of linear least-squares fits, with a small ridge against singularity."""
     scale = 1.0 / np.maximum(np.sqrt(np.einsum("mqp,mqp->mq", design, design)), 1e-300)
     scaled = design * scale[:, :, None]
     normal = scaled @ np.swapaxes(scaled, 1, 2) + _RIDGE * np.eye(design.shape[1])
@@ -714,7 +728,7 @@ def _summary(
     reach: int,
     template_noise_effect: TemplateNoise,
 ) -> Fits:
-    """Return the fits with their statistics and window checks."""
+    """Return the converged fits with their statistics and the checks of their windows."""
     unfitted = np.isin(reason, (Reason.TEMPLATE, Reason.OUTSIDE, Reason.IMAGE, Reason.FLAT, Reason.SATURATED))
     square = np.einsum("np,np->n", residual, residual)
     centred = grey - grey.mean(axis=1, keepdims=True)

@@ -66,7 +66,7 @@ class Matches:
 
     @property
     def sigma(self) -> Array:
-        """Standard deviation (n,) along the worst direction, in pixels; NaN without a fit."""
+        """Standard deviation of each of n positions along its worst direction, (n,), in pixels; NaN without a fit."""
         return _worst(self.covariance)
 
     @property
@@ -95,9 +95,10 @@ def match_windows(
     Parameters
     ----------
     image : (H, W) array_like
-        Image that is searched, of any real type.
+        Image of H rows and W columns that is searched, of any real type.
     templates : (n, k, k) array_like
-        Windows of the other image, k odd, resampled to the geometry of `image`. NaN makes a point unusable.
+        Windows of the other image, n of them with k x k pixels, k odd, resampled to the geometry of `image`. NaN makes
+        a point unusable.
     predicted : (n, 2) array_like
         Predicted row and column of the centre of each window in `image`, in pixels.
     search_radius : int
@@ -198,7 +199,8 @@ def _without_steps(
 ) -> NDArray[np.int8]:
     """Return the verdicts after the test for displacement steps within windows.
 
-    Verdicts of `silent` windows stay; they only count in the fraction of windows that fail.
+    Verdicts of the windows in the mask `silent`, whose covariance is unknown, stay unchanged; they only count in the
+    fraction of windows that fail the test.
     """
     tested = reason == Reason.ACCEPTED
     # NaN compares false
@@ -215,7 +217,7 @@ def _open(reason: NDArray[np.int8]) -> NDArray[np.bool_]:
 
 
 def _worst(covariance: Array) -> Array:
-    """Return the standard deviation (n,) along the worst direction of covariances (n, 2, 2)."""
+    """Return the standard deviations along the worst direction, (n,), of n covariances (n, 2, 2)."""
     a, b, c = covariance[:, 0, 0], covariance[:, 0, 1], covariance[:, 1, 1]
     return np.asarray(np.sqrt(0.5 * (a + c) + np.hypot(0.5 * (a - c), b)))
 
@@ -223,13 +225,13 @@ def _worst(covariance: Array) -> Array:
 # Probability of drawing no sample free of mismatches, for the share of mismatches _WRONG.
 _MISSED, _WRONG = 1e-6, 0.45
 _MOST_SAMPLES = 8000
-"""Largest number of random samples."""
+"""Largest number of random minimal samples of points in the search for a consensus."""
 _VALUES = 2_000_000
-"""Number of candidates' distances that are held in memory at once."""
+"""Number of distances of points from candidate displacement fields that are held in memory at once."""
 _MEDIAN = 2.0 * math.log(2.0)
-"""Median of chi-square with two degrees of freedom."""
+"""Median of the chi-square distribution with two degrees of freedom."""
 _ROUNDS = 50
-"""Largest number of iterations of the consensus."""
+"""Largest number of iterations of selecting and fitting the points of a consensus."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -257,7 +259,7 @@ class DisplacementField:
     heights: tuple[float, float] | None
 
     def __call__(self, position: ArrayLike, height: ArrayLike | None = None) -> Array:
-        """Return the displacement (n, 2) at positions (n, 2) and heights (n,), in pixels.
+        """Return the displacements at n positions (n, 2) and heights (n,), as (n, 2), in pixels.
 
         Raises
         ------
@@ -272,7 +274,7 @@ class DisplacementField:
 
 @dataclass(frozen=True, eq=False)
 class Consensus:
-    """Matches that agree with one displacement field.
+    """Selection of those of n matches that agree with one displacement field.
 
     Attributes
     ----------
@@ -315,7 +317,7 @@ def consensus(
     Parameters
     ----------
     predicted : (n, 2) array_like
-        Predicted rows and columns, in pixels.
+        Predicted rows and columns of n points, in pixels.
     matched : (n, 2) array_like
         Matched rows and columns, in pixels; rows with NaN are ignored.
     covariance : (n, 2, 2) array_like, optional

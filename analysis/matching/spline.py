@@ -38,7 +38,7 @@ def resampled(image: ArrayLike, rows: ArrayLike, columns: ArrayLike, *, smoothin
     Parameters
     ----------
     image : (H, W) array_like
-        Image of any real type; NaN marks missing pixels.
+        Image of H rows and W columns, of any real type; NaN marks missing pixels.
     rows : (..., k, l) array_like
         Rows of the samples. Each array of k rows and l columns is one patch and is cut out with a halo, so that only
         the patches and not the image are filtered.
@@ -73,7 +73,7 @@ def resampled(image: ArrayLike, rows: ArrayLike, columns: ArrayLike, *, smoothin
 
 
 def _fill(sample: Array, image: NDArray[np.generic], row: Array, column: Array, smoothing: float) -> None:
-    """Fill one patch with the grey values of an image at rows and columns."""
+    """Fill an array with the grey values of an image at given rows and columns, all of one patch."""
     height, width = image.shape
     # NaN compares false
     inside = (row >= 0) & (row <= height - 1) & (column >= 0) & (column <= width - 1)
@@ -100,7 +100,10 @@ def _fill(sample: Array, image: NDArray[np.generic], row: Array, column: Array, 
 
 
 def low_passed(templates: Array, smoothing: float) -> Array:
-    """Return templates (n, k, k) after a Gaussian of RMS radius `smoothing`, in pixels; the rim continues the slope."""
+    """Return n templates (n, k, k) after a Gaussian low-pass of RMS radius `smoothing`, in pixels.
+
+    The templates are continued beyond their edges with the slope that they have there.
+    """
     if not smoothing:
         return templates
     reach = int(np.ceil(4.0 * smoothing))
@@ -110,7 +113,7 @@ def low_passed(templates: Array, smoothing: float) -> Array:
 
 
 class SplineStack:
-    """Quintic splines through n finite templates (n, k, k), evaluated at separate positions in each."""
+    """Quintic splines through n templates of k x k finite values, evaluated at separate positions in each."""
 
     def __init__(self, templates: Array) -> None:
         count, self.size = templates.shape[0], templates.shape[1]
@@ -127,11 +130,11 @@ class SplineStack:
         Parameters
         ----------
         row : (m, p) ndarray
-            Rows in pixels of the template; clipped to it.
+            Rows of p positions in each of m groups, in pixels of the template; clipped to it.
         column : (m, p) ndarray
             Columns in pixels of the template; clipped to it.
         which : (m,) ndarray of int
-            Template of each row of positions.
+            Index of the template of each group of positions.
         order : int
             Highest derivative, 1 to 4.
 

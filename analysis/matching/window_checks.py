@@ -81,9 +81,9 @@ class WindowHalves:
         Parameters
         ----------
         variance : (n,) ndarray
-            Variance of the noise, including its correlation, in DN^2.
+            Variance of the noise in each of n windows, including its correlation, in DN^2.
         relief : float
-            Variance of the displacements within a typical window (tau^2 of the module), in px^2.
+            Variance of the relief, the displacements of parts of a typical window from the common fit, in px^2.
 
         Returns
         -------
@@ -103,9 +103,10 @@ class WindowHalves:
 
 
 def risk(share: float, power: Array) -> Array:
-    """Return the probability that a window that passed the test still has a displacement step, (n,), by Bayes' rule.
+    """Return the probability that a window that passed the test still has a displacement step, by Bayes' rule.
 
-    The prior probability is the fraction `share` of all windows that fail; `power` is the power of the test.
+    The prior probability is the fraction `share` of all windows that fail; `power` is the power of the test for each
+    window. The result has the shape of `power`.
     """
     return share * (1.0 - power) / (1.0 - share * power)
 
@@ -199,7 +200,7 @@ class ResidualCorrelation:
 
     @property
     def plain(self) -> Array:
-        """Covariance (n, 2, 2) of the positions if residuals of different pixels are uncorrelated, in px^2."""
+        """Covariances of the n positions if residuals of different pixels are uncorrelated, (n, 2, 2), in px^2."""
         return np.asarray(self.variance[:, None, None] * self.white)
 
     def covariance(self, good: NDArray[np.bool_]) -> Array:
@@ -286,7 +287,7 @@ def _overlap(side: int, row: int, column: int) -> tuple[_Cut, _Cut]:
 
 
 def _lagged(influence: Array) -> Array:
-    """Return the increase of the position covariance due to residuals correlated at a lag, (n, lags, 2, 2).
+    """Return the increase of the covariances of n positions due to residuals correlated at a lag, (n, lags, 2, 2).
 
     The correlation is 1 at the lag and its opposite. `influence`, (n, 2, side, side), is the derivative of row and
     column with respect to the grey values of the window.
@@ -338,7 +339,7 @@ class WindowScales:
         Parameters
         ----------
         factor : (n,) ndarray
-            Factor on the variance of the noise.
+            Factor on the variance of the noise at each of n points.
         good : (n,) ndarray of bool
             Points from which the common excess is estimated.
         """
@@ -415,17 +416,19 @@ def _square(apart: Array, covariance: Array) -> Array:
 
 
 _BLOCKS = 5
-"""Number of blocks along each side of a window."""
+"""Number of blocks of constant relief along each side of a window."""
 _LENGTH = 1.0
 """Correlation length of the relief over the window's side: a shorter one would act as noise on the affine change, a
 longer one follows it.
 """
 _OWN = 4.0
-"""Significance of a point's relief variance tau^2, in standard deviations without relief, above which the point uses
-its own value and not the common one; chance exceeds it with a probability of about 1e-3.
+"""Relief variance tau^2 of a point, in units of its standard deviation without relief, above which the point uses its
+own value and not the common one; chance exceeds it with a probability of about 1e-3.
 """
 _HELD = 2.5
-"""Limit, in standard deviations, of a point's relief variance tau^2 in the common mean."""
+"""Largest relief variance tau^2 of a point that enters the common mean, in its standard deviations without relief;
+larger ones are limited to it.
+"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -435,11 +438,12 @@ class WindowRelief:
     Attributes
     ----------
     score : (n,) ndarray
-        Score q of the module, a quadratic form of the residuals that grows with relief, in DN^2.
+        Score q, a quadratic form of the residuals that grows with relief, in DN^2.
     first : (n,) ndarray
-        Expectation of the score for white residuals of unit variance: tr(K G) of the module.
+        Expectation of the score for white residuals of unit variance (tr(K G) in the module's description).
     second : (n,) ndarray
-        Expectation of the score for relief of 1 px standard deviation: tr(K G K G) of the module, in DN^2 px^-2.
+        Expectation of the score for relief of 1 px standard deviation and no noise (tr(K G K G) in the module's
+        description), in DN^2 px^-2.
     redundancy : (n,) ndarray
         Redundancy of the fit.
     effect : (n, 2, 2) ndarray
@@ -545,7 +549,7 @@ def window_relief(design: Array, residual: Array, side: int) -> WindowRelief:
 
 
 def relief_field(side: int) -> tuple[Array, Array, Array]:
-    """Return the blocks of a window's pixels, and correlations of relief between blocks and with the middle.
+    """Return the blocks of a window's pixels, and the correlations of relief between blocks and with the middle.
 
     For p pixels and b blocks, the assignment of pixels to blocks is (p, b), the correlation between blocks (b, b), and
     that of the window's middle with the blocks (1, b).

@@ -36,7 +36,7 @@ AXES = ("X", "Y", "Z")
 
 
 def mirror_rotation(shift_m: ArrayLike, focal_length_m: float) -> Array:
-    """Return the rotation of a mirror, rad, from the shift of its autocollimator spot, m (paper 001, eq. (1))."""
+    """Return a mirror's rotation, rad, from its spot's shift, m, by eq. (1) of paper 001 (Wang et al. 2018)."""
     return np.asarray(0.5 * np.arctan(np.asarray(shift_m, np.float64) / focal_length_m))
 
 
@@ -53,8 +53,8 @@ def reading_of_normal(normal: ArrayLike) -> Array:
 def column_component(axis: str) -> int:
     """Return which component of the readings Table 2 lists for a rotation about an axis: 0 about X, 1 about Y.
 
-    Table 2 of paper 001 compares the readings of two autocollimators that view mirrors on one turntable. For the axis Z
-    it is 1: mirror 2 rotates about its own Y.
+    Table 2 of paper 001 (Wang et al. 2018) compares the readings of two autocollimators that view mirrors on one
+    turntable. For the axis Z it is 1: mirror 2 rotates about its own Y.
     """
     if axis not in AXES:
         raise ValueError(f"readings: axis must be X, Y or Z, found {axis!r}")
@@ -119,7 +119,9 @@ def exact_reading(axis: str, angle: ArrayLike, unit: int, between: float) -> Arr
 
 
 def mean_difference(first: ArrayLike, second: ArrayLike) -> float:
-    """Return the mean absolute difference of two columns of readings, as in the last line of Table 2 of paper 001.
+    """Return the mean absolute difference of two columns of readings.
+
+    The last line of Table 2 of paper 001 (Wang et al. 2018) is this number.
 
     About X and Y that line compares the reading of mirror 1 with the scaled reading of mirror 2; about Z, however, the
     scaled reading of mirror 2 with the *turntable's* angle.

@@ -10,8 +10,8 @@ and the mechanism reaches it d readings later, so that the reading after the nex
     L(z) = g z^-(d + 1) / (1 - 1/z),
 
 as for every integrator with a delay (Astrom, Wittenmark, Computer-Controlled Systems, 1997, ch. 3; in adaptive optics:
-Gendron, Lena, Astron. Astrophys. 291, 1994, 337). Its phase is -180 degrees at w = pi / (2 d + 1) per reading, where
-its size is g / (2 sin(w / 2)): the loop is stable below
+Gendron, Lena, Astron. Astrophys. 291, 1994, 337). Its phase is -180 degrees at the angular frequency w = pi / (2 d +
+1), in radians per reading, where its modulus is g / (2 sin(w / 2)): the loop is stable below
 
     g = 2 sin(pi / (4 d + 2)).
 
@@ -36,11 +36,11 @@ DECAYING = 1.0 - 1e-12
 The margin to 1 covers rounding for loops that are marginally stable.
 """
 _LEAST, _MOST = 1e-6, 1e6
-"""Gain margins that are as bad and as good as any."""
+"""Gain margins (factors) at which the search ends: a smaller one counts as 0, a larger one as infinite."""
 _CLOSE = 1e-12
 """Relative accuracy to which a gain margin is computed."""
 _SETTLING, _WATCHED = 400, 400
-"""Readings before a limit cycle is looked at, and for which it is."""
+"""Numbers of simulated readings in the search for limit cycles: those for settling, then those examined."""
 _OFFSETS = 41
 """Number of constant values of the uncorrected quantity, spread over one step, for which limit cycles are searched."""
 
@@ -208,7 +208,7 @@ def common_margin(
 
 @dataclass(frozen=True)
 class LimitCycle:
-    """Endless cycle of a mechanism that moves by whole steps while the controlled quantity would be constant.
+    """Limit cycle of a mechanism that moves by whole steps, while the uncorrected quantity is constant.
 
     It is the worst case over all positions of the desired value between two steps.
 

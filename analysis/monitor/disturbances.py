@@ -50,8 +50,8 @@ class TimeLaw:
         Start of trend and relaxation, s.
     event : tuple of (float, float)
         Step: pairs (time, probability that it has occurred by then) in the order of time, linear between; one pair
-        (time, 1) for a known time; above 1 it is the mean number of many steps. C is the probability at the earlier of
-        two times: at a time that may be before the step the motion is known less well. Empty for no step.
+        (time, 1) for a known time; a value above 1 is the mean number of many steps. C is the probability at the
+        earlier of two times: at a time that may be before the step the motion is known less well. Empty for no step.
     jump : bool
         True for a step at an unknown time: it counts as absent until it is detected (`jump_detection`), and is then an
         event. All other attributes but ``every_s`` then have their defaults.
@@ -231,9 +231,9 @@ class Disturbances:
         correlation: ArrayLike | None = None,
         jump_false_alarm: float = FALSE_ALARM,
     ) -> Disturbances:
-        """Return disturbances from plain arrays, each motion of a body of its own.
+        """Return the prior of disturbances from plain arrays; each motion belongs to a separate body.
 
-        Dimensions: D spot coordinates (row and column of every spot), P parameters.
+        Dimensions: D spot coordinates (row and column of every spot), M motions, P parameters.
 
         Parameters
         ----------

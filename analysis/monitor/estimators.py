@@ -29,7 +29,7 @@ from analysis.monitor.parameters import CameraCalibration
 from optics.numerics.extension_table import ExtensionTable
 
 PARAMETERS_PER_CAMERA = 4
-"""Number of parameters of one camera."""
+"""Number of parameters of one camera: rotations d_alpha, d_beta, d_gamma and change d_f of the principal distance."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,13 +64,16 @@ class Shifts:
 
     @property
     def spots(self) -> dict[str, slice]:
-        """Camera -> slice of its spots among the spots of all cameras."""
+        """Mapping from the name of each camera to the range of its spots among those of all cameras."""
         ends = np.cumsum([0, *(len(camera.channels) for camera in self.cameras.values())]).tolist()
         return {name: slice(a, b) for name, a, b in zip(self.cameras, ends[:-1], ends[1:], strict=True)}
 
     @property
     def coordinates(self) -> dict[str, slice]:
-        """Camera -> slice of its spot coordinates (row and column of each spot) among those of all cameras."""
+        """Mapping from the name of each camera to the range of its spot coordinates among those of all cameras.
+
+        Spot coordinates are row and column of each spot.
+        """
         return {name: slice(2 * spots.start, 2 * spots.stop) for name, spots in self.spots.items()}
 
 
@@ -84,7 +87,7 @@ class Estimator(ABC):
     note : str
         Description shown in reports.
     stated : bool
-        True if it needs a prior of the disturbances; without one it is not in the results.
+        True if it needs a prior of the disturbances (motions of bodies); without one it is not in the results.
     """
 
     title: str
@@ -116,7 +119,7 @@ class Estimator(ABC):
         """
 
     def read(self, shifts: Shifts) -> Array:
-        """Return the estimated parameters, (S, 4 K) rad and m: gain times shifts, or something better.
+        """Return the estimated parameters, (S, 4 K) rad and m: gain times shifts, or the result of exact formulas.
 
         Dimensions: S states, K cameras.
 
@@ -192,7 +195,7 @@ class Formula(PerCameraEstimator):
         cameras : mapping of str to CameraCalibration
             Calibration of each camera.
         disturbances : Disturbances or None
-            Not used.
+            Prior of the disturbances; not used here.
         """
         return all(camera.pair is not None for camera in cameras.values())
 
@@ -230,7 +233,10 @@ def _pair(camera: CameraCalibration) -> tuple[int, int]:
 
 @dataclass(frozen=True)
 class LeastSquares(PerCameraEstimator):
-    """Weighted least-squares (Gauss-Markov) estimate of the four motions of each camera that paper 001 considers.
+    """Weighted least-squares (Gauss-Markov) estimate of four motions of each camera.
+
+    They are those of paper 001 (Wang et al. 2018): shifts of the line CCD along its X and Y axes, its rotation about Z,
+    and a relative change of the camera's scale.
 
     The computation is in `analysis.monitor.model_fit`.
     """
@@ -317,7 +323,7 @@ def preferred_estimator(names: Iterable[str]) -> str:
 
 
 def applicable(cameras: Mapping[str, CameraCalibration], disturbances: Disturbances | None) -> dict[str, Estimator]:
-    """Return name -> estimator for the estimators that can be used with these cameras and this prior.
+    """Return the estimators that can be used with these cameras and this prior, by their names.
 
     Parameters
     ----------

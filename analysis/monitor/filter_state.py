@@ -19,7 +19,8 @@ with sums over the readings of the window and over bodies.
 **Bad readings.** A reading that is wrong by itself is weighed against a jump whose size is bounded by the prior. Both
 explain a reading that is far from its prediction. A priori a reading is bad with a small probability c, and a body
 jumps before it with the probability gap / every, as above. A bad reading has errors at some of its D coordinates, of
-variance v each, and none at the others. With nu the difference from the prediction and S its covariance,
+variance v each (diagonal matrix V), and none at the others. With nu the difference from the prediction, S its
+covariance and N the normal density,
 
     B(bad) = c N(nu; 0, S + V) / N(nu; 0, S)
 
@@ -74,18 +75,19 @@ class Observed:
 
     @property
     def spots(self) -> bool:
-        """True if this is a reading of the spots."""
+        """True if this is a reading of the spots, False for temperatures or camera parameters."""
         return not self.sensors and self.parameters is None
 
 
 @dataclass(frozen=True)
 class BadReading:
-    """Evidence that a reading is wrong by itself (bad) and not a real change.
+    """Evidence that a reading is faulty (bad), as opposed to showing a real change.
 
     Attributes
     ----------
     log_ratio : float
-        Logarithm of the likelihood if it is bad, including the prior probability, over that if it is not.
+        Logarithm of the ratio of the likelihood if it is bad, times the prior probability of a bad reading, to that if
+        it is good.
     z : float
         Deviation of the worst coordinate from its prediction by all others and the past, in standard deviations.
     coordinate : int
@@ -148,7 +150,7 @@ class Track:
     covariance : (n, n) ndarray
         Covariance of the states.
     response : (L, n, q) ndarray
-        Response of the mean to steps of unit outputs.
+        Change of the mean by a step before each of the last L readings that shifts each output by one unit.
     score : (L, q) ndarray
         Score b of each step: weighted sum of the readings after it, from which its size is estimated.
     information : (L, q, q) ndarray
@@ -162,7 +164,7 @@ class Track:
     information: Array
 
     def alone(self) -> Track:
-        """Return the filter without the hypotheses of steps before the last readings."""
+        """Return the filter's mean and covariance without the hypotheses of steps before the last readings."""
         return replace(self, response=self.response[:0], score=self.score[:0], information=self.information[:0])
 
 
@@ -175,7 +177,7 @@ class Whitened:
     Attributes
     ----------
     root : (d, d) ndarray
-        Cholesky factor of its covariance, noise included.
+        Cholesky factor of the reading's predicted covariance, noise included.
     white : (d,) ndarray
         Whitened innovation, root^-1 (value - prediction).
     rows : (d, n) ndarray
@@ -183,7 +185,7 @@ class Whitened:
     gain : (d, n) ndarray
         Product root^-1 H P with the covariance P of the states.
     picked : (d, q) ndarray
-        Whitened effect of unit outputs on the reading.
+        Whitened change of the reading for a change of each output by one unit.
     """
 
     root: Array
@@ -275,14 +277,15 @@ It is above 1 since the readings that indicated the jump and its size are used o
 
 @dataclass(frozen=True, eq=False)
 class JumpingBody:
-    """Body whose motions jump at a known rate.
+    """Body whose motions jump at a known mean rate.
 
     Attributes
     ----------
     motions : tuple of int
         Indices of its r motions that jump.
     spots : (q, r) ndarray
-        Effect on the q outputs of independent amounts of unit variance that make up the jumping motions.
+        Effect on the q outputs (values that readings can contain) of independent amounts of unit variance that make up
+        the jumping motions.
     root : (r, r) ndarray
         Matrix from these amounts to the motions, in prior standard deviations.
     every_s : float
@@ -330,9 +333,10 @@ class Hint:
     log_weight : (L,) ndarray
         Logarithm of the weight of each hypothesis, its likelihood ratio times its prior probability.
     mean : (L, r) ndarray
-        Mean of the amounts if the jump occurred there.
+        Mean, if the jump occurred in that gap, of the r independent amounts of unit prior variance that make up the
+        jump.
     covariance : (L, r, r) ndarray
-        Covariance of the amounts.
+        Covariance of these amounts.
     """
 
     log_weight: Array
@@ -349,11 +353,11 @@ class Hint:
         Parameters
         ----------
         looked : tuple of ndarray
-            Score (L, q) and information (L, q, q) by which the weights are computed.
+            Score (L, q) and information (L, q, q) of steps from which the weights of the hypotheses are computed.
         own : tuple of ndarray
-            Score and information by which the amounts are computed.
+            Score and information of steps from which the amounts of the jump are computed.
         outputs : (q, r) ndarray
-            Effect on the outputs of independent amounts of unit variance.
+            Effect on the outputs of the r independent amounts of unit prior variance that make up the jump.
         expected : (L,) ndarray
             Mean number of jumps in the gap before each reading; 0 where there is no gap.
         """
@@ -374,7 +378,7 @@ class Hint:
 
 
 def _chances(hints: Sequence[Hint], window: int | None = None) -> list[Array]:
-    """Return for each body the probability of a jump before each reading, (L,), one jump at most in a window.
+    """Return for each body the probability of a jump before each reading, (L,), with at most one jump in a window.
 
     The window extends over the given number of readings on either side, or over all.
 
@@ -405,7 +409,7 @@ def mixture(mean: Array, covariance: Array, hints: Sequence[Hint], moved: Sequen
     hints : sequence of Hint
         Hypotheses of a jump for each body, with their weights.
     moved : sequence of (L, n, r) ndarrays
-        Effect of unit amounts before each reading on the present states, for each body.
+        For each body, derivatives of the present states with respect to the amounts of a jump before each reading.
     """
     probabilities = _chances(hints)
     away = [np.einsum("knr,kr->kn", m, hint.mean) for m, hint in zip(moved, hints, strict=True)]
@@ -429,8 +433,8 @@ def undetected_variance(
     Parameters
     ----------
     score : sequence of (N, r) ndarrays
-        For each body, the score of a step of unit amounts before each of N readings: weighted sum of all readings, from
-        which the amounts are estimated.
+        For each body, the score of a step before each of N readings: weighted sum of all readings, from which the
+        amounts of the step are estimated.
     information : sequence of (N, r, r) ndarrays
         For each body, the information (inverse covariance) on these amounts.
     gap : (N,) ndarray
@@ -475,7 +479,7 @@ _UNSTATED = math.log(1e-3)
 
 
 def may_be_bad(bad: BadReading | None, log_odds: float, recent: Sequence[bool]) -> bool:
-    """Return True if a reading is to be set aside until the next one.
+    """Return True if a reading may be faulty and is to be set aside until the next one decides.
 
     Parameters
     ----------
@@ -501,7 +505,7 @@ def chance_good(log_odds: float) -> float:
 
 
 def bad_reading(white: Array, root: Array, noise: Array) -> BadReading | None:
-    """Return the evidence for errors in a reading; None where nothing speaks for them.
+    """Return the evidence that coordinates of a reading have gross errors; None if there is none.
 
     Dimensions: D spot coordinates (row and column of every spot).
 
@@ -532,7 +536,11 @@ def bad_reading(white: Array, root: Array, noise: Array) -> BadReading | None:
 
 
 def _with_errors(precision: Array, pulled: Array, variance: Array) -> Array:
-    """Return the log likelihood ratios for errors at the 1, 2, ... D coordinates that explain most, (D,)."""
+    """Return log likelihood ratios for errors at the k coordinates that explain a reading best, k = 1 to D, (D,).
+
+    ``precision`` is the inverse covariance (D, D) of the reading's difference from its prediction, ``pulled`` that
+    inverse times the difference, ``variance`` that of an error at each coordinate.
+    """
     free, total, out = np.ones(len(pulled), bool), 0.0, np.empty(len(pulled))
     for number in range(len(pulled)):
         inner = 1.0 + variance * np.diag(precision)

@@ -52,9 +52,15 @@ _UNLIKELY = 1e-4
 _AHEAD = 100.0
 """Length of time after the end of a series, in units of its length, over which a forecast includes further jumps."""
 _AGAIN, _TWO_VALUED = 1.0, 1.5
-"""For a smoother: weight of the repeated uncertainty of a detected jump in the spots, and of the jump's own square."""
+"""Factors of a smoother's additional variance around a detected jump.
+
+The first multiplies the part of the jump's variance that the spots observe, which counts twice: filter and smoother
+both use the readings. The second multiplies the square of the jump, as the state between the readings around it is one
+of two values.
+"""
 _INFLATIONS = np.logspace(0.0, 8.0, 161)
-"""Factors by which the prior variance of a jump is increased in the search for the most likely one."""
+"""Factors by which the prior variance of a jump is increased in the search for the variance of the largest likelihood.
+"""
 _SIZES = np.linspace(0.0, 8.0, 401)
 _MEAN_SQUARE = 2.0 * (_SIZES[1] - _SIZES[0]) * _SIZES**2 * np.exp(-0.5 * _SIZES**2) / np.sqrt(2.0 * np.pi)
 """Contribution of each size in _SIZES (in standard deviations) to the mean square of a normal number."""
@@ -108,7 +114,7 @@ class Steps:
 
 @dataclass(frozen=True)
 class Jump:
-    """Detected jump: a step of one body's motions at an unknown time, with everything that was found out about it.
+    """Detected jump: a step of one body's motions, with its estimated sizes, time and significance.
 
     Attributes
     ----------
@@ -186,7 +192,7 @@ class Jump:
 
 @dataclass(frozen=True, eq=False)
 class Step:
-    """One step of some motions by unknown amounts, either at a given event or as a detected jump.
+    """Step of motions by unknown amounts, either at the time of a specified event or as a detected jump.
 
     Dimensions: D spot coordinates (row and column of every spot), P parameters.
 
@@ -198,7 +204,8 @@ class Step:
         Pairs (time, probability that it has occurred by then), s, in the order of time, linear between; one pair (time,
         1) for a known time.
     moment : (D + P, D + P) ndarray or None
-        Mean square of its effect on spots and parameters; None for that of independent parts.
+        Mean square of its effect on the D spot coordinates and P parameters; None if that of the independent `parts`
+        applies.
     """
 
     parts: tuple[tuple[tuple[int, ...], float], ...]
@@ -232,7 +239,10 @@ class Step:
 
 @dataclass(frozen=True, eq=False)
 class Amounts:
-    """Amounts of a jump under each of L hypotheses of its place among the readings.
+    """Estimated amounts of a jump's motions under each of L hypotheses about its time.
+
+    Each hypothesis is that the jump occurred just before a certain reading. The amounts are independent under the
+    prior; together they make up the motions of the body.
 
     The fields are the means of the amounts (L, r), their covariances (L, r, r) and the log weights of the hypotheses
     (L,).
@@ -246,7 +256,7 @@ class Amounts:
 
     @classmethod
     def of(cls, score: Array, information: Array, outputs: Array, times: float) -> Amounts:
-        """Compute the amounts of a jump from the score and information of a step at each place.
+        """Compute the amounts of a jump from the score and information of a step before each reading.
 
         Dimensions: L gaps between readings, in each of which a step may have occurred, q values that readings can
         contain (outputs), r motions of the body that may jump.
@@ -254,13 +264,13 @@ class Amounts:
         Parameters
         ----------
         score : (L, q) ndarray
-            Score of a step at each place: weighted sum of the whitened readings after it.
+            Score of a step before each reading: weighted sum of the whitened readings after it.
         information : (L, q, q) ndarray
             Information (inverse covariance) on the step's effect on the outputs.
         outputs : (q, r) ndarray
-            Effect on the outputs of one prior standard deviation of each motion.
+            Derivatives of the outputs with respect to the r independent amounts that make up the body's motions.
         times : float
-            Ratio of their standard deviations to those of ``outputs``.
+            Standard deviation of the amounts before the readings; 1 for the prior of the motions.
         """
         information = outputs.T @ information @ outputs
         score = score @ outputs
@@ -272,7 +282,7 @@ class Amounts:
 
 
 def candidates(stated: Disturbances) -> tuple[Candidate, ...]:
-    """Return what is tested for jumps: each motion that may jump alone, and all such motions of a body together.
+    """Return the sets of motions that are tested for jumps: each that may jump alone, and those of a body together.
 
     Parameters
     ----------
@@ -300,9 +310,9 @@ def steps(root: Array, white: Array, when: Array, inside: slice, reference: floa
     Parameters
     ----------
     root : (n D, n D) ndarray
-        Lower triangular Cholesky factor L.
+        Lower triangular Cholesky factor L of the covariance of all shifts, in the order of time.
     white : (n D,) ndarray
-        Whitened shifts L^-1 s.
+        Whitened shifts L^-1 s, with the measured shifts s.
     when : (n,) ndarray
         Times of the measurements, s, ascending.
     inside : slice
@@ -435,7 +445,7 @@ def jump_scale(information: Array, score: Array) -> float:
 
 
 def with_jumps(stated: Disturbances, found: Sequence[Jump]) -> Disturbances:
-    """Return the prior with a copy of the motions of each detected jump appended as an event, in this order.
+    """Return the prior with a step of the same motions, of known distribution in time, added for each detected jump.
 
     Parameters
     ----------
@@ -459,7 +469,7 @@ def subthreshold_share(limit: float, seen: Array) -> Array:
     limit : float
         Detection limit, in standard deviations of the measured jump.
     seen : (n,) ndarray
-        Size of a jump of one prior standard deviation, in the same unit.
+        Size of a jump of one prior standard deviation, in the standard deviations of the measured jump.
     """
     return np.asarray(ndtr(limit - _SIZES * seen[:, None]) @ _MEAN_SQUARE)
 
@@ -518,9 +528,9 @@ def with_sizes(
     stated : Disturbances
         Prior that contains these motions.
     root : (n D, n D) ndarray
-        Cholesky factor L, with all detected jumps as events.
+        Lower triangular Cholesky factor L of the covariance of all shifts, with all detected jumps as events.
     white : (n D,) ndarray
-        Whitened shifts L^-1 s.
+        Whitened shifts L^-1 s, with the measured shifts s.
     when : (n,) ndarray
         Times of the measurements, s.
     reference : float or None
@@ -538,16 +548,16 @@ def with_sizes(
 
 @dataclass(frozen=True, eq=False)
 class Bodies:
-    """Hypotheses that one of B bodies has jumped before one of L readings.
+    """Hypotheses after a detected jump: which of B bodies has jumped, and before which of L readings.
 
     Attributes
     ----------
     own : tuple of Candidate
-        All motions of each body that may jump.
+        For each body, all of its motions that may jump.
     times : tuple of float
-        Ratio of each body's jump to the prior standard deviations.
+        Ratio of the standard deviations assumed for each body's jump to the prior ones.
     weight : (B, L) ndarray
-        Probability of each hypothesis (body and place); their sum is 1.
+        Probability of each hypothesis (body and reading); their sum is 1.
     judged : tuple of Amounts
         Estimated amounts of the jump, by the filter that detects jumps.
     amounts : tuple of Amounts
@@ -606,7 +616,9 @@ class Bodies:
 
     @property
     def spots(self) -> list[Array]:
-        """Effect of unit amounts of each body on the q outputs, one array (q, r) for each body.
+        """Derivatives of the q outputs with respect to the r amounts of a jump, one array (q, r) for each body.
+
+        Outputs are the values that readings can contain.
 
         Dimensions: r motions of the body that may jump.
         """
@@ -634,11 +646,11 @@ class Bodies:
         covariance : (n, n) ndarray
             Covariance of the filter.
         response : (L, n, q) ndarray
-            Response of the mean to steps of unit outputs before each reading.
+            Change of the mean by a step before each reading that shifts each output by one unit.
         levels : sequence of (n, r) ndarrays
-            Effect of unit amounts on the states, for each body.
+            For each body, derivatives of the states with respect to the r amounts of a jump.
         amounts : sequence of Amounts
-            Amounts of each body.
+            Estimated amounts of the jump, for each body.
         """
         shift, spread = np.zeros(len(mean)), np.zeros(covariance.shape)
         for amount, share, level, effect in zip(amounts, self.weight, levels, self.spots, strict=True):
@@ -653,18 +665,18 @@ class Bodies:
 
 
 def mixture_moments(amounts: Sequence[Amounts], effects: Sequence[Array], weight: Array) -> tuple[Array, Array]:
-    """Return mean and covariance of the effect of a jump, averaged over bodies and places by their probabilities.
+    """Return mean and covariance of the effect of a jump, averaged over the hypotheses by their probabilities.
 
     Dimensions: o values affected by the jump, r motions of the body that may jump.
 
     Parameters
     ----------
     amounts : sequence of Amounts
-        Amounts of B bodies at L places.
+        Amounts of each of B bodies if it has jumped before each of L readings.
     effects : sequence of (o, r) ndarrays
-        Effect of unit amounts, for each body.
+        For each body, derivatives of the o values with respect to the r amounts of its jump.
     weight : (B, L) ndarray
-        Probability of each hypothesis (body and place); their sum is 1.
+        Probability of each hypothesis (body and reading); their sum is 1.
     """
     each = np.stack([amount.mean @ effect.T for amount, effect in zip(amounts, effects, strict=True)])
     mean = np.einsum("bk,bko->o", weight, each)

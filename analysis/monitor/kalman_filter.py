@@ -2,17 +2,18 @@
 
 **Filter.** It works on the `state_space` of the prior, with the same effort for every reading. A second filter detects
 jumps: for a step just before each of the last readings it keeps the effect of that step on its innovations (Willsky,
-Jones, IEEE Trans. Automat. Contr. 21, 1976, 108). With the response X of its own estimate to a step of unit outputs, E
-= (picked outputs) - H X is that of an innovation nu of covariance S, and
+Jones, IEEE Trans. Automat. Contr. 21, 1976, 108). Outputs are all values that readings may contain. With X the response
+of the estimated states to a step of one unit of each output, and H the observation matrix, the response of an
+innovation nu of covariance S is E = (outputs in the reading) - H X. The score b and the information J of the step,
 
-    b = sum E' S^-1 nu,   J = sum E' S^-1 E
+    b = sum E' S^-1 nu,   J = sum E' S^-1 E,
 
-are what `jump_detection.most_likely_jump` needs, without processing a reading twice. The false-alarm probability counts
-every test of the whole life: readings, times of the step and candidates (Boole's inequality, a bound). A detected jump
-changes the estimate as if it had been known all along, (G - X) times its amounts, G the effect of steps on the states,
-as a mixture over the readings between which it can have occurred; sigma is therefore wide where that is not known. All
-jumping motions of the body are then free to have jumped: information on the others cannot be recovered later, since the
-step hypotheses are discarded.
+serve the test in `jump_detection.most_likely_jump`, without processing a reading twice. The false-alarm probability
+counts every test of the whole life: readings, times of the step and candidates (Boole's inequality, a bound). A
+detected jump changes the estimate as if it had been known all along: by (G - X) times its amounts, with G the effect of
+steps on the states, averaged over the readings between which it can have occurred. Sigma is therefore wide where the
+time is not known. All jumping motions of the body are then free to have jumped: information on the others cannot be
+recovered later, since the step hypotheses are discarded.
 
 A reading that is more likely bad than the first after a jump is set aside (`filter_state`). The next one decides: the
 states with and without it are both continued until one of the two predicts that reading better. The estimate in the
@@ -148,7 +149,7 @@ class SeriesFilter:
         True if there are readings of parameters among those of spots.
     steps : tuple of Step
         Steps known in addition to the prior.
-    unfound : bool
+    include_undetected : bool
         True to include jumps too small to be detected, where their rate is known.
     before_s : float
         Time before the first reading of spots in which bodies may have jumped, s; 0 if there is none.
@@ -166,7 +167,7 @@ class SeriesFilter:
     stepping: tuple[int, ...] = ()
     parameters_read: bool = False
     steps: tuple[Step, ...] = ()
-    unfound: bool = True
+    include_undetected: bool = True
     before_s: float = 0.0
     leaving_out: bool = True
     candidates: tuple[Candidate, ...] = field(init=False, default=())
@@ -225,24 +226,29 @@ class SeriesFilter:
 
     @cached_property
     def walking(self) -> NDArray[np.int_]:
-        """Indices of the motions that jump at a known rate, (m,); a random walk stands for their undetected jumps.
+        """Indices of the motions that jump at a known rate, (m,).
+
+        A random walk in the filter represents those of their jumps that are too small to be detected.
 
         Dimensions: m motions that jump at a known rate.
         """
-        indices = [k for k, law in enumerate(self.stated.laws) if law.every_s is not None and self.unfound]
+        indices = [k for k, law in enumerate(self.stated.laws) if law.every_s is not None and self.include_undetected]
         return np.array(indices, int)
 
     @cached_property
     def _walk(self) -> Array:
-        """Effect on the level states of the motions that jump at a known rate, times the root of their rate, (r, m).
+        """Random walk of undetected jumps: its effect on the level states per root of time, (r, m).
 
-        Dimensions: r motions of the body that may jump, m motions that jump at a known rate.
+        These are the states that steps change. Column by column it is the effect of a jump of one prior standard
+        deviation of each motion with a known jump rate, times the root of that rate.
+
+        Dimensions: r states that steps change, m motions that jump at a known rate.
         """
         rates = np.array([1.0 / float(self.stated.laws[k].every_s or 1.0) for k in self.walking])
         return self.space.level_of(self.walking.tolist())[self.space.level] * np.sqrt(rates)
 
     def looks(self, between: ArrayLike) -> Array:
-        """Return the number of tests for a jump in the whole life: the probability of a false alarm is divided by it.
+        """Return the number of tests for a jump over the whole life, by which the false-alarm probability is divided.
 
         Parameters
         ----------
@@ -253,7 +259,7 @@ class SeriesFilter:
         return np.asarray(self.window * len(self.candidates) / np.minimum(share, 1.0))
 
     def _limit(self, current: FilterState) -> float:
-        """Return the smallest log likelihood ratio at which a jump can be detected, for any number of motions."""
+        """Return the smallest log likelihood ratio at which a jump can be detected, whatever its number of motions."""
         between = current.until - current.after
         return float(limit_of(self.stated.jump_false_alarm / self.looks(between.max()), 1))
 
@@ -305,14 +311,14 @@ class SeriesFilter:
         return out
 
     def with_random_walk(self, current: FilterState, left: Array, over: float) -> FilterState:
-        """Return the state with the random walk of undetected jumps over a time added.
+        """Return the filter's state with the variance of undetected jumps (a random walk) over a time added.
 
         Dimensions: m motions that jump at a known rate.
 
         Parameters
         ----------
         current : FilterState
-            State without them.
+            State without the undetected jumps.
         left : (m,) ndarray
             Share of the mean square of jumps that is not detected.
         over : float
@@ -394,7 +400,7 @@ class SeriesFilter:
         return now, replace(trial.innovation, jump=jump)
 
     def _evaluate(self, current: FilterState, observed: Observed, weighed: bool) -> _Evaluation:
-        """Return the state before a reading of spots and with it, and the evidence that the reading is bad.
+        """Return the filter's state without and with a reading of spots, and the evidence that the reading is bad.
 
         Parameters
         ----------
@@ -462,7 +468,7 @@ class SeriesFilter:
         )
 
     def read(self, mean: Array, covariance: Array, observed: Observed) -> tuple[Array, Array, Array, Array]:
-        """Return the predicted reading and what is needed to compare it with the actual one.
+        """Return the predicted reading, its derivatives and its covariance, for comparison with the actual reading.
 
         The result holds the prediction (d,), its derivatives with respect to the states (d, n), the covariance of noise
         and second-order terms (d, d), and the effect of unit outputs on the reading (d, q).
@@ -578,7 +584,7 @@ class SeriesFilter:
         return replace(best, chance=chance, rest=rest)
 
     def _with_jump(self, current: FilterState, jump: Jump) -> tuple[FilterState, Jump]:
-        """Return the state after a jump is detected, and the jump with its sizes."""
+        """Return the filter's state after it has included a detected jump, and the jump with its estimated sizes."""
         jump_track, info = ((track.score, track.information) for track in (current.jump_track, current.state))
         gap = current.until - current.after
         bodies = Bodies.of(self.candidates, jump, current.until, gap, jump_track, info)
@@ -618,10 +624,10 @@ class SeriesFilter:
     @cached_property
     def jumping_bodies(self) -> tuple[JumpingBody, ...]:
         """Bodies whose jumps have a known rate (mean time between two jumps)."""
-        return jumping_bodies(self.stated, self.candidates) if self.unfound else ()
+        return jumping_bodies(self.stated, self.candidates) if self.include_undetected else ()
 
     def mixture(self, current: FilterState) -> FilterState:
-        """Return the state that includes undetected jumps, each weighted by its probability.
+        """Return the filter's state including jumps not yet detected, each weighted by its probability.
 
         Later readings continue from the state that is passed in.
 
@@ -720,7 +726,7 @@ class SeriesFilter:
 
 
 def _symmetric(square: Array) -> Array:
-    """Return a covariance made symmetric to the last bit."""
+    """Return the mean of a square matrix and its transpose, a covariance that is symmetric to the last bit."""
     return np.asarray(0.5 * (square + square.T))
 
 
@@ -732,7 +738,7 @@ _PIECE = 400
 def with_indicated_jumps(
     how: SeriesFilter, knowing: SeriesFilter, start: FilterState, observed: Sequence[Observed], left: Sequence[Array]
 ) -> tuple[FilterState, list[Array]]:
-    """Return the smoother's start state and shares of undetected jumps, with the jumps that all readings indicate.
+    """Return a smoother's start state and variances of undetected jumps, using what all readings indicate of them.
 
     The shares, N arrays (m,), are those of the mean square of jumps before each reading.
 
@@ -769,7 +775,7 @@ def with_indicated_jumps(
             for level, part, more in zip(levels, score, information, strict=True):
                 part[there], more[there] = scores[:count] @ level, level.T @ (known_of[:count] @ level)
 
-    plain = replace(knowing, unfound=False)
+    plain = replace(knowing, include_undetected=False)
     none = np.zeros(0)
     smoothed(
         plain, replace(start, undetected=none), observed, none, [none] * len(observed), knowing.parameters_of, note
@@ -941,11 +947,18 @@ def _filtered(
 
 
 READINGS, SHARES = (1, 3, 10), (0.5, 0.95)
-"""Numbers of readings after a jump within which it is detected, and shares of detected jumps."""
+"""Conditions of a table of detectable jumps.
+
+The first are the numbers of readings after a jump within which it is to be detected, the second the fractions of jumps
+that are to be detected.
+"""
 _SIZES = np.geomspace(0.03, 100.0, 71)
 """Simulated sizes of a jump relative to its prior standard deviations, 12 percent apart."""
 _DRAWS, _BEFORE = 400, 20
-"""Simulated jumps of each size, which give 95 percent to 1.1; readings after which the information is steady."""
+"""Number of simulated jumps of each size, and of readings before them, which bring the filter to steady state.
+
+With this number of jumps, a fraction of 95 % of detected ones is known to 1.1 %.
+"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -1019,11 +1032,25 @@ def _step_informations(how: SeriesFilter, interval: float, noise: Array) -> Arra
 
 
 def _test(spots: Array, information: Array, chance: float) -> tuple[Array, float]:
-    """Return the test for one candidate: the matrix that whitens its score, (r, q), and the limit of the test.
+    """Return the test for jumps of one candidate: the matrix that whitens its score, and the limit of the chi-square.
 
-    The matrix turns a score into independent numbers of unit variance, whose sum of squares is compared with the limit.
+    A candidate is a set of motions of one body that may jump. Its score is the sum of the prediction errors after the
+    jump, weighted by their inverse covariance.
 
-    Dimensions: r motions of the body that may jump, q values that readings can contain (outputs).
+    Parameters
+    ----------
+    spots : (q, m) ndarray
+        Derivatives of the q components of the readings with respect to the m motions of the candidate.
+    information : (q, q) ndarray
+        Information (inverse covariance) of the readings on a step of these components.
+    chance : float
+        False-alarm probability of the test.
+
+    Returns
+    -------
+    tuple of (r, q) ndarray and float
+        Matrix that turns the q weighted prediction errors into r <= m independent numbers of unit variance, and the
+        limit of their sum of squares, above which a jump is detected.
     """
     values, vectors = np.linalg.eigh(spots.T @ information @ spots)
     seen = values > UNOBSERVABLE * values.max()
@@ -1049,7 +1076,7 @@ def _detection_rates(
 
 
 def _smallest_size(found: Array, share: float) -> float:
-    """Return the size from which on a given fraction of jumps is detected; NaN if no size reaches it."""
+    """Return the smallest jump size from which on a given fraction of jumps is detected; NaN if no size reaches it."""
     less = np.flatnonzero(found < share)
     first = less[-1] + 1 if len(less) else 0
     if first == len(_SIZES):

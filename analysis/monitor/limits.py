@@ -47,7 +47,7 @@ class Quantity:
     group : str
         Name of a camera, ``intersection_angle`` or ``ground``.
     parameter : Parameter
-        What of that group is read, with its unit.
+        Declaration of the quantity of that camera, pair or ground point, with its unit.
     row : (4 K,) ndarray
         Coefficients of the linear combination, in the quantity's unit per rad of d_alpha, d_beta and d_gamma and per m
         of d_f, of one camera after the other.
@@ -59,12 +59,12 @@ class Quantity:
 
     @property
     def key(self) -> str:
-        """Name of the quantity in files of results, which ends in its unit."""
+        """Name of the quantity in files of results, which ends in its unit: ``d_f_um``."""
         return self.parameter.key
 
     @property
     def name(self) -> str:
-        """Name in operation plans, group and key: ``forward d_f_um``."""
+        """Name of the quantity in operation plans, made of its group and its key: ``forward d_f_um``."""
         return f"{self.group} {self.parameter.key}"
 
 
@@ -102,8 +102,11 @@ def quantities(cameras: Mapping[str, CameraCalibration], ground: GroundGeometry 
 
 
 _UNMOVED, _NEGLIGIBLE = 1e-7, 1e-9
-"""Fractions of the effect of a motion on a camera (angles and relative changes alike), and of the largest effect of any
-motion, below which derivatives are rounding."""
+"""Thresholds below which the derivative of a camera's parameter with respect to a motion is rounding error.
+
+The first is relative to the whole effect of this motion on the cameras (angles and relative changes alike), the second
+to the largest effect of any motion.
+"""
 
 
 def unchanged_quantities(
@@ -160,7 +163,7 @@ class Split:
 
     @property
     def sigma(self) -> Array:
-        """Standard deviations of the estimate's error due to motions and noise, (Q,), in the units of the quantities.
+        """Standard deviations of the estimates' errors due to motions and noise, (Q,), in the units of the quantities.
 
         Dimensions: Q quantities.
         """
@@ -168,7 +171,7 @@ class Split:
 
     @staticmethod
     def by(shares: Array, names: Sequence[str]) -> dict[str, Array]:
-        """Return name -> sum of the contributions of the motions with that name, (Q,).
+        """Return a mapping from each name to the sum of the contributions of the motions with that name, (Q,).
 
         The names are in the order of their first occurrence.
 
@@ -420,22 +423,24 @@ def calibrated_sigma(rows: Array, stated: Disturbances, noise: Array, field: Arr
 
 
 UNOBSERVED = 0.1
-"""Ratio of a motion's spot shift to the shift's noise below which the motion has no effect on a spot."""
+"""Ratio of the spot shift due to a motion to the noise of the shift below which the spot does not show the motion."""
 SHARE = 0.01
-"""Smallest fraction of the variance of a quantity from which on a body that the spots do not reveal is reported."""
+"""Smallest fraction of a quantity's variance at which a body that the spots do not reveal is reported."""
 DEGREES = 4.0
-"""Degrees of freedom of Student's distribution that is assumed for numbers of the prior that are guesses."""
+"""Degrees of freedom of Student's distribution assumed for standard deviations of the prior that are guesses."""
 _DRAWS = 8_000
 _STEPS = 100
 _ROUNDING = 1e-12
-"""Step of a half width, relative to it, at which Newton's method ends; each step doubles the digits."""
+"""Relative step at which Newton's method for the half width of an interval ends; each step doubles the digits."""
 _LEVELS = (0.6826894921370859, 0.9544997361036416, 0.9973002039367398)
 """Probabilities within 1, 2 and 3 standard deviations of a normal error."""
 
 
 @dataclass(frozen=True, eq=False)
 class Elasticity:
-    """Sensitivity of Q quantities to one number of the prior.
+    """Sensitivity of the sigmas of Q quantities to one standard deviation specified in the prior.
+
+    One such number is the standard deviation that a cause gives to a motion of one or several bodies.
 
     Attributes
     ----------
@@ -446,10 +451,10 @@ class Elasticity:
     bodies : tuple of str
         Bodies that have it.
     elasticity : (Q,) ndarray
-        Relative change of sigma per relative change of the number.
+        Relative change of a quantity's sigma divided by the relative change of the number.
     doubled : (Q,) ndarray
         Sigma of the error if the real number is twice as large but the estimator still assumes the original prior.
-    told : (Q,) ndarray
+    doubled_in_prior : (Q,) ndarray
         Sigma of the error if the number is twice as large in reality and in the estimator's prior.
     """
 
@@ -459,7 +464,7 @@ class Elasticity:
     bodies: tuple[str, ...]
     elasticity: Array
     doubled: Array
-    told: Array
+    doubled_in_prior: Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -471,9 +476,9 @@ class HeavyTail:
     degrees : float
         Degrees of freedom of Student's distribution.
     rms : (Q,) ndarray
-        Root of the mean square error.
+        Root of the mean square error, in the units of the quantities.
     held : (3, Q) ndarray
-        Half widths of the intervals with the probabilities of 1, 2 and 3 sigma of a normal prior.
+        Half widths of the intervals that contain the error with the probabilities 68.3 %, 95.4 % and 99.7 %.
     beyond : (Q,) ndarray
         Probability of an error beyond 3 of the reported sigmas, 0.0027 for a normal prior.
     """
@@ -485,7 +490,9 @@ class HeavyTail:
 
 
 def prior_numbers(stated: Disturbances) -> dict[str, list[int]]:
-    """Return for each number of the prior the indices of the motions whose standard deviation it is.
+    """Return, for each standard deviation specified in the prior, the indices of the motions that have it.
+
+    The keys of the result name the cause and the kind of motion.
 
     Parameters
     ----------
@@ -505,7 +512,10 @@ def prior_numbers(stated: Disturbances) -> dict[str, list[int]]:
 
 
 def elasticities(rows: Array, stated: Disturbances, noise: Array, gain: Array) -> tuple[Elasticity, ...]:
-    """Return the relative sensitivity of sigma to each number of the prior, largest for the first quantity first.
+    """Return the relative sensitivity of sigma to each standard deviation of the prior, d ln sigma / d ln s.
+
+    Sigma is that of a quantity's error, s the standard deviation that a cause gives to a motion of one or several
+    bodies. The results are in descending order of the first quantity's sensitivity.
 
     Dimensions: Q quantities, K cameras, D spot coordinates (row and column of every spot).
 
@@ -539,14 +549,14 @@ def elasticities(rows: Array, stated: Disturbances, noise: Array, gain: Array) -
                 bodies=tuple(dict.fromkeys(stated.bodies[k] for k in indices)),
                 elasticity=shares[:, indices].sum(axis=1) / safe,
                 doubled=np.sqrt(np.maximum(doubled, 0.0)),
-                told=posterior_sigma(rows, stated.scaled(factors), noise),
+                doubled_in_prior=posterior_sigma(rows, stated.scaled(factors), noise),
             )
         )
     return tuple(sorted(out, key=lambda elasticity: -float(elasticity.elasticity[0])))
 
 
 def unobserved_bodies(rows: Array, stated: Disturbances, noise: Array, gain: Array) -> dict[str, Array]:
-    """Return body -> fraction of each quantity's variance due to its motions that hardly move the spots, (Q,).
+    """Return the fraction of each quantity's variance due to motions that hardly move the spots, (Q,), by body.
 
     Only bodies for which a share exceeds `SHARE` are returned.
 
@@ -573,9 +583,9 @@ def unobserved_bodies(rows: Array, stated: Disturbances, noise: Array, gain: Arr
 
 
 def heavy_tails(rows: Array, stated: Disturbances, noise: Array, gain: Array, degrees: float = DEGREES) -> HeavyTail:
-    """Compute the errors of an estimator if each number of the prior has Student's distribution.
+    """Compute the errors of an estimator if the motions have Student's and not a normal distribution.
 
-    Each number has one random scale for all its motions, instead of its standard deviation.
+    All motions that share a standard deviation specified in the prior are multiplied by one random scale.
 
     Dimensions: Q quantities, K cameras, D spot coordinates (row and column of every spot).
 
@@ -619,7 +629,7 @@ def heavy_tails(rows: Array, stated: Disturbances, noise: Array, gain: Array, de
 
 
 def _of(error: Array, indices: Sequence[int]) -> Array:
-    """Return the error per unit of each motion (Q, M), set to zero for all motions but some.
+    """Return the error of each quantity per unit of each motion (Q, M), set to zero except for selected motions.
 
     Dimensions: Q quantities, M motions.
     """
@@ -629,7 +639,7 @@ def _of(error: Array, indices: Sequence[int]) -> Array:
 
 
 def _half_widths(sigma: Array, level: float) -> Array:
-    """Return the half widths of intervals with a given probability for normal errors of random sigmas (N, Q), (Q,).
+    """Return the half widths (Q,) of intervals with a given probability, for normal errors of random sigmas (N, Q).
 
     The probability grows with the half width ever more slowly. Newton's method from 0 therefore approaches from below
     at every step.

@@ -69,7 +69,7 @@ def gain(
     parameter_jacobian: ArrayLike,
     motion_names: Sequence[str] | None = None,
 ) -> Array:
-    """Return the gain of the weighted least-squares fit, (..., 4, D) rad and m per pixel of shift.
+    """Return the weighted least-squares matrix from spot shifts to camera parameters, (..., 4, D) rad and m per px.
 
     Dimensions: D spot coordinates (row and column of every spot).
 
@@ -118,15 +118,15 @@ class MotionReport:
     name : str
         Name of the motion.
     signature_px : (D,) ndarray
-        Spot shifts, px.
+        Spot shifts due to one unit of the motion (its signature), px.
     explained : float
-        Fraction [0, 1] of the signature, weighted by its noise, that the family's motions can imitate.
+        Fraction, 0 to 1, of the square of the signature, weighted by the noise, that the fitted motions can reproduce.
     imitation : (F,) ndarray
-        Amounts of the family's motions (in their units) that the fit finds instead.
+        Amounts of the fitted motions, in their units, that the fit gives for this motion.
     reported, true : (4,) ndarray
         Parameters that the model reports, and the true change; rad and m.
     nearest, cosine : str or None, float
-        Family motion (other than itself) with the most similar signature, and the cosine of both signatures.
+        Other fitted motion with the most similar signature, and the cosine of the angle between both signatures.
     """
 
     name: str
@@ -146,7 +146,7 @@ class ObservabilityReport:
     Attributes
     ----------
     rank : int
-        Rank of the noise-weighted, unit-scaled signatures of all motions.
+        Rank of the matrix of the spot shifts due to one unit of each motion, weighted by the noise.
     family : tuple of str
         Names of the P motions that the model fits.
     motions : tuple of MotionReport
@@ -191,7 +191,7 @@ def observability(
     Raises
     ------
     RankError
-        The family itself is degenerate.
+        The spots cannot separate the motions that the model fits.
     """
     spots, parameters = _jacobians(spot_jacobian, parameter_jacobian, limited=False)
     names, size = tuple(motion_names), np.asarray(scales, dtype=np.float64)
@@ -282,7 +282,7 @@ def _statements(reports: list[MotionReport], family: list[str], rank: int, coord
 
 
 def _sum(terms: Sequence[tuple[float, str]]) -> str:
-    """Return a sum as text, such as ``-0.755 x one + 0.535 x other``."""
+    """Return a linear combination as text, such as ``-0.755 x one + 0.535 x other``."""
     text = ""
     for amount, name in terms:
         sign = (" - " if amount < 0 else " + ") if text else ("-" if amount < 0 else "")
@@ -357,7 +357,7 @@ class UnobservableMode:
     quantities : (Q,) ndarray
         Effect of one standard deviation of the mode, in the quantities' units.
     sigma : float
-        Root of the sum of the squares of `quantities`, each divided by its scale.
+        Root of the sum of the squares of `quantities`, each divided by the scale given to `unobservable_modes`.
     motions : (M,) ndarray
         Most likely motions that cause it, in prior standard deviations.
     bodies : mapping of str to float

@@ -205,10 +205,8 @@ def coefficients(name: str, geometry: MonitorGeometry) -> Array:
     """Return the coefficients of a set of formulas, (4, 4) rad and m per pixel of shift.
 
     Rows are [d_alpha, d_beta, d_gamma, d_f] (rad, m), columns [left row, left column, right row, right column], after -
-    before. For `paper_single` it is the argument of the arctangents. Multiplied with the Jacobian (4, M) of spot shifts
-    per motion it gives a crosstalk table.
-
-    Dimensions: M motions.
+    before. For `paper_single` it is the argument of the arctangents. Multiplied by the Jacobian (4, M) of the spot
+    shifts with respect to M motions, it gives the changes that the formulas report for each motion (a crosstalk table).
     """
     if name not in FORMULAS:
         raise ValueError(f"monitoring: no estimator {name!r}; there are {', '.join(FORMULAS)}")
@@ -231,7 +229,7 @@ def coefficients(name: str, geometry: MonitorGeometry) -> Array:
 def paper_single(
     before: ArrayLike, after: ArrayLike, covariance: ArrayLike, geometry: MonitorGeometry
 ) -> CameraParameters:
-    """Return the changes by eq. (2), (3), (5), (7) of paper 001 as printed, with the arctangent.
+    """Return the changes by eq. (2), (3), (5), (7) of paper 001 (Wang et al. 2018) as printed, with the arctangent.
 
     Parameters
     ----------
@@ -256,7 +254,7 @@ def paper_single(
 def paper_joint(
     before: ArrayLike, after: ArrayLike, covariance: ArrayLike, geometry: MonitorGeometry
 ) -> CameraParameters:
-    """Return the changes by the last column of Table 1 of paper 001, as printed.
+    """Return the changes by the last column of Table 1 of paper 001 (Wang et al. 2018), as printed.
 
     The table does not define the sign of Y_L; each row takes the sign that agrees with the single-change formula beside
     it.
@@ -344,7 +342,7 @@ class IntersectionAngleChange(StateArrays):
 
     @property
     def noise_rad(self) -> Array:
-        """Standard deviation due to the noise of the images alone, (...) rad."""
+        """Standard deviation of the angle's change due to the noise of the images alone, (...) rad."""
         return self.sigma_rad if self.sigma_noise_rad is None else self.sigma_noise_rad
 
 
@@ -369,9 +367,9 @@ def exact(
     backward_look_rad : float
         Look angle of the other camera, rad.
     across : (..., 4, 4) ndarray or None
-        Covariance of the forward with the backward parameters due to noise; None if there is none.
+        Cross-covariance of the forward and the backward parameters due to noise; None if they are independent.
     across_total : (..., 4, 4) ndarray or None
-        Covariance of the forward with the backward parameters of the total error; None if there is none.
+        Cross-covariance of the total errors of the forward and the backward parameters; None if they are independent.
 
     Raises
     ------
@@ -501,7 +499,7 @@ class GroundGeometry:
 
     @cached_property
     def incidences_rad(self) -> tuple[float, float]:
-        """Angles of the rays from the vertical at the ground, rad."""
+        """Angles of incidence of the two cameras' rays at the ground, from the vertical, rad."""
         ratio = 1.0 + self.altitude_m / EARTH_RADIUS_M
         first, second = (math.asin(ratio * math.sin(a)) for a in self.looks_rad)
         return first, second
@@ -517,7 +515,7 @@ class GroundGeometry:
 
     @cached_property
     def matrices(self) -> Array:
-        """Matrices from changes of the two cameras to shifts on the ground, at places along the line, (places, 3, 8).
+        """Matrices from changes of the two cameras to shifts on the ground at positions along the line, (places, 3, 8).
 
         Rows of a matrix are the shifts along the track, across it and up, in m; columns are the changes. The changes
         are d_alpha, d_beta, d_gamma (rad), d_f / f of the first camera, then of the second. The middle of the line is
@@ -599,7 +597,7 @@ class GroundGeometry:
         Parameters
         ----------
         values : (S, 8) ndarray
-            Estimated changes, rad and m.
+            Estimated changes d_alpha, d_beta, d_gamma (rad) and d_f (m) of the first camera, then of the second.
         noise : (S, 8, 8) ndarray
             Covariance of the changes due to noise.
         total : (S, 8, 8) ndarray

@@ -25,7 +25,7 @@ from analysis.spots.spot_template import SpotTemplate
 from optics.numerics.extension_table import ExtensionTable
 
 PAIR = ("left", "right")
-"""Names of the channels at the +Y and at the -Y end of a line, which paper 001 numbers 1 and 2."""
+"""Names of the channels at the +Y and at the -Y end of a line, which paper 001 (Wang et al. 2018) numbers 1 and 2."""
 
 
 @shows()
@@ -36,7 +36,7 @@ class CameraCalibration:
     Attributes
     ----------
     geometry : MonitorGeometry
-        Geometry for the formulas of paper 001.
+        Geometry for the formulas of paper 001 (Wang et al. 2018).
     look_rad : float
         Nominal look angle about the base's Y, rad.
     spot_jacobian : (2 n, P) ndarray
@@ -138,7 +138,10 @@ class MonitorCalibration:
 
 
 ANGLE_GROUP, GROUND_GROUP = "intersection_angle", "ground"
-"""Keys of files for the readings of two cameras together; those of one camera are under its name."""
+"""Keys, in result files, of changes computed from two cameras: their intersection angle, and ground errors.
+
+Changes of one camera are under its name.
+"""
 _PER_SI: Mapping[str, float] = MappingProxyType(
     {"arcsec": 1 / ARCSEC, "m": 1.0, "mm": 1e3, "um": UM_PER_M, "nm": 1e9, "ppm": 1e6, "percent": 1e2}
 )
@@ -218,7 +221,7 @@ The first four are the parameters that estimators determine; a further one is a 
 here is its key.
 """
 ANGLE = Parameter("change_arcsec", "Δθ", "change of the angle between the cameras' lines of sight, opening positive", 4)
-"""Change of the angle between two cameras' lines of sight."""
+"""Change of the angle between the lines of sight of two cameras, as a quantity that the monitor reads."""
 GROUND = (
     Parameter("along_m", "along", "error on the ground along the track", 3),
     Parameter("across_m", "across", "error on the ground across the track, to the right", 3),
@@ -228,7 +231,9 @@ GROUND = (
 
 
 def rows_of(camera: CameraCalibration) -> Array:
-    """Return the coefficients of a camera's readings on its four parameters, (P, 4), in their units per rad and m.
+    """Return the coefficients of a camera's readings on d_alpha, d_beta, d_gamma (rad) and d_f (m), (P, 4).
+
+    They are in the units of the readings per radian and per metre.
 
     Dimensions: P readings of the camera.
 

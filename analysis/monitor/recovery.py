@@ -45,19 +45,25 @@ from analysis.spots.likelihood import FALSE_ALARM, FitStates, fit_states, requir
 from analysis.spots.spot_positions import NoiseParts, SpotPositions, difference_covariance, noise_parts
 
 ALIKE = 2.0
-"""Ratio of the chi-square of a spot's core to that of the frames' noise up to which the noise explains both."""
+"""Largest ratio of a spot core's chi-square per degree of freedom to the variance of the frames' noise (in units of the
+specified variance) at which that noise still explains the misfit.
+"""
 LOUD = 1.3
-"""Squared ratio of the frames' noise to the specified one above which it is too large.
+"""Ratio of the noise variance of the frames to the specified one above which the noise counts as too large.
 
 A median over an image exceeds it by chance only with a deviation of 6 sigma.
 """
 NOISE, BEFORE, AFTER = "noise", "before", "shape"
-"""Causes: noise of the frames, the shape of the spots before, their shape after alone."""
+"""Names of the causes of a warning that the sigmas of spot positions are not valid.
+
+They are noise of the frames that is too large, a shape of the spots before the change that differs from the calibrated
+one, and a shape after the change that alone differs.
+"""
 
 
 @dataclass(frozen=True)
 class SpotWarning:
-    """Reason why sigma is not valid for a state.
+    """Reason why the sigmas of the spot positions are not valid for a state.
 
     Attributes
     ----------
@@ -93,30 +99,30 @@ class SpotEvidence:
     after: FitStates
 
     def at(self, states: slice) -> SpotEvidence:
-        """Return the evidence of a slice of the states.
+        """Return the goodness of fit of the spots in selected states.
 
         Parameters
         ----------
         states : slice
-            Range of the states.
+            Range of the states to keep.
         """
         before = self.before if len(self.before.whole) == 1 else self.before.at(states)
         return SpotEvidence(before, self.after.at(states))
 
     @classmethod
     def joined(cls, parts: Sequence[SpotEvidence]) -> SpotEvidence:
-        """Return the evidence of several series against one nominal state, joined.
+        """Return the goodness of fit of several series of states, which share one nominal state, joined.
 
         Parameters
         ----------
         parts : sequence of SpotEvidence
-            Evidence of each series; at least one.
+            Goodness of fit of each series; at least one.
         """
         return cls(parts[0].before, FitStates.joined([part.after for part in parts]))
 
     @property
     def holds(self) -> NDArray[np.bool_]:
-        """True for states whose spots before and after are as assumed, (S,).
+        """True for states in which all spots have the assumed shape and noise, before and after, (S,).
 
         Dimensions: S states.
         """
@@ -132,11 +138,11 @@ class SpotEvidence:
 
     @property
     def worst(self) -> int:
-        """Index of the state whose spots fit worst."""
+        """Index of the state whose spots fit the calibrated shape worst."""
         return int(np.argmax(np.max(self.widening, axis=1)))
 
     def course_doubt(self, moments: Sequence[str], names: Sequence[str]) -> str | None:
-        """Return the reason why sigma is not valid at the worst of many times; None where it is valid at all.
+        """Return the reason why sigma is not valid at the worst of many times; None if it is valid at all of them.
 
         Parameters
         ----------
@@ -149,7 +155,7 @@ class SpotEvidence:
         return None if warning is None else f"at {moments[self.worst]}, the worst of {bad} times: {warning.text}"
 
     def doubt(self, state: int = 0, names: Sequence[str] = ()) -> SpotWarning | None:
-        """Return the reason why sigma is not valid for a state; None where it is.
+        """Return the reason why the sigmas of the spot positions are not valid for a state; None if they are.
 
         Parameters
         ----------
@@ -221,7 +227,7 @@ _MOST_STEPS = 20
 
 @dataclass(frozen=True, eq=False)
 class Retraced:
-    """Exact effects of S states on spots and cameras, from a ray trace.
+    """Exact spot shifts and camera changes in S states of the instrument, from a ray trace.
 
     Dimensions: D spot coordinates (row and column of every spot), K cameras.
 
@@ -239,7 +245,7 @@ class Retraced:
 
 @dataclass(frozen=True, eq=False)
 class MotionModel:
-    """Motions assumed by an estimator.
+    """Motions assumed by an estimator, with their linear effects and a ray trace of their exact ones.
 
     Dimensions: D spot coordinates (row and column of every spot), P motions, K cameras.
 
@@ -250,9 +256,10 @@ class MotionModel:
     parameters : (4 K, P) ndarray
         Changes B, rad and m per unit of each motion.
     amounts : callable
-        Function from the covariance of the shifts (S, D, D), px^2, to G (S, P, D), units per px.
+        Function from the covariance of the shifts (S, D, D), px^2, to the gain G (S, P, D) by which the motions are
+        estimated from the shifts, in units of the motions per px.
     states : callable
-        Function from amounts (S, P) to the states that they make.
+        Function from the amounts of the motions (S, P) to the states of the instrument, for `trace`.
     trace : callable
         Function from S states to their exact effects. Models that share one are traced together.
     near_px : float
@@ -278,9 +285,9 @@ class Curvature(StateArrays):
     off : (S, Q) ndarray
         Error of the linear reading of each quantity, sigmas; NaN where the state cannot be traced.
     beyond : (S,) ndarray of bool
-        True where the error is too large, so that the reading is that of the last step.
+        True where the error is too large, so that the result of the iteration replaces the linear reading.
     rests : (S,) ndarray of bool
-        True where the steps converged, or none were needed.
+        True where the iteration converged, or none was needed.
     """
 
     off: Array
@@ -474,7 +481,7 @@ class Estimates:
 @shows("parameters", "before [px]", "after [px]", "sigma_after [px]")
 @dataclass(frozen=True, eq=False)
 class Recovery(StateArrays):
-    """Results of the monitor's images for S states.
+    """Results of the monitor's images of C spots for S states.
 
     Attributes
     ----------
@@ -511,12 +518,12 @@ class Recovery(StateArrays):
     curvature: Mapping[str, Curvature] = field(default_factory=dict)
 
     def at(self, states: slice) -> Recovery:
-        """Return the results of a slice of the states, without ``parts``.
+        """Return the results of selected states, without ``parts``.
 
         Parameters
         ----------
         states : slice
-            Range of the states.
+            Range of the states to keep.
         """
         return StateArrays.at(replace(self, parts=None), states)
 
@@ -552,8 +559,6 @@ def measure_spots(
     """Measure the position of every spot in mean frames (B, H, W), in the order of the calibration.
 
     B is the number of images, a multiple of the number of spots; H and W are their rows and columns.
-
-    Dimensions: B images, H rows.
 
     Parameters
     ----------

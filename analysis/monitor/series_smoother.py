@@ -60,7 +60,7 @@ _AT_ONCE = 64
 
 
 class ShiftNoise(Protocol):
-    """Interface of the noise of a series of spot shifts: the covariance of any of its measurements together."""
+    """Interface of the noise of a series of spot shifts, which gives the joint covariance of any measurements."""
 
     def covariance(self, images: Numbers) -> Array:
         """Return the covariance of the shifts of some measurements, (n D, n D) px^2, one measurement after the other.
@@ -404,7 +404,7 @@ class _Search:
         raise AssertionError(f"a jump at {jump.until} s is at no measurement")
 
     def _factors(self, model: Disturbances) -> Iterator[tuple[_Factor, slice]]:
-        """Yield for each window the factorised measurements, and the range of measurements it decides about."""
+        """Yield for each section of a series its factorised measurements, and the range in which it finds jumps."""
         process = _Process(model, self.reference)
         for piece, window in _pieces(len(self.when), window_of(self.shifts.shape[1])):
             indices = self.order[window]
@@ -440,7 +440,7 @@ class _Process:
             self.parts.append((law, spots @ correlation @ spots.T, across @ spots.T, across @ parameters.T))
 
     def _covariance(self, law: TimeLaw, one: Array, two: Array) -> Array:
-        """Return the covariance of a law between two sets of times, (n, m).
+        """Return the covariance of motions with a time law between two sets of times, (n, m).
 
         Dimensions: n times of the first set, m times of the second set.
         """
@@ -451,21 +451,21 @@ class _Process:
         return np.asarray(out - since[:, None] - until + law.covariance(self.reference, self.reference))
 
     def shifts(self, times: Array) -> Array:
-        """Return the covariance of the shifts, (n D, n D) px^2.
+        """Return the prior covariance of the spot shifts in n measurements, (n D, n D) px^2.
 
         Dimensions: n measurements, D spot coordinates (row and column of every spot).
         """
         return _together([(self._covariance(law, times, times), spots) for law, spots, _, _ in self.parts])
 
     def across(self, times: Array, wanted: Array) -> Array:
-        """Return the covariance of shifts with parameters, (n D, m 4 K).
+        """Return the prior cross-covariance of spot shifts with camera parameters, (n D, m 4 K).
 
         Dimensions: n measurements, D spot coordinates (row and column of every spot), m wanted times, K cameras.
         """
         return _together([(self._covariance(law, times, wanted), cross.T) for law, _, cross, _ in self.parts])
 
     def parameters(self, wanted: Array) -> Array:
-        """Return the covariance of the parameters at each time, (m, 4 K, 4 K).
+        """Return the prior covariance of the camera parameters at each time, (m, 4 K, 4 K).
 
         Dimensions: m wanted times, K cameras.
         """
@@ -481,7 +481,10 @@ class _Process:
 
 
 def _together(parts: list[tuple[Array, Array]]) -> Array:
-    """Return the sum of Kronecker products: of each time law's covariance over time with that over coordinates."""
+    """Return the covariance of values at several times: sum over time laws of a Kronecker product.
+
+    The factors are each law's covariance over time and its covariance over coordinates.
+    """
     return np.asarray(sum(np.kron(time, block) for time, block in parts))
 
 
@@ -508,7 +511,7 @@ class _Factor:
         return np.asarray(solve_triangular(self.root, left.T, lower=True))
 
     def estimate(self, times: Array, at: Numbers, filtered: SeriesChanges, smoothed: SeriesChanges) -> None:
-        """Fill in the changes at some of the times.
+        """Compute the filtered and smoothed camera changes at selected times and write them into the given results.
 
         Dimensions: T times.
 
@@ -519,9 +522,9 @@ class _Factor:
         at : ndarray of int
             Indices of the times to process.
         filtered : SeriesChanges
-            Filtered changes to fill in.
+            Filtered changes at all times, into which the results are written.
         smoothed : SeriesChanges
-            Smoothed changes to fill in.
+            Smoothed changes at all times, into which the results are written.
         """
         wanted = times[at]
         prior = self.process.parameters(wanted)
@@ -537,7 +540,7 @@ class _Factor:
 
 
 def _positive(prior: Array, gained: Array) -> Array:
-    """Return the prior covariance minus what was gained, without the negative variances that rounding leaves."""
+    """Return the prior covariance minus its reduction by measurements, without negative variances due to rounding."""
     size = np.sqrt(np.diag(prior))
     scale = np.where(size > 0.0, size, 1.0)
     left = (prior - gained) / scale[:, None] / scale

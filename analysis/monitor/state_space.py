@@ -33,12 +33,12 @@ from analysis.monitor.disturbances import Disturbances, TimeLaw
 _INTERVALS = 200
 """Number of intervals between readings whose state transitions are kept in memory."""
 _NOTHING = 1e-12
-"""Singular value of the scaled effects on the outputs, relative to the largest, below which only rounding is left."""
+"""Singular value of the scaled effects of motions on the outputs, relative to the largest, that is only rounding."""
 
 
 @dataclass(frozen=True, eq=False)
 class HeatInputs:
-    """Temperatures read by sensors, as inputs with errors.
+    """Temperatures of bodies that sensors read, as inputs of the state space with uncertain effect on the light.
 
     Dimensions: m motions.
 
@@ -53,7 +53,7 @@ class HeatInputs:
     factors : (m,) ndarray of int
         Index of the factor by which the effect of each motion on light differs from the computed one.
     names : tuple of str
-        Names of the factors, bodies.
+        Names of the factors, which are those of the bodies.
     sigma : float
         Standard deviation of a factor before any reading.
     """
@@ -79,11 +79,13 @@ class _Block:
     Attributes
     ----------
     kind : str
-        `level` of all that steps, `law` of another law, `heat` of temperatures with sensors, `factor` and `reference`.
+        `level` for everything that changes by steps, `law` for another time law, `heat` for temperatures with sensors,
+        `factor` for the factors of the effect of heat, `reference` for the error of the reference positions.
     law : TimeLaw
         Law in time.
     at : slice
-        Range of the states; for a law with a period the first half is the cosine part, the second the sine part.
+        Range of the block's states among all; for a law with a period the first half is the cosine part, the second the
+        sine part.
     outputs : (D + P, r) ndarray
         Effect of the first r states on spot coordinates (px) and parameters, where the law's amplitude is 1.
     covariance : (r, r) ndarray
@@ -116,13 +118,13 @@ class _Transition:
     Attributes
     ----------
     kept : (n,) ndarray
-        Factor by which each state decays.
+        Factor by which each state decays over the interval, 0 to 1.
     kept_both : (n, n) ndarray
-        Factor by which the product of two states decays.
+        Factor by which the product of two states decays over the interval.
     turned : tuple of (slice, ndarray)
         For each law with a period its states, and the matrix of their rotation.
     gained : (n, n) ndarray
-        Covariance that laws without events add in the interval.
+        Process noise: covariance that the time laws without events add to the states in the interval.
     """
 
     kept: Array
@@ -248,7 +250,7 @@ class StateSpace:
 
     @property
     def level(self) -> slice:
-        """Range of the states that steps change; all other states are unchanged by steps."""
+        """Range, among all states, of those that steps (events and jumps) change."""
         return self._blocks[0].at if self._blocks else slice(0, 0)
 
     def level_of(self, motions: Sequence[int]) -> Array:
@@ -312,14 +314,14 @@ class StateSpace:
             spread[part, part] += what
 
     def moved(self, states: Array, then: float, now: float, back: bool = False) -> Array:
-        """Return states, or quantities that propagate as they do, at another time, (..., n, k).
+        """Return states, or vectors that propagate like states, at another time, without process noise, (..., n, k).
 
         Dimensions: n states of the filter, k columns.
 
         Parameters
         ----------
         states : (..., n, k) ndarray
-            States.
+            k columns, each a vector of the n states.
         then : float
             Time of the states, s.
         now : float
@@ -393,7 +395,7 @@ class StateSpace:
 
     @cached_property
     def _transitions(self) -> dict[float, _Transition]:
-        """Interval in seconds -> state transition, for the last intervals, since few different intervals occur."""
+        """Cache of state transitions by the length of the interval in seconds, since few different intervals occur."""
         return {}
 
     def spread(self, covariance: Array, then: float, now: float) -> Array:
@@ -449,7 +451,7 @@ class StateSpace:
         return self.acting(self._rows(time), mean, covariance)
 
     def acting(self, rows: Array, mean: Array, covariance: Array) -> tuple[Array, Array, Array]:
-        """Return linear combinations of the states, with temperatures times the estimated factors of their effect.
+        """Return linear combinations of the states, in which estimated factors multiply the effect of temperatures.
 
         The results are values (R,), derivatives with respect to the states (R, n), and the covariance of the
         second-order terms.
@@ -479,7 +481,7 @@ class StateSpace:
         return values, rows, self._second(plain, plain, covariance)
 
     def _second(self, rows: Array, others: Array, across: Array) -> Array:
-        """Return the covariance of the products of factors and temperatures beyond first order, (R, R').
+        """Return the second-order part of the covariance of products of heat factors and temperatures, (R, R').
 
         Dimensions: R combinations, n states of the filter.
 
@@ -541,9 +543,9 @@ class StateSpace:
 
     @cached_property
     def basis(self) -> Array:
-        """Effect of the n states on the outputs where the amplitudes of all time laws are 1, (D + P, n).
+        """Derivatives of the outputs with respect to the n states if all time laws have the amplitude 1, (D + P, n).
 
-        Dimensions: D spot coordinates (row and column of every spot), P parameters.
+        Outputs are D spot coordinates (row and column of every spot), in px, then P camera parameters.
         """
         rows = np.zeros((self.width + self.stated.parameters.shape[0], self.size))
         for block in self._blocks:
@@ -552,13 +554,13 @@ class StateSpace:
 
     @cached_property
     def _heat_states(self) -> dict[int, int]:
-        """Index of a motion that is a temperature with a sensor -> index of its state."""
+        """Mapping from the index of each motion that is a temperature with a sensor to the index of its state."""
         heat = [block for block in self._blocks if block.kind == "heat"]
         return {motion: block.at.start + k for block in heat for k, motion in enumerate(block.motions)}
 
     @cached_property
     def factors(self) -> slice:
-        """Range of the states that are factors of the effect of heat."""
+        """Range, among all states, of the relative excess of the real effect of heat over the computed one."""
         return next((block.at for block in self._blocks if block.kind == "factor"), slice(0, 0))
 
     @cached_property
@@ -604,7 +606,7 @@ class StateSpace:
         return out
 
     def motion_gain(self, time: float, steps: Sequence[tuple[Sequence[int], float]] = ()) -> tuple[Array, Array]:
-        """Return the matrix (M, n) from states to motions, and the covariance (M, M) that the states leave.
+        """Return the matrix (M, n) from states to motions, and the covariance (M, M) of the motions for known states.
 
         Motions are in prior standard deviations.
 
@@ -669,7 +671,7 @@ def _halves(at: slice) -> tuple[slice, slice]:
 
 
 def _kept(law: TimeLaw, over: float) -> float:
-    """Return the factor by which a state of a time law decays over a time in seconds."""
+    """Return the factor, 0 to 1, by which a state of a time law decays over a time in seconds."""
     if law.white:
         return 0.0 if over > 0.0 else 1.0
     return 1.0 if law.drift_s is None else math.exp(-over / law.drift_s)

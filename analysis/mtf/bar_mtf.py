@@ -429,7 +429,7 @@ def _design(position: Array, frequency: Array, numbers: tuple[int, ...], paramet
 
 
 def _gram(first: Array, second: Array) -> Array:
-    """Return the products of two sets of functions, summed over pixels.
+    """Return the matrix of scalar products of two sets of functions, summed over pixels.
 
     A matrix product is not used, since its threads wait for each other on a busy machine.
     """
@@ -516,7 +516,7 @@ def measure_bar_pages(
     Raises
     ------
     BarError
-        `measure_bars` fails, or the bars move from page to page.
+        The mean of the pages shows no measurable bars (`bar_mtf`), or the bars move from page to page.
     """
     unique = different_pages(region)
     pages, patches = region[unique], [patch[different_pages(patch)] for patch in (dark, bright)]

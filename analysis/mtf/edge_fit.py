@@ -272,7 +272,7 @@ class EdgeSpread:
         return np.hstack([cho_solve(self.factor, right[:, k : k + 8], check_finite=False) for k in columns])
 
     def _local(self, design: EdgeDesign) -> Array:
-        """Return the coefficients of the splines at each pixel of the core, (4, M).
+        """Return the coefficients of the four B-splines that are nonzero at each pixel of the core, (4, M).
 
         Dimensions: M pixels in the core.
         """
@@ -317,7 +317,10 @@ _LARGEST_GAP = 0.3
 # Gauss-Newton steps of a straight line: in uneven light, which is correlated with the line, and in even light.
 _LINE_STEPS = (4, 2)
 OVERSAMPLING, COARSE = 4, 2
-"""Knots of the edge-spread function per pixel: final, and coarse while the line is fitted to avoid fitting noise."""
+"""Knots of the edge-spread function per pixel: in the final fit, and in the fits that determine the edge's line.
+
+The latter has fewer, so that it does not follow the noise.
+"""
 HIGHEST_ORDER = 5
 """Highest order of the polynomial that follows a curved edge, that of ISO 12233:2023."""
 FALSE_ALARM = 1e-4
@@ -355,7 +358,7 @@ class EdgeRows:
 
     @staticmethod
     def of(lines: Array, shape: tuple[int, ...], bend: Array) -> EdgeRows:
-        """Return the rows of pages, one page after the other.
+        """Return the rows of several pages, one page after the other, with the line of each page and the common bend.
 
         Dimensions: P pages, B coefficients of the bend.
 

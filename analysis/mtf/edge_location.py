@@ -231,7 +231,7 @@ def _direction(grey: Array) -> tuple[Axis, int]:
 
 
 def _blocks(grey: Array) -> Array:
-    """Return the mean grey values of all complete blocks of 4 x 4 px."""
+    """Return the mean grey values of all complete blocks of 4 x 4 px of a region."""
     rows, columns = grey.shape[0] // 4, grey.shape[1] // 4
     whole = grey[: rows * 4, : columns * 4].reshape(rows, 4, columns, 4)
     return np.asarray(whole.mean(axis=(1, 3)))

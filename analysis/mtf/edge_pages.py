@@ -137,7 +137,7 @@ def measure_pages(
 
 @dataclass(frozen=True, eq=False)
 class _Run:
-    """Options of a measurement: noise model, step of grey values, number of copied pages, even light."""
+    """Options of a measurement: noise model, step of grey values, number of copied pages, and evenness of the light."""
 
     noise: NoiseModel | None
     step: float

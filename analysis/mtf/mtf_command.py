@@ -39,7 +39,7 @@ _ROWS = (0.05, 0.1, 0.15, 0.2, 0.25, 0.3, 0.35, 0.4, 0.45, 0.5)
 
 
 class _Wrong(Exception):
-    """Error of the user's input, described in one sentence."""
+    """Error raised for an invalid input of the user, which its message describes in one sentence."""
 
 
 def run_mtf(
@@ -176,7 +176,7 @@ def _step(source: ImageFile, region: Array, gamma: str | None) -> float:
 
 
 def _given_pitch(pitch: str | None, pixel_size: str | None, errors: Console) -> str:
-    """Return the text of the pitch option, also under its old name."""
+    """Return the text of the option for the pixel pitch, which may be given under its old name."""
     if pixel_size is not None:
         errors.print("note: --pixel-size is now --pitch; the old name is accepted for one version", soft_wrap=True)
     if (pitch is None) == (pixel_size is None):
@@ -185,7 +185,7 @@ def _given_pitch(pitch: str | None, pixel_size: str | None, errors: Console) -> 
 
 
 def _pitch(text: str) -> float:
-    """Return the pixel pitch in millimetres."""
+    """Return the pixel pitch in millimetres from the text of its option, such as ``7 um``."""
     match = re.fullmatch(r"\s*([-+0-9.eE]+)\s*(\S*)\s*", text)
     try:
         value = float(match[1]) if match else math.nan
@@ -200,7 +200,7 @@ def _pitch(text: str) -> float:
 
 
 def _frequency(text: str, pitch: float) -> float:
-    """Return the frequency in cycles per pixel; the pitch is in millimetres."""
+    """Return the frequency in cycles per pixel from the text of its option; the pitch is in millimetres."""
     match = re.fullmatch(r"\s*([-+0-9.eE]+)\s*(cycles/mm|cycles/pixel|lp/mm)\s*", text)
     try:
         value = float(match[1]) if match else math.nan

@@ -58,7 +58,7 @@ kilometres come out far beyond it.
 
 
 class CalibrationError(MeasurementError, ValueError):
-    """Error for invalid input of an in-orbit calibration."""
+    """Error raised for invalid input of an in-orbit calibration."""
 
 
 @dataclass(frozen=True)
@@ -138,7 +138,7 @@ class Noise:
         return tuple(t for t in terms if t.sigma > 0)
 
     def check(self) -> None:
-        """Raise CalibrationError if a sigma or an interval is invalid."""
+        """Raise CalibrationError if a standard deviation or an interval is negative, missing or not finite."""
         sigmas = (self.image, self.attitude, self.station, self.slow_attitude, self.attitude_walk)
         if not (np.isfinite(sigmas).all() and self.image > 0 and min(sigmas) >= 0):
             raise CalibrationError(
@@ -161,7 +161,7 @@ class CalibrationField:
     rays : mapping of str to Rays
         Image points of each line camera, by its name.
     ground : (m, 3) ndarray
-        Coordinates of the control points and start values of the tie points, ITRS, in metres.
+        Coordinates of the control points and start values of the tie points, m in all, ITRS, in metres.
     covariance : (m, 3, 3) ndarray
         Covariance of the control points, in m^2; zero where they are error-free, ignored for tie points.
     control : (m,) ndarray of bool
@@ -192,7 +192,7 @@ class CalibrationField:
         rays : mapping of str to Rays
             Image points of each line camera, by its name.
         ground : (m, 3) array_like
-            Coordinates of the points, ITRS, in metres.
+            Coordinates of the m points, ITRS, in metres.
         sigma : float or (float, float) or (m, 3, 3) ndarray
             Standard deviation of the control points in metres, one for all axes or (each horizontal axis, height), 0
             for error-free points; or their covariance in m^2, zero for error-free points.
@@ -239,7 +239,7 @@ class CalibrationField:
 
 
 def _control_covariance(name: str, points: Array, sigma: float | tuple[float, float] | Array) -> Array:
-    """Return the (m, 3, 3) covariance of control points, in m^2."""
+    """Return the covariances of m control points, (m, 3, 3), in m^2."""
     if isinstance(sigma, np.ndarray):
         exact = ~np.any(sigma, axis=(1, 2)) if sigma.shape == (len(points), 3, 3) else np.zeros(0, bool)
         if len(exact) != len(points) or not np.all(np.linalg.eigvalsh(sigma)[~exact] > 0.0):
@@ -252,7 +252,7 @@ def _control_covariance(name: str, points: Array, sigma: float | tuple[float, fl
 
 
 def level_covariance(points: Array, plan: ArrayLike, height: ArrayLike) -> Array:
-    """Return the (m, 3, 3) ITRS covariance of points with equal sigmas along both horizontal axes, in m^2.
+    """Return the ITRS covariances (m, 3, 3) of m points with equal sigmas along both horizontal axes, in m^2.
 
     Parameters
     ----------
@@ -269,14 +269,14 @@ def level_covariance(points: Array, plan: ArrayLike, height: ArrayLike) -> Array
 
 
 def _rough_height(points: Array) -> Array:
-    """Return the (m,) distances of points from the ellipsoid along their radius, in metres."""
+    """Return the distances of m points from the ellipsoid along their radius, (m,), in metres."""
     radius = np.linalg.norm(points, axis=1)
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.asarray(radius - radius / np.linalg.norm(points / _SEMI_AXES, axis=1))
 
 
 def vertical(points: Array) -> Array:
-    """Return the (m, 3) unit normals of the ellipsoid at points (m, 3), ITRS, in metres.
+    """Return the unit normals of the ellipsoid at m points, both (m, 3), ITRS; the points are in metres.
 
     The normal is computed as if the point lay on the ellipsoid. For a point at height h above a semi-major axis a, the
     error is h / a times the angle between normal and radius: 1e-6 rad for heights below 2 km.
@@ -482,7 +482,7 @@ class Parameters:
         return cls(names, values, np.array([entries[n][1] for n in names]), columns, middles)
 
     def since_middle(self, name: str, rays: Rays) -> Array:
-        """Return the (n,) seconds from a field's mean time to its rays; zero where the bias does not drift."""
+        """Return the times of n rays since the field's mean time, (n,) s; zero where the bias does not drift."""
         if name not in self.middles or rays.time is None:
             return np.zeros(len(rays.point))
         return np.asarray(rays.time - self.middles[name])
@@ -555,8 +555,8 @@ def index(names: Sequence[str], name: str) -> int:
 
 WORST = 1e-4
 """Image motion of a start value of unknown accuracy, in metres: 15 px of 6.5 um, 32 arcsec, 75 m on the ground, as
-without any calibration (paper 003: 100 m class). With a camera mounted askew by one arc minute the pitch becomes
-observable, but only to 400 px with sixty points of 0.3 px.
+without any calibration (paper 003, Mo et al. 2015: 100 m class). With a camera mounted askew by one arc minute the
+pitch becomes observable, but only to 400 px with sixty points of 0.3 px.
 """
 LOST = 3e3
 """Largest ratio of a combination's standard deviation, as image motion, to the noise of a single image point. Above it
@@ -564,13 +564,13 @@ the combination counts as not determined by the points, whatever the sigmas of t
 width of a field give 500 or less.
 """
 WEAK = 3e-2
-"""Strength below which an estimated combination is reported as weak."""
+"""Strength (`Combination.strength`, 0 to 1) below which an estimated combination of unknowns is reported as weak."""
 _CLOSED = 10.0
 """Factor on the sigma of an unknown's prior, within which the prior is taken to fix the combinations that contain this
 unknown.
 """
 _SHOWN = 1e-2
-"""Smallest image motion of an unknown listed in a combination, as a fraction of the largest one in it."""
+"""Smallest image motion due to an unknown that is listed in a linear combination, relative to the largest one in it."""
 _ANGLES = (*BIAS, *DRIFT[:3], "rate")
 
 
@@ -650,7 +650,7 @@ class Gauge:
 
 
 class RankError(CalibrationError):
-    """Ground points leave combinations of unknowns undetermined, and no gauge fixes them.
+    """Error raised if ground points leave combinations of unknowns undetermined and no gauge fixes them.
 
     Attributes
     ----------
@@ -675,7 +675,7 @@ class Freedom:
         Coefficients of k pseudo-observations that tie combinations to the start values: rows @ (unknowns - start) is
         zero with unit standard deviation.
     opened : tuple of Combination
-        Open combinations before the gauge.
+        Combinations that the ground points leave undetermined, before the gauge is applied.
     """
 
     kept: NDArray[np.intp]
@@ -702,7 +702,9 @@ def null_vectors(reduced: Array, sigma: Array) -> Array:
 
 
 def weak_vectors(reduced: Array, length: Array, scale: Array, basis: Array) -> Array:
-    """Return the combinations of P unknowns within `basis` whose strength is below `WEAK`, (P, k), in units of `scale`.
+    """Return the combinations of unknowns within `basis` whose strength is below `WEAK`, in units of `scale`.
+
+    The result is (P, k) for k combinations of P unknowns.
 
     The strength is the ratio of a combination's standard deviation with everything else known to that in the
     adjustment.
@@ -727,7 +729,7 @@ def weak_vectors(reduced: Array, length: Array, scale: Array, basis: Array) -> A
 def combinations(
     names: Sequence[str], scale: Array, vectors: Array, reduced: Array, length: Array
 ) -> tuple[Combination, ...]:
-    """Return a space of combinations as k combinations of named unknowns, as sparse as possible.
+    """Return k linear combinations of named unknowns, as sparse as possible, that span a given space.
 
     A combination lists the unknowns that take part with at least a hundredth of the largest motion. Each combination
     has an unknown that is in no other one.

@@ -24,12 +24,12 @@ unit variance make z a stationary second-order autoregression with the double ro
 covariance is 3 (-rho)^n (n + (1 + rho^2) / (1 - rho^2)), and the precision matrix of a segment of it has five
 diagonals.
 
-**Third differences** assess an orbit or attitude series (paper 003, Table 2). A third difference x[k+3] - 3 x[k+2] + 3
-x[k+1] - x[k] removes a smooth motion, up to its third derivative times dt^3, and leaves noise: white noise with
-standard deviation s gives it the RMS s sqrt(1 + 9 + 9 + 1) = s sqrt(20), and neighbours correlate by -15/20. It is
-blind to a bias, a drift or noise that is slower than a few samples, and data that were smoothed before look better than
-they are. The smooth part is not always small: along a circular orbit at 500 km the third derivative is 8.4e-3 m/s^3, so
-8 mm at 1 s but 8 m at 10 s.
+**Third differences** assess an orbit or attitude series (paper 003, Mo et al. 2015, Table 2). A third difference
+x[k+3] - 3 x[k+2] + 3 x[k+1] - x[k] removes a smooth motion, up to its third derivative times dt^3, and leaves noise:
+white noise with standard deviation s gives it the RMS s sqrt(1 + 9 + 9 + 1) = s sqrt(20), and neighbours correlate by
+-15/20. It is blind to a bias, a drift or noise that is slower than a few samples, and data that were smoothed before
+look better than they are. The smooth part is not always small: along a circular orbit at 500 km the third derivative is
+8.4e-3 m/s^3, so 8 mm at 1 s but 8 m at 10 s.
 
 **CE90 and LE90** are the horizontal radius and the height interval that hold 90 % of the errors, as map standards
 define them: of one point by its covariance, of a set of points with different covariances (for a point drawn from the
@@ -127,7 +127,9 @@ def _covariance(count: int) -> Array:
 
 
 def spline_precision(count: int) -> sparse.csr_matrix:
-    """Return the inverse of `_covariance` for four or more coefficients.
+    """Return the precision matrix of four or more neighbouring coefficients of an interpolating cubic spline.
+
+    It is the inverse of their covariance for independent readings of unit variance.
 
     Its interior is the square of the tridiagonal matrix with (1 4 1) / 6 in each row; two rows at each end differ.
     """
@@ -153,7 +155,7 @@ class ThirdDifference:
     Attributes
     ----------
     rms : (k,) ndarray
-        RMS of the third differences of each quantity, in its unit, as in Table 2 of paper 003.
+        RMS of the third differences of each quantity, in its unit, as in Table 2 of paper 003 (Mo et al. 2015).
     white_sigma : (k,) ndarray
         rms / sqrt(20), the standard deviation of one sample if the noise is white.
     """
@@ -168,9 +170,9 @@ def third_difference(time: ArrayLike, series: ArrayLike) -> ThirdDifference:
     Parameters
     ----------
     time : (n,) array_like
-        Times of the samples, in seconds.
+        Times of the n samples, in seconds.
     series : (n,) or (n, k) array_like
-        Samples, in metres or radians.
+        Samples of one quantity or of k, in metres or radians.
 
     Raises
     ------
@@ -195,7 +197,7 @@ def third_difference(time: ArrayLike, series: ArrayLike) -> ThirdDifference:
 
 
 _STEPS = 10
-"""Largest number of Gauss-Newton steps."""
+"""Largest number of Gauss-Newton steps of a forward intersection."""
 _CONVERGED = 1e-6
 """Largest step of a converged iteration, in metres; coordinates of 6.4e6 m are rounded to 1e-9 m."""
 _PARALLEL = 3e-4
@@ -204,7 +206,7 @@ _PARALLEL = 3e-4
 
 @dataclass(frozen=True, eq=False)
 class Intersection:
-    """Points from forward intersection.
+    """Coordinates of m points from forward intersection.
 
     Attributes
     ----------
@@ -226,7 +228,7 @@ class Intersection:
 
 @dataclass(frozen=True, eq=False)
 class CheckErrors:
-    """Errors at check points, intersected minus surveyed.
+    """Errors at m check points, intersected minus surveyed.
 
     Attributes
     ----------
@@ -310,7 +312,7 @@ def intersect(
 
 
 def check_errors(intersected: Array, surveyed: ArrayLike) -> CheckErrors:
-    """Compare intersected points (m, 3) with surveyed coordinates (m, 3), ITRS, in metres.
+    """Compare the coordinates of m intersected points with the surveyed ones, both (m, 3), ITRS, in metres.
 
     Points that were not intersected (NaN) are ignored.
 
@@ -353,7 +355,7 @@ def _start(
 
 
 class IntersectionError(MeasurementError, ValueError):
-    """Points that cannot be intersected."""
+    """Error raised for points whose rays cannot be intersected."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -405,7 +407,7 @@ class CalibratedLine:
         return replace(self, directions=self.directions @ matrix.T, principal_distance=distance)
 
     def look(self, pixel: Array) -> Array:
-        """Return the (n, 3) unit directions toward the scene of pixels (n,), in the body's axes."""
+        """Return the unit directions toward the scene of n pixels, (n, 3), in the body's axes."""
         vector = self._series(self.directions, pixel)
         return np.asarray(vector / np.linalg.norm(vector, axis=-1, keepdims=True))
 
@@ -420,7 +422,7 @@ class CalibratedLine:
 
 @dataclass(frozen=True, eq=False)
 class Sightings:
-    """Image positions of points on one line, in the points' order.
+    """Image positions of n points on one line, in the points' order.
 
     Attributes
     ----------
@@ -439,7 +441,7 @@ class Sightings:
 
 @dataclass(frozen=True, eq=False)
 class StereoPoints:
-    """Points intersected from two rays each.
+    """Points, n of them, intersected from two rays each.
 
     Attributes
     ----------
@@ -532,14 +534,14 @@ def intersect_rays(
 
 
 def between(times: ArrayLike, measured: ArrayLike, values: ArrayLike) -> Array:
-    """Interpolate measured camera changes linearly in time, constant before the first and after the last measurement.
+    """Interpolate measured camera changes linearly in time; they are constant outside the measured times.
 
     Parameters
     ----------
     times : (T,) array_like
         Times of the result, T of them, in seconds.
     measured : (m,) array_like
-        Ascending times of the measured changes, in seconds.
+        Ascending times of the m measured changes, in seconds.
     values : (m, 4) array_like
         Measured changes of the camera: d_alpha, d_beta, d_gamma (radians) and d_f (metres).
     """
@@ -575,7 +577,7 @@ class Accuracy:
 
 
 def level_axes(points: Array) -> Array:
-    """Return the (m, 3, 3) east, north and up axes as rows, at points (m, 3), ITRS, in metres."""
+    """Return the east, north and up axes at m points (m, 3) as rows, (m, 3, 3); points and axes are in ITRS."""
     up = vertical(points)
     east = np.cross([0.0, 0.0, 1.0], up)
     east = east / np.linalg.norm(east, axis=1, keepdims=True)

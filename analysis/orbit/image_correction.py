@@ -20,7 +20,7 @@ from analysis.arrays import Array
 Kind = Literal["shift", "affine"]
 
 _FALSE_ALARM = 1e-3
-"""Probability that any point of a file without gross errors is excluded."""
+"""Probability that any point is excluded from the control points of one file if none has a gross error."""
 _SAME_PLACE = 1e-6
 """Smallest ratio of the minor to the major extent of points that do not lie on one line."""
 LEAST_POINTS = {"shift": 1, "affine": 3}
@@ -29,7 +29,7 @@ LEAST_POINTS = {"shift": 1, "affine": 3}
 
 @dataclass(frozen=True, eq=False)
 class ImageCorrection:
-    """Correction of image coordinates, measured minus predicted.
+    """Correction of image coordinates, measured minus predicted, from N points.
 
     Attributes
     ----------
@@ -82,7 +82,7 @@ class ImageCorrection:
 
     @property
     def probability(self) -> float:
-        """p-value of the chi-square; 1 without redundancy."""
+        """p-value of the chi-square of the residuals; 1 without redundancy."""
         return statistics.p_value(self.chi_square, self.freedom)
 
     def _basis(self, line: ArrayLike, sample: ArrayLike) -> Array:
@@ -114,7 +114,7 @@ def image_correction(
     Parameters
     ----------
     predicted : (N, 2) array_like
-        Line and sample at which the model sees the points, in pixels.
+        Line and sample at which the model sees the N points, in pixels.
     measured : (N, 2) array_like
         Measured line and sample, in pixels.
     covariance : (N, 2, 2) array_like

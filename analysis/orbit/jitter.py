@@ -76,13 +76,13 @@ _NEVER = 1e-280
 _LEAST_ROWS = 30
 """Smallest number of degrees of freedom of a spectrum or of an estimated variance factor."""
 _REWEIGHTED = 3
-"""Number of iterations of the variance estimation."""
+"""Number of iterations in which the variances of the kinds of errors are estimated."""
 _LEAST_FACTOR = 0.01
-"""Smallest variance factor that is estimated, a tenth of the a-priori sigma."""
+"""Smallest variance factor that is estimated; sigma is then a tenth of the a-priori one."""
 
 
 class JitterError(MeasurementError, ValueError):
-    """Observations that do not allow a jitter analysis."""
+    """Error raised for observations that do not allow a jitter analysis."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -225,7 +225,7 @@ class Observations:
         return np.einsum("rjfk,rja->rfka", both, self.weight).reshape(len(self.value), len(f), 2 * self.axes)
 
     def taken(self, keep: ArrayLike) -> Observations:
-        """Return the observations that a boolean mask (R,) selects."""
+        """Return the observations that a boolean mask, with one element for each observation, selects."""
         where = np.asarray(keep)
         some, group = np.unique(self.group[where], return_inverse=True)
         value, weight, nuisance = self.value[where], self.weight[where], self.nuisance[where]
@@ -250,7 +250,10 @@ class Observations:
         return estimate
 
     def _factors(self) -> Array:
-        """Return the variance factors (K,) of one iteration of `factors`, relative to the present whitening."""
+        """Return the variance factors of the K kinds of errors from one iteration of `factors`, (K,).
+
+        They are relative to the variances that the present whitening assumes.
+        """
         left, known, mix = (self._of_groups(v) for v in (self.rest(self.value)[:, None], self.known, self.mix))
         by_kind = [mix[:, :, k] for k in range(mix.shape[2])]
         spread = [m @ m.swapaxes(1, 2) for m in by_kind]
@@ -291,7 +294,7 @@ class Observations:
 
     @cached_property
     def _row(self) -> NDArray[np.intp]:
-        """Number of each of R observations among those of its ground point, from 0 on."""
+        """Position of each of R observations among those of its ground point, counted from 0."""
         return _within(self.group, len(self.time))
 
     def _of_groups(self, columns: Array) -> Array:
@@ -304,12 +307,12 @@ class Observations:
         return out
 
     def beside(self, columns: Array) -> Observations:
-        """Return the observations with P more nuisance parameters, given by their derivatives (R, P)."""
+        """Return the R observations with P more nuisance parameters, given by their derivatives (R, P)."""
         return replace(self, nuisance=np.concatenate([self.nuisance, columns], axis=1))
 
 
 def _within(group: NDArray[np.intp], count: int) -> NDArray[np.intp]:
-    """Return the number of each of R observations among those of its ground point, from 0 on.
+    """Return the position of each of R observations among those of its ground point, counted from 0.
 
     `group` is ascending.
     """
@@ -378,7 +381,7 @@ class Periodogram:
     def chance(self, power: ArrayLike) -> Array:
         """Return an upper bound of the probability that noise alone reaches a power at any searched frequency.
 
-        The variance of the noise is unknown.
+        The noise variance is estimated from the residuals, with `freedom` degrees of freedom.
         """
         share = np.clip(np.asarray(power, np.float64) / self.total, 0.0, 1.0)
         single = np.maximum(stats.beta.sf(share, 0.5 * self.order, 0.5 * (self.freedom - self.order)), _NEVER)
@@ -512,7 +515,7 @@ class _Products:
         -------
         tuple of ndarray
             Products of all waves with one another, of waves with their slopes with respect to frequency, and of slopes,
-            each (F, 2 A, 2 A), and of waves with the value, (F, 2 A).
+            each (F, 2 A, 2 A) for A axes, and of waves with the observed values, (F, 2 A).
         """
         count, a = len(frequency), self.axes
         t = 2.0 * np.pi * self.time
@@ -554,8 +557,9 @@ class _Products:
 
 
 _FINE, _PADDED = 16, 4
-"""Grid moments per period of the highest frequency, and transformed frequencies per resolution element: an oscillation
-loses at most 3 % of its power by either.
+"""Sampling of the periodogram: grid times per period of the highest frequency, and frequencies per resolution.
+
+The resolution is the inverse of the length of the series. An oscillation loses at most 3 % of its power by either.
 """
 _WIDEST = 2**18
 """Largest number of resolution elements (inverse of the observed time span) over which the Fourier transform of the
@@ -625,7 +629,7 @@ def peaks(observations: Observations, lowest: float, highest: float) -> tuple[Ar
 
 
 MOST_LINES = 20
-"""Largest number of lines that a search detects."""
+"""Largest number of oscillations (spectral lines) that a search detects."""
 _FAR = 5.0
 """Robust standard deviations beyond which an observation is excluded as wrong; of normally distributed observations it
 excludes one in two million.
@@ -647,12 +651,12 @@ _MOST_ALIASES = 24
 first.
 """
 _ALIKE = 0.8
-"""Smallest approximate power of a candidate alias, as a fraction of the power of the line."""
+"""Smallest approximate power of a candidate alias, as a fraction of the power of the detected oscillation."""
 
 
 @dataclass(frozen=True, eq=False)
 class Lines:
-    """Detected oscillations, fitted together.
+    """Detected oscillations (spectral lines) of an attitude, fitted together.
 
     The attitude angle about each axis at time t is the sum over the lines of sine * sin(2 pi f (t - origin)) + cosine *
     cos(2 pi f (t - origin)), f being the frequency of a line.
@@ -764,7 +768,7 @@ class JitterSearch:
     factors : (K,) ndarray
         Estimated factor on the a-priori variance of each of K kinds of errors.
     threshold : float
-        Power of ``after`` that noise alone exceeds with the specified probability.
+        Power in ``after`` that noise alone exceeds with the specified false-alarm probability.
     beyond : float
         Highest frequency at which aliases were searched, in hertz.
     """
@@ -873,7 +877,7 @@ def find_jitter(
     Parameters
     ----------
     time : (n,) array_like
-        Times of the observations, in seconds, in any order.
+        Times of the n observations, in seconds, in any order.
     angle : (n,) or (n, A) array_like
         Angles about A axes, in radians; with `lag`, angle at ``time + lag`` minus angle at ``time``, as two bands or
         two rows of chips show it.
@@ -889,7 +893,8 @@ def find_jitter(
     Returns
     -------
     Lines
-        `frequency` (K,), `amplitude` and `phase` (K, A) with `frequency_sigma` and `amplitude_sigma`, strongest first.
+        Oscillations, K of them: `frequency` (K,), `amplitude` and `phase` (K, A) with `frequency_sigma` and
+        `amplitude_sigma`, strongest first.
 
     Raises
     ------
@@ -943,18 +948,18 @@ def find_jitter(
 def _unaliased(
     observations: Observations, lines: Lines | None, fitted: Lines, band: tuple[float, float], false_alarm: float
 ) -> tuple[Lines, tuple[float, ...]]:
-    """Return all lines with the last one at its most likely frequency, and its aliases, in hertz.
+    """Return all oscillations (lines) with the last one at its most likely frequency, and its aliases, in hertz.
 
     Parameters
     ----------
-    kept : Observations
+    observations : Observations
         Observations that are used.
     lines : Lines or None
         Lines detected before, or None if this is the first.
     fitted : Lines
         These lines and the last one.
-    reach : tuple of float
-        Lowest and highest frequency in which aliases are searched, in hertz.
+    band : tuple of float
+        Lowest and highest frequency between which aliases are searched, in hertz.
     false_alarm : float
         Likelihood ratio to the best frequency above which a frequency is an alias.
     """
@@ -983,18 +988,18 @@ def _unaliased(
 
 
 def _left(observations: Observations, lines: Lines) -> float:
-    """Return the sum of squared residuals of the observations after fitting nuisance parameters and lines."""
+    """Return the sum of squared residuals of the observations after fitting nuisance parameters and oscillations."""
     residual = observations.rest(observations.value - _predicted(observations, lines))
     return float(residual @ residual)
 
 
 def _beside(observations: Observations, lines: Lines | None) -> Observations:
-    """Return the observations with all parameters of the lines as additional nuisance parameters."""
+    """Return the observations with all parameters of the oscillations as additional nuisance parameters."""
     return observations if lines is None else observations.beside(_columns(observations, lines))
 
 
 def _columns(observations: Observations, lines: Lines) -> Array:
-    """Return the derivatives of R observations with respect to the P parameters of the lines, (R, P)."""
+    """Return the derivatives of R observations with respect to the P parameters of the oscillations, (R, P)."""
     design = np.zeros((len(observations.value), lines.covariance.shape[0]))
     for j in range(observations.time.shape[1]):
         design += np.einsum(
@@ -1013,7 +1018,7 @@ def _predicted(observations: Observations, lines: Lines) -> Array:
 
 
 def _good(observations: Observations, lines: Lines | None) -> NDArray[np.bool_]:
-    """Return a mask of the observations that nuisance and lines explain within the noise.
+    """Return a mask of the observations that nuisance parameters and oscillations explain within the noise.
 
     Either all or no observations of a ground point are used.
     """

@@ -1,4 +1,6 @@
-"""Planes in which CCD lines photograph at one moment (paper 000, eqs. 1-5), and their angles (eqs. 6-7).
+"""Planes in which CCD lines photograph at one moment, and their angles.
+
+The equations are (1) to (5), and for the angles (6) and (7), of paper 000 (Liu and Huang 2014).
 
 **Plane.** The station O and the n >= 3 ground points of the strip that one line sees lie in one plane except for their
 errors. Three fits have the same interface:
@@ -67,11 +69,11 @@ one counts as singular.
 
 
 class PlaneError(MeasurementError, ValueError):
-    """Points that do not determine the plane, or not in the requested form."""
+    """Error raised for points that do not determine a plane, or not in the requested form."""
 
 
 class NearVerticalWarning(UserWarning):
-    """Plane that is so steep in its frame that z = a0 x + a1 y + a2 is biased."""
+    """Warning that a plane is so steep in its frame that the fit of z = a0 x + a1 y + a2 is biased."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,7 +115,7 @@ class Station:
 
 @dataclass(frozen=True, eq=False)
 class Strip:
-    """Ground points that one CCD line sees at one moment; errors of different points are independent.
+    """Ground points, n of them, that one CCD line sees at one moment; errors of different points are independent.
 
     Attributes
     ----------
@@ -133,7 +135,7 @@ class Strip:
         Parameters
         ----------
         points : (n, 3) array_like
-            Coordinates, in metres.
+            Coordinates of the n points, in metres.
         noise : float, (n,), (3, 3) or (n, 3, 3) array_like
             Standard deviation of each coordinate in metres, or the covariance in m^2.
 
@@ -161,7 +163,8 @@ class PlaneFit:
     Attributes
     ----------
     method : {'printed', 'corrected', 'tls'}
-        Method of the fit; see the module.
+        Method of the fit: equation 5 of paper 000 (Liu and Huang 2014) as printed or with the corrected sign, or total
+        least squares.
     station : Station
         Station that the plane contains.
     strip : Strip
@@ -198,7 +201,7 @@ class PlaneFit:
 
     @property
     def degrees_of_freedom(self) -> int:
-        """Degrees of freedom of the residuals."""
+        """Degrees of freedom of the residuals of n points: n - 2."""
         return len(self.residual) - 2
 
     @property
@@ -253,8 +256,8 @@ class PlaneFit:
 def fit_plane(station: Station, strip: Strip, method: Method = "tls") -> PlaneFit:
     """Fit a plane through the station to the ground points of one CCD line.
 
-    The methods are total least squares (tls) and z = a0 x + a1 y + a2 by the paper's eq. 5, with the printed or the
-    corrected sign.
+    The methods are total least squares (tls) and z = a0 x + a1 y + a2 by eq. 5 of paper 000 (Liu and Huang 2014), with
+    the printed or the corrected sign.
 
     Raises
     ------
@@ -284,7 +287,10 @@ def fit_plane(station: Station, strip: Strip, method: Method = "tls") -> PlaneFi
 
 
 def _explicit(station: Station, strip: Strip, arm: Array, method: Method) -> PlaneFit:
-    """Fit the plane by eqs. 1 and 5, with the printed or the right sign."""
+    """Fit the plane z = a0 x + a1 y + a2 by eqs. 1 and 5 of paper 000 (Liu and Huang 2014).
+
+    ``method`` selects the sign of eq. 5: "printed", as in the paper, which is a misprint, or "corrected".
+    """
     flat = arm[:, :2]
     matrix = flat.T @ flat
     condition = float(np.linalg.cond(matrix))
@@ -399,14 +405,14 @@ class _DistanceNoise:
         return cls(own, float(normal @ station.covariance @ normal))
 
     def weighted(self, rows: Array) -> Array:
-        """Return the inverse covariance of the n distances times a vector (n,) or matrix (n, k)."""
+        """Return the inverse covariance of the n distances times a vector (n,) or k columns (n, k)."""
         weight = 1.0 / self.own
         scaled = (rows.T * weight).T
         ratio = self.shared / (1.0 + self.shared * weight.sum())
         return np.asarray(scaled - ratio * np.multiply.outer(weight, scaled.sum(axis=0)))
 
     def white(self, rows: Array) -> Array:
-        """Return a matrix (n, k) whitened by the symmetric root of the inverse covariance of the n distances."""
+        """Return k columns, (n, k), whitened by the symmetric root of the inverse covariance of the n distances."""
         unit = self.own**-0.5
         total = float(unit @ unit)
         scaled = rows * unit[:, None]
@@ -464,7 +470,7 @@ _FOLDED = 3.0
 
 
 class AngleError(MeasurementError, ValueError):
-    """Planes or rays that determine no angle."""
+    """Error raised for planes or rays that determine no angle."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -476,7 +482,7 @@ class PlaneAngles:
     values : (m,) ndarray
         Acute angles by atan2, in radians.
     printed : (m,) ndarray
-        Acute angles by the paper's arccos, in radians.
+        Acute angles by the arccos of paper 000 (Liu and Huang 2014), in radians.
     covariance : (m, m) ndarray
         Covariance from points and station, in rad^2.
     gradient : (m, k, 3) ndarray
@@ -493,7 +499,7 @@ class PlaneAngles:
 
     @property
     def sigma(self) -> Array:
-        """Standard deviation (m,) of the angles, in radians."""
+        """Standard deviations of the m angles, (m,), in radians."""
         return np.asarray(np.sqrt(np.diag(self.covariance)))
 
 
@@ -679,8 +685,8 @@ def line_frame(plane: PlaneFit, tangent: ArrayLike, bend: float = 0.0) -> LineFr
     plane : PlaneFit
         Plane fitted to the line's points; not the printed one.
     tangent : (n,) array_like
-        Tangent of the angle of each point from the line of sight along the CCD line, from its pixel number and the
-        interior orientation; either sense of counting.
+        Tangent of the angle of each of the plane's n points from the line of sight along the CCD line, from its pixel
+        number and the interior orientation; either sense of counting.
     bend : float
         Standard deviation, in radians, by which the ends of a line that was straight in the laboratory may have bent
         out of its plane since. The bend is estimated with this sigma as its prior, and the central ray follows it. 0:
@@ -708,7 +714,8 @@ def line_frame(plane: PlaneFit, tangent: ArrayLike, bend: float = 0.0) -> LineFr
     slope = float(spread @ (measured - measured.mean()) / (spread @ spread)) if np.any(spread) else 0.0
     if abs(abs(slope) - 1.0) > 0.1:
         raise AngleError(
-            f"central ray: the points subtend {abs(slope):.3g} times the angle of their tangents; are these wrong?"
+            f"central ray: the angle between the points from their coordinates is {abs(slope):.3g} times that from the"
+            " given tangents (1 is expected); check the tangents"
         )
     # the sigma of a point's angle is its sigma over its distance
     weight = np.sum(arm**2, axis=1) / np.trace(strip.covariance, axis1=1, axis2=2)
@@ -752,7 +759,7 @@ class AlongTrackAngles:
 
     @property
     def sigma(self) -> Array:
-        """Standard deviation (m,) of the angles, in radians."""
+        """Standard deviations of the m angles, (m,), in radians."""
         return np.asarray(np.sqrt(np.diag(self.covariance)))
 
 
@@ -920,7 +927,7 @@ def sensitivity(
     method : {'printed', 'corrected', 'tls'}
         Method of the plane fit.
     amounts : (k,) array_like, optional
-        Displacements, in metres, rising from 0; 0 to 10 m in steps of 1 m by default.
+        Displacements, k of them, in metres, rising from 0; 0 to 10 m in steps of 1 m by default.
 
     Raises
     ------

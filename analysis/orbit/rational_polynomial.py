@@ -19,7 +19,7 @@ from analysis.arrays import Array, UndeterminedError
 from optics.numerics.backend import one_blas_thread
 
 TERMS = 20
-"""Number of coefficients of a cubic in three coordinates."""
+"""Number of coefficients of a cubic polynomial in three coordinates."""
 _POWERS = np.array(
     [
         *((0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1), (1, 1, 0), (1, 0, 1), (0, 1, 1), (2, 0, 0), (0, 2, 0), (0, 0, 2)),
@@ -124,7 +124,7 @@ class RationalPolynomial:
         return self.offset[0] + self.scale[0] * line, self.offset[1] + self.scale[1] * sample
 
     def text(self) -> str:
-        """Return the contents of NAME_RPC.TXT, which GDAL reads beside NAME.tif."""
+        """Return the polynomials as the text of a file NAME_RPC.TXT, which GDAL reads beside NAME.tif."""
         names = (("LINE", "pixels"), ("SAMP", "pixels"), ("LAT", "degrees"), ("LONG", "degrees"), ("HEIGHT", "meters"))
         errors = (("ERR_BIAS", self.bias_m), ("ERR_RAND", self.random_m))
         rows = [f"{name}: {value!r} meters" for name, value in errors if value is not None]
@@ -164,11 +164,12 @@ def fit_rpc(
     Parameters
     ----------
     image : (N, 2) array_like
-        Line and sample, in pixels; the centre of the first pixel is (0, 0).
+        Line and sample of N points, in pixels; the centre of the first pixel is (0, 0).
     ground : (N, 3) array_like
         Latitude and longitude (degrees) and height above the ellipsoid (metres). The points must cover several heights.
     check : tuple of (M, 2) and (M, 3) array_like, optional
-        Image and ground coordinates of check points between the others. By default every fourth point is a check point.
+        Image and ground coordinates of M check points between the others. By default every fourth point is a check
+        point.
 
     Returns
     -------
@@ -235,7 +236,7 @@ def fit_rpc(
 
 
 def _checked_points(image: ArrayLike, ground: ArrayLike) -> Array:
-    """Return image and ground coordinates side by side, (N, 5).
+    """Return image (line, sample) and ground coordinates of N points side by side, (N, 5).
 
     Raises
     ------
@@ -284,7 +285,7 @@ def _best(
 
 @one_blas_thread()
 def _ratio(basis: Array, value: Array, damping: float) -> tuple[Array, Array]:
-    """Return numerator (20,) and denominator (20,), whose first coefficient is 1, of the ratio that fits values (N,).
+    """Return numerator (20,) and denominator (20,), whose first coefficient is 1, of the ratio that fits N values.
 
     The ratio is fitted by iterated linear least squares, weighted with the inverse of the previous denominator.
     `damping` regularises the coefficients of the denominator.

@@ -1,9 +1,9 @@
 """Space resection of a camera of two or more lines: attitude and angles from one moment's ground points together.
 
-This is the photogrammetric method that paper 000 compares its planes with. Each point p has a position on its CCD line,
-hence a known direction in the line's frame, (tx, ty, 1) up to length: X flight direction, Y along the line, Z toward
-the scene. Line k is mounted in the body at the look angle look_k, a rotation about the body's Y, positive forward; that
-of one line, the reference, is zero. Its projection centre is at c_k in the line's frame:
+This is the photogrammetric method that paper 000 (Liu and Huang 2014) compares its planes with. Each point p has a
+position on its CCD line, hence a known direction in the line's frame, (tx, ty, 1) up to length: X flight direction, Y
+along the line, Z toward the scene. Line k is mounted in the body at the look angle look_k, a rotation about the body's
+Y, positive forward; that of one line, the reference, is zero. Its projection centre is at c_k in the line's frame:
 
     (tx, ty, 1) ~ Ry(look_k)^T R^T (p - O) - c_k.
 
@@ -45,7 +45,7 @@ _CONVERGED = 1e-6
 
 
 class ResectionError(MeasurementError, ValueError):
-    """Points that do not determine the unknowns.
+    """Error raised for points that do not determine the unknowns of a resection.
 
     Attributes
     ----------
@@ -181,7 +181,7 @@ class Resection:
         return dict(zip(self.names, (float(s) for s in np.sqrt(np.diag(self.covariance))), strict=True))
 
     def angles(self, pairs: Sequence[tuple[str, str]]) -> Array:
-        """Return the (m,) look angles of the first minus the second line of each pair, in radians.
+        """Return the look angles of the first minus the second line of each of m pairs, (m,), in radians.
 
         Raises
         ------
@@ -192,7 +192,7 @@ class Resection:
         return np.array([self.looks[a] - self.looks[b] for a, b in pairs])
 
     def angle_covariance(self, pairs: Sequence[tuple[str, str]]) -> Array:
-        """Return the (m, m) covariance of `angles`, in rad^2.
+        """Return the covariance of the differences of look angles of m pairs of lines (`angles`), (m, m), in rad^2.
 
         Raises
         ------

@@ -1,4 +1,4 @@
-"""Rigorous model of a three-line camera in orbit (paper 003): collinearity at the exposure time.
+"""Rigorous model of a three-line camera in orbit (paper 003, Mo et al. 2015): collinearity at the exposure time.
 
     ground = station + offset + R_body R_bias (position + scale R_camera l),
 
@@ -175,7 +175,7 @@ class LineModel:
         Parameters
         ----------
         body : (n, 3) ndarray
-            Ground points from the body's origin, in its true axes, in metres.
+            Ground points, n of them, from the body's origin, in its true axes, in metres.
         image : (n, 2) ndarray
             x and y in the focal plane, in metres.
 
@@ -204,12 +204,12 @@ class LineModel:
 
     @cached_property
     def _turned(self) -> Array:
-        """Rotation Rx(d_beta) Ry(d_alpha) Rz(d_gamma) of the drift."""
+        """Rotation matrix (3, 3) of the camera's drift: Rx(d_beta) Ry(d_alpha) Rz(d_gamma)."""
         return bias_rotation(self._turns)
 
     @cached_property
     def _turned_slopes(self) -> tuple[Array, ...]:
-        """Derivatives of the drift's rotation with respect to d_alpha, d_beta, d_gamma."""
+        """Derivatives of the drift's rotation matrix with respect to d_alpha, d_beta, d_gamma, per radian."""
         slopes = _rotation_slopes(self._turns)
         return tuple(slopes[axis] for axis in _DRIFT_AXIS)
 
@@ -223,7 +223,7 @@ class LineModel:
 
 @dataclass(frozen=True, eq=False)
 class Seen:
-    """Collinearity misclosures of image points, with derivatives with respect to ground points and camera drift.
+    """Collinearity misclosures of n image points, with derivatives with respect to ground points and camera drift.
 
     Attributes
     ----------
@@ -323,7 +323,7 @@ class Rays:
         return cls(which.astype(np.intp), images, stations, attitudes, None if time is None else times)
 
     def taken(self, keep: ArrayLike) -> Rays:
-        """Return the rays that a mask or an index selects."""
+        """Return the rays that a boolean mask or an array of indices selects."""
         where = np.asarray(keep)
         time, spread = (None if v is None else v[where] for v in (self.time, self.spread))
         return Rays(self.point[where], self.image[where], self.station[where], self.attitude[where], time, spread)
@@ -459,7 +459,7 @@ def _axis_rotation(axis: int, angle: float | complex) -> np.ndarray:
 
 
 def _axis_rotation_slope(axis: int, angle: float) -> Array:
-    """Return the derivative of `_axis_rotation` with respect to the angle."""
+    """Return the derivative of the rotation about a coordinate axis with respect to its angle, (3, 3), 1/rad."""
     slope = _axis_rotation(axis, angle + 0.5 * np.pi)
     slope[axis, axis] = 0.0
     return slope

@@ -79,17 +79,17 @@ TERMS = tuple(_POWER)
 _WIDEST = np.pi / 4
 """Largest plausible angle, in radians: line cameras see a few degrees, and larger values are probably in degrees."""
 _SINGULAR = 1e-9
-"""Smallest determinant of the normal equations of eq. (2), relative to the product of their diagonal elements; a
-determinant of 1e-9 leaves six correct digits.
+"""Smallest determinant of the normal equations of eq. (2) of paper 004 (Li et al. 2020), relative to the product of
+their diagonal elements; a determinant of 1e-9 leaves six correct digits.
 """
 
 
 class OrientationError(MeasurementError, ValueError):
-    """Error for readings that do not determine the requested quantities; the message says what to change."""
+    """Error raised for readings that do not determine the requested quantities; the message says what to change."""
 
 
 def readings(position: ArrayLike, angle: ArrayLike) -> tuple[Array, Array]:
-    """Return validated image positions (metres) and angles (radians) as float64 arrays of one shape (..., N).
+    """Return validated image positions (metres) and angles (radians) of N points as float64 arrays (..., N).
 
     Raises
     ------
@@ -128,7 +128,9 @@ def readings(position: ArrayLike, angle: ArrayLike) -> tuple[Array, Array]:
 def distortion(
     position: ArrayLike, angle: ArrayLike, principal_distance: ArrayLike, principal_point: ArrayLike = 0.0
 ) -> Array:
-    """Return the distortion of each of N points, in metres: D = L - f tan W + p tan^2 W (paper 004, eq. 1).
+    """Return the distortion of each of N points, in metres: D = L - f tan W + p tan^2 W.
+
+    The equation is (1) of paper 004 (Li et al. 2020).
 
     Parameters
     ----------
@@ -154,12 +156,14 @@ def distortion(
 
 
 def principal_distance_and_point(position: ArrayLike, angle: ArrayLike) -> tuple[Array, Array]:
-    """Return the principal distance f and principal point p of smallest distortion, in metres (paper 004, eq. 2).
+    """Return the principal distance f and principal point p of smallest distortion, in metres.
+
+    The equation is (2) of paper 004 (Li et al. 2020).
 
     Parameters
     ----------
     position : (..., N) array_like
-        Image positions, in metres.
+        Image positions of N points, in metres; leading axes are sets of points.
     angle : (..., N) array_like
         Angles, in radians, at least two different ones other than zero in each set.
 
@@ -187,14 +191,14 @@ def principal_distance_and_point(position: ArrayLike, angle: ArrayLike) -> tuple
 
 
 def principal_distance(position: ArrayLike, angle: ArrayLike) -> Array:
-    """Return the balanced principal distance f (...), in metres: paper 004, eq. (3).
+    """Return the balanced principal distance f (...), in metres: paper 004 (Li et al. 2020), eq. (3).
 
     It leaves the smallest distortion with p = 0.
 
     Parameters
     ----------
     position : (..., N) array_like
-        Image positions, in metres.
+        Image positions of N points, in metres; leading axes are sets of points.
     angle : (..., N) array_like
         Angles, in radians.
 
@@ -214,12 +218,14 @@ def principal_distance(position: ArrayLike, angle: ArrayLike) -> Array:
 
 
 def principal_point(position: ArrayLike, angle: ArrayLike, principal_distance: ArrayLike) -> Array:
-    """Return the principal point p (...) for a known principal distance f (...), in metres: paper 004, eq. (4).
+    """Return the principal point p (...), in metres, for a known principal distance f (...), in metres.
+
+    The equation is (4) of paper 004 (Li et al. 2020).
 
     Parameters
     ----------
     position : (..., N) array_like
-        Image positions, in metres.
+        Image positions of N points, in metres; leading axes are sets of points.
     angle : (..., N) array_like
         Angles, in radians.
     principal_distance : (...) array_like
@@ -295,7 +301,7 @@ def _check_separable(columns: Array, names: tuple[str, ...], angle: Array) -> No
     Parameters
     ----------
     columns : (N, P) ndarray
-        Columns of the design.
+        Derivatives of the positions of N points with respect to P terms.
     names : tuple of str
         Names of the terms.
     angle : (N,) ndarray
@@ -351,7 +357,7 @@ def _noise_matrix(values: ArrayLike, count: int, name: str) -> Array:
 
 
 def _noise_root(noise: Array) -> Array:
-    """Return the lower Cholesky factor of a covariance (N, N), with which errors are whitened.
+    """Return the lower Cholesky factor of the covariance of N values, (N, N), with which errors are whitened.
 
     Raises
     ------
@@ -372,7 +378,8 @@ def _noise_root(noise: Array) -> Array:
 _SIGNIFICANT = 3.0
 """Ratio to its sigma above which a principal point counts as different from zero: false-alarm rate 0.3 %."""
 POINT_TOLERANCE = 10e-6
-"""Largest sigma, in metres, of an observable principal point: about a pixel, the size that paper 004 expects of it."""
+"""Largest sigma, in metres, of an observable principal point: about a pixel, the size that paper 004 (Li et al. 2020)
+expects of it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -392,7 +399,7 @@ class PointReport:
 
 
 def _point_report(names: tuple[str, ...], values: Array, angle: Array, noise: Array) -> PointReport:
-    """Return the observability of p from a fit of these terms, or of a fit with p added.
+    """Return the observability of the principal point from a fit of given terms, or of a fit with it added.
 
     Parameters
     ----------
@@ -401,7 +408,7 @@ def _point_report(names: tuple[str, ...], values: Array, angle: Array, noise: Ar
     values : (P,) ndarray
         Values of the terms, in metres.
     angle : (N,) ndarray
-        Angles, in radians.
+        Angles of N points, in radians.
     noise : (N, N) ndarray
         Covariance of the positions, in m^2.
     """
@@ -513,13 +520,13 @@ class InteriorOrientation:
 
     @property
     def correlation(self) -> Array:
-        """Correlation matrix of the P terms, in their order."""
+        """Correlation matrix of the P fitted terms, (P, P), in the order of `terms`."""
         sigma = np.sqrt(np.diagonal(self.covariance))
         return np.asarray(self.covariance / np.outer(sigma, sigma))
 
     @property
     def residual_covariance(self) -> Array:
-        """Covariance (N, N) of the residuals, in m^2, of rank N - P."""
+        """Covariance of the residuals of N points, (N, N), in m^2; its rank is N - P for P fitted terms."""
         columns = design(self.angle, self.terms)
         left = np.eye(len(self.angle)) - columns @ gain(columns)
         return np.asarray(left @ self.noise @ left.T)
@@ -546,7 +553,7 @@ def fit_interior_orientation(
     Parameters
     ----------
     position : (N,) array_like
-        Image positions L along the line, in metres.
+        Image positions L of N points along the line, in metres.
     angle : (N,) array_like
         Angles W of the directions, in radians, counted in the same sense.
     covariance : float, (N,) or (N, N) array_like
@@ -651,7 +658,7 @@ LINE_TERMS = ("axis", "principal_distance", "principal_point", "k1")
 distortion. The last three are keys of a line in a payload file.
 """
 _STEPS = 20
-"""Largest number of Gauss-Newton steps."""
+"""Largest number of Gauss-Newton steps of the fit of the line model."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -672,7 +679,7 @@ class LineOrientation:
 
     @property
     def sigma(self) -> Array:
-        """Standard deviations of the four values, in rad, m, m, 1/m^2."""
+        """Standard deviations of axis reading (rad), principal distance (m), principal point (m) and k1 (1/m^2)."""
         return np.sqrt(np.diagonal(self.covariance))
 
 
@@ -728,7 +735,8 @@ def line_orientation(fit: InteriorOrientation) -> LineOrientation:
 
 
 CALIBRATED = ("constant", "principal_distance", "principal_point")
-"""Names of the terms that are subtracted to obtain the distortion: those of eq. (2), with a constant."""
+"""Names of the terms that are subtracted to obtain the distortion: those of eq. (2) of paper 004 (Li et al. 2020), with
+a constant."""
 SMOOTH = (*CALIBRATED, "radial3")
 """Names of the terms of the smooth model (with radial distortion), whose residuals measure the scatter of the points.
 """
@@ -770,7 +778,7 @@ def locate_spots(
     Parameters
     ----------
     frames : (N, S, frames, H, W) ndarray of uint16
-        Frames of N points in S sets.
+        Frames, H rows by W columns, of N points in S sets.
     column : (N, S) array_like
         Column of the line at which each image begins.
     middle : float
@@ -953,7 +961,7 @@ class Distortion:
 
     @property
     def sigma(self) -> Array:
-        """Standard deviation (N,) of D, in metres."""
+        """Standard deviation of the distortion of each of N points, (N,), in metres."""
         return np.sqrt(np.maximum(np.diagonal(self.fit.residual_covariance), 0.0))
 
     @property
@@ -965,7 +973,7 @@ class Distortion:
     def rms_over_sets(self) -> Array:
         """RMS of each of N points' distortion over the kept sets, each set fitted separately, in metres.
 
-        The values are named after Table 2 of paper 004.
+        The values are named after Table 2 of paper 004 (Li et al. 2020).
         """
         out = np.full(self.position.shape, np.nan)
         for s, keep in enumerate(self.means.keep.T):

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Centroid:
-    """A centroid method.
+    """Method that measures the positions of spots in mean frames.
 
     Dimensions: H rows, W columns.
 

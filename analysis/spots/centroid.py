@@ -89,7 +89,7 @@ def energy_centroid(
 def _energy(
     image: Array, frames: int, noise: NoiseModel, radius: float, border_px: int, keep_maps: bool
 ) -> SpotPositions:
-    """Return the energy centroids of a few images of a batch."""
+    """Return the energy centroids (first moments of the light) of the images of one section of a batch."""
     count, height, width = image.shape
     row, column, _, _, _ = spot_image.coarse(image, frames, noise)
     border = np.ones((height, width), dtype=bool)
@@ -171,7 +171,7 @@ def _wandered(theta: Array, row: Array, column: Array) -> NDArray[np.bool_]:
 
 
 def _gauss(image: Array, frames: int, noise: NoiseModel, radius: float, elliptical: bool) -> SpotPositions:
-    """Fit the Gaussians of a few images of a batch, each on the part of its image that the window can cover."""
+    """Fit a Gaussian to each image of one section of a batch, on the part of the image that its window can cover."""
     count, full_height, full_width = image.shape
     row, column, background, peak, area = spot_image.coarse(image, frames, noise)
     spot_image.check_edge(np.stack([row, column], axis=1), full_height, full_width, radius)

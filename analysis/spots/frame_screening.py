@@ -33,14 +33,23 @@ MOST_MOVES = 4
 """Greatest number of iterations in which a frame's movement is fitted, and in which the centroid of its light is found.
 """
 _SLOPES, _SMOOTHED = 2.0 / (8.0 * math.pi), 1.0 / (4.0 * math.pi * 1.5**2)
-"""Variance of both slopes of white noise smoothed by a Gaussian of 1 px, and variance of white noise smoothed by one of
-1.5 px, each over the variance of the white noise."""
+"""Variances of smoothed white noise, relative to the variance of the noise before smoothing.
+
+The first is that of both slopes (sum, per px^2) after a Gaussian of 1 px standard deviation, the second that of the
+values after a Gaussian of 1.5 px.
+"""
 _FAINT, _UNSURE = 0.01, 0.1
-"""Fraction of noise in the squared slopes of the median above which only pixels about the spot count, and above which a
-movement cannot be detected."""
+"""Fractions of the summed squared slopes of the median image that may be due to noise.
+
+Above the first, only pixels about the spot are used to fit movements; above the second, over these pixels, a movement
+cannot be detected.
+"""
 _LEAST_MOVED_PX, _FARTHEST_PX, _ABOUT_PX, _ALIGNED = 0.3, 12.0, 10.0, 64
-"""Median movement from which, and largest movement up to which, frames are aligned before their median is taken; radius
-of the light whose centroid gives each frame's position; number of frames of that median."""
+"""Rules for aligning moved frames before their median is taken.
+
+They are the smallest median movement and the largest movement for which frames are aligned, in pixels; the radius of
+the light whose centroid gives each frame's position, in pixels; and the number of frames of the median.
+"""
 
 
 def reliable_pixels(middle: Array, noise: NoiseModel, count: int, follows: Mask) -> Mask | None:
@@ -201,7 +210,7 @@ Released = Callable[[NDArray[Any]], None]
 _HELD = 1 << 25
 """Number of bytes of frames that are processed at a time, to limit memory."""
 GROWTH_SIGMAS = 3.5
-"""Residual, in sigmas, from which a neighbour of a transient belongs to it."""
+"""Residual, in sigmas, above which a pixel next to a transient (cosmic ray) counts as part of it."""
 _DIM = 0.5
 """Fraction of the brightest frame's light below which a frame counts as not containing the spot."""
 _UNLIKE = 0.01
@@ -213,10 +222,12 @@ _LEAST_SHARE, _UNKNOWN, _LEAST_DRIFT_DN = 1e-3, 1e12, 0.5
 _ROUNDS = 20
 """Greatest number of iterations in which the clipping limit of differences is adapted to the noise."""
 _SMALL_PX, _LARGEST_PX = 0.1, 5.0
-"""Movement, px, above which a frame is compared with the shifted reference, and the largest such movement."""
+"""Movements in pixels: above the first, a frame is compared with the shifted reference; the second is the largest."""
 _NOISE_OFF, _MOST_SIGMAS = 0.15, 4.0
-"""Tolerated relative difference between the noise of frames and the specified one; and the clipping limit of single
-differences, in standard deviations, against cosmic rays."""
+"""Tolerated relative difference between measured and specified noise, and clipping limit of differences, in sigmas.
+
+The limit excludes cosmic rays from the estimate of the noise.
+"""
 _LIT = 0.02
 """Fraction of the peak from which a pixel is illuminated, so that movement and smear look like noise there."""
 _LEAST_LEVEL_DN = 1.0
@@ -290,12 +301,12 @@ class ScreenedFrames:
 
     @property
     def clean(self) -> bool:
-        """True if no defect changed the measurement."""
+        """True if no defect of the frames changed the measurement."""
         return not any(finding.corrects for finding in self.findings)
 
 
 def _in_memory(frames: NDArray[Any]) -> None:
-    """Do nothing, for frames that are held in memory."""
+    """Do nothing: the default for `released` if the frames are in memory and no file has to be released."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -326,7 +337,7 @@ class _Stack:
 
     @classmethod
     def of(cls, frames: NDArray[Any], bad: Mask | None, released: Released, blank: bool = False) -> _Stack:
-        """Return the stack of all frames."""
+        """Return the stack of all recorded frames of one state."""
         known = np.zeros(frames.shape[1:], dtype=bool) if bad is None else bad
         return cls(frames, np.arange(len(frames)), known, released, blank)
 
@@ -335,7 +346,7 @@ class _Stack:
 
     @property
     def shape(self) -> tuple[int, int]:
-        """Number of rows and columns."""
+        """Number of rows and columns of a frame."""
         return self.frames.shape[1], self.frames.shape[2]
 
     def taken(self, numbers: NDArray[np.intp]) -> _Stack:

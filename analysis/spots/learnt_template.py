@@ -49,7 +49,11 @@ MARGIN_PX = 40
 _TAPER_PX = 4
 _CORE = 0.05
 _LOOKS, _FILLS = 3, 40
-"""Number of passes that estimate the light's band of frequencies, and iterations of filling in each."""
+"""Numbers of iterations that fill missing pixels from a band-limited image.
+
+The first is the number of estimates of the band of the light's frequencies, the second the number of fillings with
+each.
+"""
 _UNEVEN = 0.5
 """Rms of an image's slopes, in sigmas of a pixel, from which on they belong to the background.
 
@@ -134,7 +138,9 @@ class LearntTemplate:
         return _filtered(image, self.passed)
 
     def returned(self, maps: Array) -> Array:
-        """Return derivatives with respect to the pixels of the image that was learnt from, (n, H, W).
+        """Return the derivatives of n quantities with respect to the pixels of the learnt image, (n, H, W).
+
+        The learnt image is the one from which the shape was learnt.
 
         They are the given derivatives with respect to the shape's samples times the (transposed) linear operation of
         learning.
@@ -331,8 +337,8 @@ class LearntShift:
     ----------
     covariance : (2, 2) ndarray
         Covariance of the shift, px^2.
-    lean : (2,) ndarray
-        Bias of the shift, px, by which the fit leans towards positions half way between pixels; its square is in the
+    fit_bias : (2,) ndarray
+        Bias of the shift, px: the fit is drawn towards positions half way between pixels; its square is in the
         covariance.
     parts : tuple of NoiseParts
         Noise of the images before and after, for the covariance of several shifts against the same image before. The
@@ -397,10 +403,10 @@ def _shape_of(learnt: LearntTemplate, spot: FittedSpot) -> SpotTemplate:
 
 
 def _by_image(learnt: LearntTemplate, spot: FittedSpot, maps: Array) -> Array:
-    """Return the derivatives of quantities of a state with respect to the image before, by way of the learnt shape.
+    """Return the derivatives of a position with respect to the image that the shape was learnt from, (2, H, W).
 
-    The result has the shape (2, H, W); ``maps`` are the derivatives of these two quantities with respect to the state's
-    image.
+    That image acts on the position through the shape in the fitted model. ``maps`` are the derivatives of the
+    position's row and column with respect to the model.
 
     Dimensions: H rows, W columns.
     """
@@ -414,9 +420,10 @@ def _by_image(learnt: LearntTemplate, spot: FittedSpot, maps: Array) -> Array:
 def _second_order(
     learnt: LearntTemplate, before: FittedSpot, after: FittedSpot, noise: NoiseModel
 ) -> tuple[Array, Array]:
-    """Return the second-order effects of the shape's noise on a fit: the factor of its response and its bias.
+    """Return the second-order effects of the shape's noise on a fit: the factor on its response, and its bias.
 
-    The factor is the matrix (2, 2) by which the fit responds more than its normal matrix says; the bias is (2,) px.
+    The factor is a matrix (2, 2): ratio of the fit's response to image noise to that which its normal matrix predicts.
+    The bias is (2,) px.
     """
     ratio = float(after.positions.flux[0]) / learnt.light
     # kernel of the pixel at the spot's centre
@@ -468,7 +475,10 @@ def _kernel(learnt: LearntTemplate, before: FittedSpot, after: FittedSpot, pixel
 def _shared(
     slopes: Array, weight: Array, before: FittedSpot, after: FittedSpot, noise: NoiseModel, middle: tuple[int, int]
 ) -> Array:
-    """Return the weighted covariance of model slopes and image that the common fixed pattern causes, (2,)."""
+    """Return the covariance of the model's slopes with the image's noise due to their common fixed pattern, (2,).
+
+    It is summed over the pixels with the weights of the fit.
+    """
     # the same pixels of the detector in both images
     rows, columns = (slice(max(a, b), None) for a, b in zip(before.offset, after.offset, strict=True))
     light_before = before.light[rows.start - before.offset[0] :, columns.start - before.offset[1] :]

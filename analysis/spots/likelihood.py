@@ -194,7 +194,7 @@ class _Scored:
 
 @dataclass(frozen=True, eq=False)
 class _Rule:
-    """Template, noise model and number of frames of a fit, with its iteration."""
+    """Fisher scoring of spots with one template, noise model and number of frames."""
 
     template: SpotTemplate
     noise: NoiseModel
@@ -364,7 +364,7 @@ def _step(
 
 
 def image_bound(light: ArrayLike, background: float, noise: NoiseModel, frames: int) -> Array:
-    """Return the Cramer-Rao bound of the positions of spots given due to noise-free images, (B, 2, 2) px^2.
+    """Return the Cramer-Rao bound of the positions of spots that noise-free images show, (B, 2, 2) px^2.
 
     Dimensions: B spots, H rows, W columns.
 
@@ -421,9 +421,9 @@ class FitStates(StateArrays):
     whole, core : ndarray
         Reduced chi-squares of all pixels and of the core's; NaN where no shape was fitted.
     whole_limit, core_limit : ndarray
-        Limits of these; infinite where no shape was fitted.
+        Limits of these chi-squares; infinite where no shape was fitted.
     whole_sigma, core_sigma : ndarray
-        Standard deviations of these due to the noise of the frames.
+        Standard deviations of these chi-squares due to the noise of the frames.
     noise : ndarray
         Squared ratio of the frames' noise to the specified one, from the median of all pixels.
     """

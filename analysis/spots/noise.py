@@ -47,12 +47,18 @@ ROUNDING_VARIANCE = 1.0 / 12.0
 FINE = 1.0
 """Rms of normal noise, DN, from which the rounding error is new in every frame: the systematic part is 4e-19 DN^2."""
 COARSE, FEW = 0.3, 3.0
-"""Noise, DN, at a light signal, DN, below which rings and wings of a spot show the steps of grey values in all frames:
-the rounding error is then correlated between neighbouring pixels, which `systematic_variance` does not model."""
+"""RMS noise, DN, below which rounding errors are correlated, and the light signal, DN, at which it is computed.
+
+Rings and wings of a spot then show the same steps of grey values in all frames, and the rounding error is correlated
+between neighbouring pixels, which `systematic_variance` does not model.
+"""
 MEASURABLE = 0.4
 """Rms noise, DN, from which the variance of grey values gives the noise to a tenth at any level between two steps."""
 _TERMS, _NOTHING = 60, 1e-12
-"""Greatest number of harmonics, and the square of phi below which they are neglected."""
+"""Largest number of harmonics of the rounding error, and size below which they are neglected.
+
+The size is the square of the noise's characteristic function at the harmonic.
+"""
 
 
 def systematic_variance(electrons: ArrayLike, read_e2: ArrayLike, gain: float) -> Any:
@@ -244,7 +250,7 @@ class NoiseModel:
 
     @property
     def dsnu_variance_dn2(self) -> float:
-        """Variance of the fixed additive patterns, DN^2."""
+        """Variance over pixels of the fixed patterns that do not depend on the light, DN^2."""
         further = sum(term.fixed_variance_e2 for term in self.further)
         return (self.gain_dn_per_e * self.dsnu_e) ** 2 + self.gain_dn_per_e**2 * further
 

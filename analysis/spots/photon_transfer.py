@@ -25,9 +25,9 @@ from analysis.statistics import robust_sigma
 
 _HOT_SIGMAS = 10.0
 _RESPONSE = (0.5, 1.5)
-"""Range of the response of a usable pixel, relative to that of the others."""
+"""Smallest and largest response to light of a usable pixel, relative to that of the other pixels."""
 _NOTHING = 1e-12
-"""Variance of rounding, DN^2, below which its uncertainty is neglected."""
+"""Variance of the rounding error, DN^2, below which its uncertainty is neglected."""
 _LEAST_LIGHT = 10.0
 """Smallest level of flat over dark frames, in sigmas of a pixel of one dark frame, that counts as light."""
 

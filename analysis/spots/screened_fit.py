@@ -38,7 +38,7 @@ _FLUX_SIGMAS = 5.0
 _MOST_SMEAR = 25.0
 """Largest second moment of a smear, px^2; a spot that is smeared by more is rejected as another one."""
 CORE_SHARE = 0.02
-"""Fraction of the peak above which the shape of the spot is tested."""
+"""Fraction of the peak above which pixels belong to the core, where the shape of the spot is tested."""
 
 
 @dataclass(frozen=True)
@@ -313,10 +313,10 @@ def fit_screened(
 
 
 def model_parts(fit: ScreenedFit, template: SpotTemplate) -> tuple[Array, Array, Array]:
-    """Return what a fitted image consists of: its derivatives, its part that is not the spot, and that part's ones.
+    """Return the derivatives of a fitted image, its part that is not the spot, and the derivatives of that part.
 
     The arrays are the derivatives (K, P) of all pixels with respect to all parameters; the part (P,), DN, that is
-    neither the spot nor its level; and the derivatives (K, P) of that part.
+    neither the spot nor the level of the background; and the derivatives (K, P) of that part.
 
     Dimensions: K fitted parameters, P pixels.
 
@@ -341,7 +341,7 @@ def _variance(level: Array, counts: Array, noise: NoiseModel) -> Array:
 
 
 def _cost(design: Array, level: Array, frames: float, noise: NoiseModel, covariance: Array) -> float:
-    """Return by which fraction the position's sigma exceeds that from an undisturbed image."""
+    """Return the relative increase of the position's sigma over that from an image without defects."""
     weighted = design / _variance(level, np.full_like(level, frames), noise)
     ideal = np.linalg.inv(weighted @ design.T)[:2, :2]
     return float(np.sqrt(np.trace(covariance) / np.trace(ideal)) - 1.0)
@@ -377,7 +377,7 @@ class _Model:
 
     @property
     def _others(self) -> int:
-        """Index of the first parameter of the further spots."""
+        """Index, among all parameters, of the first parameter of the further spots."""
         return 4 + self._slopes
 
     @property
@@ -392,7 +392,7 @@ class _Model:
         return theta
 
     def started_from(self, near: ScreenedFit) -> Array:
-        """Return start parameters from another fit; terms that it lacks start anew."""
+        """Return start parameters from an earlier fit; terms that it lacks start at their default values."""
         p = near.positions
         theta = self.first((float(p.row[0]), float(p.column[0])), float(p.flux[0]), float(p.background[0]))
         for k, (row, column, share) in enumerate(near.others[: len(self.terms.others)]):
@@ -402,9 +402,9 @@ class _Model:
         return theta
 
     def signed(self, theta: Array, flat: Array, use: Mask, known: int) -> Array:
-        """Return the parameters with the light of new further spots estimated, which may be positive or negative.
+        """Return the parameters with start values for the light of newly added further spots, positive or negative.
 
-        New are all further spots but the first ``known``.
+        All further spots but the first ``known`` are new.
         """
         for light in range(self._others + 3 * known + 2, self._smear, 3):
             theta[light] = 0.0
@@ -439,7 +439,7 @@ class _Model:
         return [0, 1, *(self._others + 3 * k + axis for k in range(len(self.terms.others)) for axis in (0, 1))]
 
     def rests(self, change: Array, inverse: Array) -> bool:
-        """Return True if an iteration step has changed the positions by less than their tolerance."""
+        """Return True if the last iteration step has changed all positions by less than their tolerance."""
         others = self._places[2:]
         sigma = np.sqrt(np.maximum(np.diag(inverse)[others], 0.0))
         return bool(
@@ -512,7 +512,7 @@ class _Model:
         return theta[indices] * scale, np.sqrt(np.diag(inverse)[indices]) * scale
 
     def smear_of(self, theta: Array) -> Array:
-        """Return the second moments of the smear, (2, 2) px^2."""
+        """Return the fitted second moments of the smear along rows and columns, (2, 2) px^2."""
         if not self.terms.smear:
             return np.zeros((2, 2))
         a = theta[self._smear :]

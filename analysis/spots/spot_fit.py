@@ -15,7 +15,7 @@ from analysis.spots.noise import NoiseModel
 from analysis.spots.spot_template import SpotTemplate
 
 METHODS = ("gaussian", "energy", "ml")
-"""Methods of `fit_spot`, by their names in `analysis.spots.CENTROIDS`."""
+"""Names of the centroid methods that `fit_spot` offers, out of `analysis.spots.CENTROIDS`."""
 
 
 @dataclass(frozen=True, eq=False)

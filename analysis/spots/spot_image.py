@@ -348,8 +348,8 @@ def template_model(
     template : SpotTemplate
         Shapes of the spots.
     part : tuple or None
-        First pixels (B, 2), one for each spot, and shape (h, w) of the part of the detector to compute; None for all of
-        it.
+        First pixels (B, 2), one for each spot, and number of rows h and columns w of the part of the detector to
+        compute; None for all of it.
     out : ndarray or None
         Array (B, 4, P) that receives the derivatives; None to make a new one.
     """

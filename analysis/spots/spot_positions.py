@@ -236,7 +236,7 @@ class SeriesNoise:
 
     @property
     def images(self) -> int:
-        """Number of images that have been added."""
+        """Number of images that have been added to the series."""
         return len(self._rows)
 
     def add(self, after: NoiseParts) -> None:

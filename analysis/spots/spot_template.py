@@ -118,7 +118,7 @@ class SpotTemplate:
         background: float = 0.0,
         tolerance: float = 1e-8,
     ) -> SpotTemplate:
-        """Calibrate a shape from one image.
+        """Make the template of a spot's shape from one image of the spot.
 
         Dimensions: M rows of template samples, N columns of template samples.
 
@@ -215,7 +215,7 @@ class SpotTemplate:
 
     @property
     def count(self) -> int:
-        """Number T of shapes held."""
+        """Number T of spot shapes in the template."""
         return int(self.centre.shape[0])
 
     @property
@@ -262,8 +262,8 @@ class SpotTemplate:
         index : (B,) ndarray of int or None
             Index of each spot's shape; default: spot b has shape b modulo T.
         part : tuple or None
-            First pixels (B, 2), one for each spot, and shape (h, w) of the part of the detector to evaluate; default:
-            all of it.
+            First pixels (B, 2), one for each spot, and number of rows h and columns w of the part of the detector to
+            evaluate; default: all of it.
 
         Raises
         ------
@@ -304,8 +304,8 @@ class SpotTemplate:
         index : (B,) ndarray of int
             Index of each spot's shape in the template.
         part : tuple or None
-            First pixels (B, 2), one for each spot, and shape (h, w) of the part of the detector to compute; None for
-            all of it.
+            First pixels (B, 2), one for each spot, and number of rows h and columns w of the part of the detector to
+            compute; None for all of it.
 
         Raises
         ------

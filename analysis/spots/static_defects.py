@@ -95,9 +95,9 @@ def repaired_centroid(
 CLOSER = 4.5
 """Residual, in sigmas of a pixel, above which it is excluded from an image that is known to contain defects."""
 MOST_OTHERS = 3
-"""Greatest number of reflections that are fitted."""
+"""Greatest number of further spots (reflections) that are fitted in one image."""
 NEAREST_PX = 4.0
-"""Distance, px, below which a further light is not distinguished from the spot."""
+"""Distance, px, below which a second source of light is not distinguished from the spot."""
 _REACH = 2
 _MISFIT = 0.05
 """Allowed error of the prediction of a residual from those around it, relative to the residual."""
@@ -113,7 +113,7 @@ _ABOVE_RING = 6.0
 _EDGE_LIGHT_PX = 12.0
 """Radius, px, of the area that is excluded about a light to which the shape cannot be fitted."""
 _LEAST_SHARE = 5.0
-"""Significance, in sigmas, below which a further spot is dropped."""
+"""Significance, in sigmas, below which a further spot (reflection) is dropped from the fit."""
 _ROUNDS = 8
 _GROSS = 4.0
 """Factor by which a pixel's limit for exclusion is increased while smear is not fitted yet."""
@@ -412,9 +412,9 @@ def _uneven(fitted: _Fit, mean: Array, good: Mask, terms: FitTerms, fit: Screene
 
 
 def _spread(terms: FitTerms) -> float:
-    """Return the factor by which the noise in what a smooth background term explains exceeds that of one image.
+    """Return the factor on the variance that noise gives a fitted smooth background term.
 
-    It is larger than 1 for a learnt shape, which contains the noise of another image.
+    It is 1 for a noise-free shape and 2 for a learnt one, which contains the noise of another image.
     """
     return 2.0 if terms.learnt else 1.0
 
@@ -450,7 +450,7 @@ def _others(
 
 
 def _needed_spots(fitted: _Fit, good: Mask, terms: FitTerms, fit: ScreenedFit) -> tuple[FitTerms, ScreenedFit]:
-    """Drop further spots that are no longer significant."""
+    """Fit again without those further spots (reflections) that are no longer significant."""
     share = np.abs(fit.others[:, 2]) if terms.learnt else fit.others[:, 2]
     bright = share > _LEAST_SHARE * fit.others_sigma[:, 2]
     if np.all(bright):

@@ -1,1 +1,1 @@
-"""Dividing error of a turntable: repeated comparisons, outliers, fits and compensation (paper 004)."""
+"""Dividing error of a turntable (paper 004, Li et al. 2020): comparisons, outliers, fits and compensation."""

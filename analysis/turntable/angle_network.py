@@ -1,4 +1,4 @@
-"""Back-propagation network of paper 004 (section 3.3) as a curve fit with one hidden layer of tanh.
+"""Back-propagation network of paper 004 (Li et al. 2020, section 3.3) as a fit with one hidden layer of tanh.
 
 One angle goes in, one value comes out.
 
@@ -21,8 +21,10 @@ Curve = Callable[[Array], Array]
 
 HIDDEN, RESTARTS = 20, 4
 DECAY, GAIN = 1e-2, 5.0
-"""Weight decay, and the standard deviation to which angles are scaled: steep enough starts for a curve with many turns.
-Chosen on simulated turntables, seeds 0 to 3 of a model like that of scenes/lab/turntable.yaml.
+"""Weight decay of the network, and standard deviation to which its input angles are scaled.
+
+The scale makes the network's initial curves steep enough for an error with many turns. Both were chosen on simulated
+turntables, seeds 0 to 3 of a model like that of scenes/lab/turntable.yaml.
 """
 FLATTEST = 0.1
 """Smallest curvature of the network's loss, in units of the decay, that its linearisation uses. Between 0.1 and 1 the
@@ -32,7 +34,7 @@ MOST_ITERATIONS, TOLERANCE = 8000, 1e-4
 
 
 class NotConvergedError(MeasurementError, RuntimeError):
-    """Network of which no training converged."""
+    """Error raised if no training of the network converged."""
 
 
 def network(x: Array, y: Array, s: Array, seed: int) -> tuple[dict[str, float], Curve, Curve]:
@@ -94,7 +96,7 @@ def network(x: Array, y: Array, s: Array, seed: int) -> tuple[dict[str, float], 
         )
 
     def curve(a: Array) -> Array:
-        """Return the mean prediction of the networks at angles."""
+        """Return the mean of the trained networks' predictions at given angles."""
         return mean + scale_of_values * np.mean([net.predict(scale * (a[:, None] - middle)) for net in nets], axis=0)
 
     solves = [response(net, scale * (x - middle), (y - mean) / scale_of_values, weight) for net in nets]

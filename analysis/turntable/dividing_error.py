@@ -4,7 +4,7 @@ Sign, everywhere: **dividing error = reading - true angle**, e(R) = R - phi. A c
 
 The table is stopped at a set of readings; at each of them a reference (indexed polygon and autocollimator) gives the
 true angle, so that every comparison gives e(R) + the error of the reference at that position + noise. The comparisons
-are repeated (paper 004, section 3.3).
+are repeated (paper 004, Li et al. 2020, section 3.3).
 
 1. `CalibrationSeries`: gross errors are rejected by Chauvenet's criterion; mean, RMS of the repeats before and after,
    sigma.
@@ -66,7 +66,7 @@ SMOOTHINGS = (0.0, *np.logspace(-8.0, 1.0, 46))
 one.
 """
 SLACK = 1e-9
-"""Tolerance, in radians, within which an angle equals that of a point."""
+"""Tolerance, in radians, within which an angle counts as equal to that of a fitted point."""
 GAP_ORDER = {"piecewise_linear": 2, "polynomial": 0, "cubic_spline": 4, "fourier": 0, "network": 0}
 """Exponent p with which the error of a fit between points, h apart, decreases as h^p for a smooth curve: 2 and 4 for
 the local fits. The error of the others is due to missing terms and does not depend on the step (0).
@@ -186,7 +186,7 @@ class CrossValidation:
 
     @property
     def excess(self) -> float:
-        """Mean square of the residuals beyond the noise, at least zero."""
+        """Mean square of the prediction errors minus that expected from noise, at least zero."""
         return max(0.0, float(np.mean(self.residual**2 - self.variance)))
 
 
@@ -199,7 +199,7 @@ def widest_step(angle: ArrayLike) -> float:
     Parameters
     ----------
     angle : (N,) array_like
-        Points of the fit, increasing, in radians.
+        Angles of the N points of the fit, increasing, in radians.
     """
     x = np.asarray(angle, np.float64)
     bridged = x[2:] - x[:-2]
@@ -219,7 +219,7 @@ def fit_dividing_error(
     Parameters
     ----------
     angle : (N,) array_like
-        Angles, in radians, increasing.
+        Angles of N points, in radians, increasing.
     value : (N,) array_like
         Dividing error (reading minus true angle) at these angles, in any unit.
     sigma : float or (N,) array_like
@@ -288,7 +288,7 @@ def cross_validate(
     name : str
         Name of the fit.
     angle : (N,) array_like
-        Angles of the points, in radians.
+        Angles of the N points, in radians.
     value : (N,) array_like
         Values of the points.
     sigma : float or (N,) array_like
@@ -332,7 +332,7 @@ def angles_left(count: int, folds: int) -> int:
 
 
 def _points(name: str, angle: ArrayLike, value: ArrayLike, sigma: ArrayLike) -> tuple[Array, Array, Array]:
-    """Return validated angles, values and sigmas as arrays (N,)."""
+    """Return validated angles, values and sigmas of N points as arrays (N,)."""
     x, y = np.asarray(angle, np.float64), np.asarray(value, np.float64)
     if x.ndim != 1 or y.shape != x.shape:
         raise ValueError(f"{name}: angles and values must be (N,) and of equal shape, found {x.shape} and {y.shape}")
@@ -471,7 +471,7 @@ FITS: Mapping[str, Callable[[Array, Array, Array, int], _FitResult]] = {
     "fourier": _fourier,
     "network": network,
 }
-"""Functions that fit each kind of curve, by its name."""
+"""Functions that fit a curve to a dividing error, by the name of the kind of curve."""
 
 
 FEWEST = 3
@@ -496,7 +496,7 @@ def chauvenet(readings: ArrayLike, present: NDArray[np.bool_] | None = None) -> 
     Parameters
     ----------
     readings : (..., n) array_like
-        Readings, in any unit; the last axis holds the repeats of one quantity.
+        Readings, in any unit; the last axis holds the n repeats of one quantity.
     present : (..., n) ndarray of bool, optional
         Readings that were taken, if quantities have different numbers of repeats; the others may hold any finite
         number.
@@ -543,7 +543,7 @@ def rejection_rate(n: int) -> float:
 
 
 def expected_rejections(counts: NDArray[np.int64]) -> float:
-    """Return the expected number of rejections in series of normal readings with the given counts (N,)."""
+    """Return the expected number of rejections in N series of normal readings, from their lengths (N,)."""
     sizes, times = np.unique(counts, return_counts=True)
     return float(sum(rejection_rate(int(n)) * (int(n) * int(many)) for n, many in zip(sizes, times, strict=True)))
 
@@ -559,7 +559,7 @@ def normal_reduction(n: int | NDArray[np.int64]) -> float:
     Parameters
     ----------
     n : int or (N,) ndarray of int
-        Number of readings of every series, or of each of them.
+        Number of readings of every series, or of each of N series.
     """
     sizes, times = np.unique(n, return_counts=True)
     parts = [_left(int(size)) for size in sizes]
@@ -610,7 +610,7 @@ class CalibrationSeries:
     present: NDArray[np.bool_] | None = None
 
     def __post_init__(self) -> None:
-        """Raise ValueError for invalid shapes and numbers."""
+        """Raise ValueError for arrays whose shapes do not match, and for numbers that are out of range."""
         x, y = np.asarray(self.angle, np.float64), np.asarray(self.comparisons, np.float64)
         if x.ndim != 1 or y.ndim != 2 or len(y) != len(x):
             raise ValueError(f"calibration: angles (N,) and comparisons (N, repeats), found {x.shape} and {y.shape}")
@@ -631,42 +631,42 @@ class CalibrationSeries:
 
     @cached_property
     def keep(self) -> NDArray[np.bool_]:
-        """Mask (N, repeats) of the comparisons that Chauvenet's criterion keeps."""
+        """Mask of the comparisons at N readings of the table that Chauvenet's criterion keeps, (N, repeats)."""
         return chauvenet(self.comparisons, self.present)
 
     @property
     def taken(self) -> NDArray[np.bool_]:
-        """Mask (N, repeats) of the comparisons that were made."""
+        """Mask of the comparisons at N readings of the table that were made, (N, repeats)."""
         return np.ones(self.comparisons.shape, bool) if self.present is None else self.present
 
     @property
     def counts(self) -> NDArray[np.int64]:
-        """Number (N,) of comparisons of each angle."""
+        """Number of comparisons at each of N readings of the table, (N,)."""
         return np.asarray(self.taken.sum(axis=1))
 
     @property
     def repeats(self) -> int:
-        """Largest number of comparisons of an angle."""
+        """Largest number of comparisons that were made at one angle."""
         return self.comparisons.shape[1]
 
     @property
     def excluded_comparisons(self) -> NDArray[np.bool_]:
-        """Mask (N, repeats) of the comparisons that Chauvenet's criterion rejects."""
+        """Mask of the comparisons at N readings of the table that Chauvenet's criterion rejects, (N, repeats)."""
         return self.taken & ~self.keep
 
     @property
     def from_mean(self) -> Array:
-        """Comparisons minus the mean of the kept ones at their angle, (N, repeats), in radians."""
+        """Comparisons minus the mean of the kept ones at each of N angles, (N, repeats), in radians."""
         return self.comparisons - self.mean[:, None]
 
     @property
     def rejected(self) -> int:
-        """Number of rejected comparisons."""
+        """Number of comparisons that Chauvenet's criterion rejects."""
         return int(np.sum(self.excluded_comparisons))
 
     @cached_property
     def mean(self) -> Array:
-        """Dividing error (N,) at each angle from the kept comparisons, in radians."""
+        """Dividing error at each of N angles, mean of the kept comparisons, (N,), in radians."""
         return np.asarray(np.mean(self.comparisons, axis=1, where=self.keep))
 
     @cached_property
@@ -698,7 +698,7 @@ class CalibrationSeries:
 
     @cached_property
     def suspect(self) -> NDArray[np.bool_]:
-        """Mask (N,) of angles whose kept repeats scatter significantly more than those of all angles.
+        """Mask of those of N angles whose kept repeats scatter significantly more than those of all angles, (N,).
 
         Two gross errors at one angle widen its RMS so much that Chauvenet's criterion keeps both. The test is a
         chi-square test with a false-alarm rate of 0.1 % for all angles together.
@@ -723,13 +723,13 @@ class CalibrationSeries:
         return float(np.sqrt(self._pooled(~self.suspect) / normal_reduction(self.counts)))
 
     def _pooled(self, angles: NDArray[np.bool_]) -> float:
-        """Return the pooled variance of the kept repeats at selected angles (N,), in rad^2."""
+        """Return the pooled variance of the kept repeats at the angles that a mask (N angles) selects, in rad^2."""
         freedom = (self.keep.sum(axis=1) - 1)[angles]
         return float(np.sum(freedom * self.rms_after[angles] ** 2) / np.sum(freedom))
 
     @property
     def noise_sigma(self) -> Array:
-        """Standard deviation (N,) of each mean from the scatter of the repeats, in radians.
+        """Standard deviation of the mean at each of N angles from the scatter of the repeats, (N,), in radians.
 
         Suspect angles use their own RMS.
         """
@@ -738,24 +738,23 @@ class CalibrationSeries:
 
     @property
     def sigma(self) -> Array:
-        """Standard deviation (N,) of each mean as a measure of the dividing error, in radians.
+        """Standard deviation of the dividing error measured at each of N angles, (N,), in radians.
 
-        It includes the scatter and the reference.
-
-        It is at least the rounding of the angles, which remains in a series without noise.
+        It includes the scatter of the repeats and the error of the reference, and is at least the rounding of the
+        angles, which remains in a series without noise.
         """
         rounding = np.spacing(np.max(np.abs(self.angle)))
         return np.asarray(np.maximum(np.hypot(self.noise_sigma, self.reference_sigma), rounding))
 
     @property
     def step(self) -> float:
-        """Median distance of neighbouring angles, in radians."""
+        """Median distance of neighbouring readings of the table, in radians."""
         return float(np.median(np.diff(self.angle)))
 
 
 @dataclass(frozen=True, eq=False)
 class Trial:
-    """Fit with its cross-validation on the calibration points."""
+    """Curve fitted to a calibration series, with its cross-validation on the calibration points."""
 
     fit: AngleFit
     validation: CrossValidation
@@ -912,11 +911,10 @@ class DividingCompensation:
         return np.asarray(reading, np.float64) - self.error(reading)
 
     def covariance(self, reading: ArrayLike, other: ArrayLike | None = None) -> Array:
-        """Return the covariance of the corrected angles at M readings, or between those at M and at L, in rad^2.
+        """Return the covariance of the corrected angles, in rad^2.
 
-        It is (M, M) or (M, L), the sum of the four parts of the class.
-
-        The white part applies to equal readings.
+        It is (M, M) for M readings, or (M, L) between those at M and at L other readings: the sum of the four parts
+        that the class describes. The part `white` counts only between equal readings.
         """
         first = np.atleast_1d(np.asarray(reading, np.float64))
         second = first if other is None else np.atleast_1d(np.asarray(other, np.float64))
@@ -967,9 +965,9 @@ def step_kernel(first: Array, second: Array, step: float) -> Array:
     Parameters
     ----------
     first : (M,) ndarray
-        Readings, in any unit.
+        Readings, M of them, in any unit.
     second : (L,) ndarray
-        Readings, in the same unit.
+        Readings, L of them, in the same unit.
     step : float
         Step of the calibration, in the same unit.
     """

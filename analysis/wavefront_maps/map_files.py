@@ -31,7 +31,7 @@ from analysis.images.image_file import FITS_MAGIC, ImageError, ImageFile, fits_c
 WAVES = "waves"
 """Unit of values in wavelengths, whose conversion to metres needs the wavelength."""
 _LENGTHS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "nm": 1e-9, "pm": 1e-12}
-"""Size of each unit of length, in metres."""
+"""Size in metres of each unit of length that a file may name."""
 _NAMES = {
     **{name: name for name in _LENGTHS},
     "micron": "um",
@@ -44,11 +44,11 @@ _NAMES = {
         for end in ("", "s")
     },
 }
-"""Unit by its name in files, in lower case."""
+"""Unit of length, or waves, by each of its names in files, in lower case."""
 
 
 class MapError(MeasurementError, ValueError):
-    """File that cannot be read as a wavefront, or map that does not determine a result.
+    """Error raised for a file that cannot be read as a wavefront, or for a map that does not determine a result.
 
     The message says what to change.
     """
@@ -202,7 +202,7 @@ def agreed(path: Path, key: str, stated: float | None, found: float | None) -> f
 MOST_BYTES = 100_000_000
 """Largest size of a text file that is read, in bytes."""
 MOST_POINTS = 20_000_000
-"""Largest number of points of a map."""
+"""Largest number of points of a map that is read."""
 _ZEMAX_UNITS = {0: 1e-3, 1: 1e-2, 2: 25.4e-3, 3: 1.0}
 """Size, in metres, of the unit that each unit flag of a Zemax Grid Sag file means."""
 _CODEV_NO_DATA = -32768
@@ -213,7 +213,7 @@ _STATEMENT = re.compile(r"#\s*([\w ]+?)\s*[:=]\s*(.*)")
 _WHAT = ("wavefront", "surface")
 
 Line = tuple[int, str]
-"""Line number in the file, from 1, and text."""
+"""Line of a text file: its number, counted from 1, and its text."""
 
 
 def text_of(path: Path) -> str:
@@ -517,14 +517,14 @@ def unit_written(path: Path, found: str | None, remedy: str) -> str:
 
 
 def _grid(where: str, sizes: list[int]) -> tuple[int, int]:
-    """Return the two sizes of a grid; raise MapError if they are out of range."""
+    """Return the numbers of rows and columns of a grid from a file; raise MapError if they are out of range."""
     if len(sizes) != 2 or min(sizes) < 2 or math.prod(sizes) > MOST_POINTS:
         raise MapError(f"{where}: a grid of {' x '.join(map(str, sizes))} points; 2 to {MOST_POINTS} in all are read")
     return sizes[0], sizes[1]
 
 
 def _check_points(path: Path, numbers: Array, count: int, rows: int, columns: int) -> None:
-    """Raise MapError for a wrong number of points or a point that is not finite."""
+    """Raise MapError if a file has a wrong number of points, or a point that is not finite."""
     if count != rows * columns:
         raise MapError(
             f"{path} has {count} points, but its header states {columns} x {rows}: it is truncated or extended"
@@ -534,7 +534,7 @@ def _check_points(path: Path, numbers: Array, count: int, rows: int, columns: in
 
 
 METROPRO_MAGIC = b"\x88\x1b\x03"
-"""First bytes of MetroPro files, before the byte of the header format."""
+"""First bytes of MetroPro files, which precede the byte that gives the header format."""
 HDF5_MAGIC = b"\x89HDF\r\n\x1a\n"
 """First bytes of HDF5 files."""
 _HEADERS = {0x6F: 834, 0x70: 834, 0x71: 4096}
@@ -542,7 +542,7 @@ _HEADERS = {0x6F: 834, 0x70: 834, 0x71: 4096}
 _STEPS = {0: 4096, 1: 32768, 2: 131072}
 """Number of integer counts per fringe for each value of the header's phase resolution in MetroPro files."""
 _INVALID = 2147483640
-"""Count from which a point of a Zygo file is invalid."""
+"""Integer count from which on a point of a Zygo file is marked as not measured."""
 _LARGEST_WAVELENGTH = 1e-3
 """Largest plausible wavelength, in metres."""
 _FIELDS = {
@@ -706,7 +706,7 @@ def _datx(path: Path, specified: float | None) -> WavefrontMap:
 
 
 def _surfaces(file: Any) -> Iterator[Any]:
-    """Yield the data sets of surfaces, in the order of their names."""
+    """Yield the HDF5 data sets of an Mx file that hold surfaces, in the order of their names."""
     import h5py
 
     for name in ("Data/Surface", "Measurement/Surface"):
@@ -760,7 +760,7 @@ def _attributes(file: Any, surface: Any) -> dict[str, Any]:
 
 
 def _number(keys: dict[str, Any], key: str, otherwise: float) -> float:
-    """Return a numeric attribute, or a default if it is missing or a text."""
+    """Return the number under a key of a file's attributes, or a default if it is missing or a text."""
     value = keys.get(key, otherwise)
     return otherwise if isinstance(value, str) else float(value)
 
@@ -782,7 +782,10 @@ def _spacing(surface: Any) -> float:
 _PUPIL_SCALE = ("PUPLSCAL", "PIXELSCL", "PIXSCALE")
 """FITS keys with metres per pixel of pupils, as POPPY writes and reads them."""
 _LARGEST_PIXEL, _LARGEST = 1.0, 10.0
-"""Metres; beyond them a unit is wrong or a file is damaged."""
+"""Largest plausible pixel size in a pupil, and largest plausible wavefront error, both in metres.
+
+Beyond them a unit is wrong or a file is damaged.
+"""
 
 
 def read_map(path: Path, *, wavelength: float | None = None) -> WavefrontMap:

@@ -34,7 +34,7 @@ _ORIENTATION_NAMES = {
     (True, 2): "mirrored x",
     (True, 3): "mirrored antidiagonal",
 }
-"""Name of each orientation, by (mirrored, quarter turns)."""
+"""Name of each orientation of a map, by (mirrored, number of rotations by 90 degrees)."""
 _COSINE = (1, 0, -1, 0)
 """Cosine of 0, 90, 180 and 270 degrees, as exact integers."""
 
@@ -161,7 +161,7 @@ class Orientation:
         Parameters
         ----------
         coefficients : (..., Z) ndarray
-            Coefficients before the operation.
+            Coefficients of Z terms before the operation.
         terms : sequence of int
             Noll's indices, (Z,).
         """
@@ -169,9 +169,9 @@ class Orientation:
 
 
 ORIENTATIONS = tuple(Orientation(*key) for key in _ORIENTATION_NAMES)
-"""All eight orientations with the sign of the file."""
+"""The eight orientations of a map (mirrored or not, four rotations), with the sign of the file."""
 SIGNED_ORIENTATIONS = tuple(Orientation(o.mirrored, o.quarter_turns, sign) for sign in (1, -1) for o in ORIENTATIONS)
-"""All sixteen orientations with both signs."""
+"""The sixteen orientations of a map: eight mirrors and rotations, each with either sign."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -192,7 +192,7 @@ class OrientationEvidence:
         p-value of each chi-square.
     allowed : tuple of Orientation
         Orientations that the data do not reject at the false-alarm rate.
-    together : tuple of Orientation
+    indistinguishable : tuple of Orientation
         Orientations that the data do not distinguish from the best one, including it.
     """
 
@@ -283,8 +283,11 @@ it cannot represent; below it these pixels do not separate the terms.
 _CHUNK = 50_000
 """Number of pixels processed at a time, which limits the memory for large maps."""
 _TRIES, _NEAR, _STEP = 400, 1.5, 0.75
-"""Circles through three points of the edge that are tried; pixels from one of them within which a point is on it, at
-first and when it is refined: a step lies within half a pixel of the edge.
+"""Constants of the search for a circular edge of a pupil.
+
+They are the number of circles through three random points of the edge that are tried, and the distance from a circle,
+in pixels, within which a point lies on it: first, and when the circle is refined. The steps of a digital edge lie
+within half a pixel of it.
 """
 _SPECK = 0.02
 """Smallest area of a connected illuminated region, relative to the largest; smaller regions are ignored as specks."""
@@ -528,5 +531,5 @@ def _checked_map(values: ArrayLike) -> Array:
 
 
 def _chunks(count: int) -> Iterator[slice]:
-    """Yield slices of at most `_CHUNK` elements."""
+    """Yield slices of at most `_CHUNK` elements that together cover a given number of pixels."""
     return (slice(k, k + _CHUNK) for k in range(0, count, _CHUNK))

@@ -1,7 +1,8 @@
 """Wavefront error, point spread function and MTF of a camera at a point of its field.
 
-Edges of all surfaces count: holes, obscurations, vanes of spiders and rims that vignette. A hole about the middle of
-the stop alone is integrated exactly; other edges are polygons of the same area on the stop.
+Light is blocked by the edges of all surfaces: holes, obscurations, vanes of spiders and rims that vignette. A pupil
+whose only edge is a hole about the middle of the stop is integrated exactly; other edges are represented by polygons of
+the same area on the stop.
 """
 
 from __future__ import annotations
@@ -35,9 +36,9 @@ from optics.waves.pupil_shadow import SMALLEST
 from optics.waves.pupil_stack import DEGREE, VIGNETTED_RINGS, PupilFunction, fit_pupils
 
 _STATISTICS_PHASE = 36.0
-"""Phase from the middle to the rim of the stop, radians, that sets the number of nodes for rms values.
+"""Assumed change of phase from the middle to the rim of the stop, radians, when an rms wavefront error is computed.
 
-It gives twelve rings of nodes, enough to integrate the square of a smooth wavefront error.
+It determines the number of quadrature nodes: twelve rings, enough to integrate the square of a smooth wavefront error.
 """
 
 
@@ -54,7 +55,8 @@ class Wavefront:
     x, y : (N,) ndarray
         N points of the stop in units of its radius.
     weight : (N,) ndarray
-        Weights of a mean over the light, which sum to 1; negative where a shadow is subtracted.
+        Quadrature weights of a mean over the part of the stop that light passes, which sum to 1; negative where the
+        part that an edge blocks is subtracted.
     error : (N,) ndarray
         Wavefront error, metres, positive where the wavefront is ahead of the reference sphere.
     coefficients : (J,) ndarray
@@ -63,11 +65,11 @@ class Wavefront:
     rms : float
         Root mean square of the error, metres.
     residual_rms : float
-        Root mean square of what the terms leave, metres.
+        Root mean square of the error that remains after the terms are subtracted, metres.
     strehl : float
         Strehl ratio: intensity at the reference point over that of the same light without error.
     light : float
-        Share of the stop's area that light comes through.
+        Fraction of the stop's area that light passes, 0 to 1.
     """
 
     x: np.ndarray
@@ -82,7 +84,7 @@ class Wavefront:
 
 
 def _chief(camera: Camera, field: Field) -> tuple[np.ndarray, float]:
-    """Return where the chief ray meets the image plane, (3,), and how far upstream the exit pupil lies, both in metres.
+    """Return the chief ray's point on the image plane, (3,), and the distance from it back to the exit pupil, metres.
 
     The chief ray passes through the middle of the stop.
     """
@@ -108,7 +110,8 @@ def wavefront(camera: Camera, field: Field = (0.0, 0.0), terms: int = 28) -> Wav
     Returns
     -------
     Wavefront
-        The error over the light in the stop, its terms and statistics. Defocus is part of it.
+        The error at points of the stop that light passes, its Zernike coefficients and statistics. Defocus is part of
+        it.
 
     Raises
     ------
@@ -166,7 +169,7 @@ def wavefront(camera: Camera, field: Field = (0.0, 0.0), terms: int = 28) -> Wav
 
 
 def _colours(camera: Camera, spectrum: Spectrum | None) -> list[tuple[Camera, float]]:
-    """Return the camera in light of each wavelength of a spectrum, with the fraction of the total light."""
+    """Return pairs of the camera at a wavelength of a spectrum and the weight of that wavelength; weights sum to 1."""
     shares = {camera.wavelength: 1.0} if spectrum is None else spectrum
     total = sum(shares.values())
     if not total > 0.0 or min(shares.values()) < 0.0:
@@ -175,9 +178,10 @@ def _colours(camera: Camera, spectrum: Spectrum | None) -> list[tuple[Camera, fl
 
 
 def _field_at(camera: Camera, field: Field, nodes: PupilNodes, origin: np.ndarray) -> PupilField:
-    """Return the plane waves at nodes of the stop that interfere about a point of the image plane, with total power 1.
+    """Return the plane waves whose interference gives the light's amplitude near a point of the image plane.
 
-    ``origin`` (3,) is that point, in metres in the camera's frame.
+    There is one wave for each node of the stop, ``origin`` (3,) is the point, metres in the camera's frame, and the
+    total power is 1.
     """
     imaging, to_stop = camera.systems
     rays = imaging_rays(default_backend(), imaging, to_stop, direction_of(field), camera.launch, camera.aperture, nodes)
@@ -249,7 +253,7 @@ def psf(
 
 
 def _pupil(camera: Camera, field: Field, origin: np.ndarray) -> PupilFunction:
-    """Return the exit pupil seen from a point ``origin`` (3,) of the image plane, less what edges block."""
+    """Return the exit pupil as seen from a point ``origin`` (3,) of the image plane, without the parts edges block."""
     pieces = shadow_pieces(camera, field)
     nodes = disk(VIGNETTED_RINGS if pieces is not None else 12)
     traced = _field_at(camera, field, nodes, origin)

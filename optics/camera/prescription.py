@@ -163,8 +163,9 @@ class Camera:
     Raises
     ------
     ValueError
-        There is no surface, the stop is none of them or has no diameter, a thickness leads against the light, or a
-        glass or its wavelength is not known.
+        There is no surface, ``stop`` is not the index of one or that surface has no diameter, the sign of a thickness
+        is opposite to the direction of the light, a glass is not known, or the wavelength is outside its formula's
+        range.
 
     Examples
     --------
@@ -193,7 +194,7 @@ class Camera:
     medium: Literal["vacuum", "air"] = "vacuum"
 
     def __post_init__(self) -> None:
-        """Check that the stop and all glasses are known."""
+        """Check that stop, signs of thicknesses and glasses are possible; raise ValueError otherwise."""
         if not isinstance(self.surfaces, Sequence) or not len(self.surfaces):
             raise ValueError("surfaces must be a sequence of at least one OpticalSurface")
         object.__setattr__(self, "surfaces", tuple(self.surfaces))
@@ -218,7 +219,7 @@ class Camera:
 
     @cached_property
     def indices(self) -> tuple[float, ...]:
-        """Refractive index after each surface; a mirror keeps that before it."""
+        """Refractive index of the medium after each surface; after a mirror it is that before it."""
         out = [1.0]
         for surface in self.surfaces:
             named = surface.material
@@ -252,7 +253,7 @@ class Camera:
 
     @cached_property
     def systems(self) -> tuple[SystemBatch, SystemBatch]:
-        """Two systems to trace: all surfaces and the image plane; and the surfaces as far as the aperture stop."""
+        """Two systems to trace: one of all surfaces and the image plane, and one that ends at the aperture stop."""
         names = self.assembly.sequences[_IMAGE]
         return assemble(self.assembly, [names]), assemble(self.assembly, [names[: self.stop + 1]])
 

@@ -24,7 +24,10 @@ Field = tuple[float, float]
 """Angles (x, y) of a far point, radians."""
 
 RINGS = 12
-"""Number of rings of quadrature nodes over the stop; exact for squares of wavefronts that are polynomials to order 23.
+"""Number of rings of quadrature nodes over the stop.
+
+The mean square of a wavefront error is exact when the error is a polynomial of degree 23 or less in the coordinates of
+the stop.
 """
 
 _MOST_NODES = 4_000_000
@@ -32,7 +35,7 @@ _MOST_NODES = 4_000_000
 
 
 class LightLostError(PhysicalError, ValueError):
-    """No light of a field comes through the camera."""
+    """Error: no light of a field point comes through the camera."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,9 +51,11 @@ class TracedRays:
     path : (N,) ndarray
         Optical path from the launch points, metres.
     valid : (N,) ndarray of bool
-        Rays that meet every surface within its clear aperture; the other numbers of rays that do not are meaningless.
+        True for rays that meet every surface within its clear aperture; for the others, position, direction and path
+        are meaningless.
     reached : (N,) ndarray of bool
-        Rays that meet every surface and are not totally reflected in glass, be they within the clear apertures or not.
+        True for rays that meet every surface and are not totally reflected in glass, inside or outside the clear
+        apertures.
     hits : (N, K, 3) ndarray
         Points on each of the K surfaces, metres, in the surface's own frame.
     """
@@ -227,7 +232,8 @@ def shadow_pieces(camera: Camera, field: Field, ring: bool = True) -> np.ndarray
     Returns
     -------
     (1, K, V, 2) ndarray or None
-        K polygons of V corners (x, y), in units of the stop's radius.
+        K polygons of V corners (x, y), in units of the stop's radius, with a first axis of length 1 (one camera), as
+        the functions on batches of polygons expect it.
     """
     every = {f"s{k}": s.edges(k != camera.stop, k != camera.stop or ring) for k, s in enumerate(camera.surfaces)}
     edges = {name: own for name, own in every.items() if own}
@@ -281,7 +287,7 @@ def light_nodes(camera: Camera, field: Field, phase: float) -> PupilNodes:
 
 
 def chief_point(camera: Camera, field: Field) -> np.ndarray:
-    """Return where the chief ray of a field point meets the image plane, (3,), metres, stopped by an edge or not."""
+    """Return the point where a field's chief ray meets the image plane, (3,), metres, even if an edge blocks it."""
     return np.asarray(trace_stop(camera, field, np.zeros((1, 2))).position[0])
 
 

@@ -43,7 +43,8 @@ class Variable:
     element : str
         Name of a surface; empty for the field bias.
     quantity : str
-        One of ``SHAPE``, ``POSE_QUANTITIES`` or ``field_bias``.
+        The varied quantity: ``curvature``, ``conic``, ``A4``, ``A6`` or ``A8`` of a surface's shape; ``z``, ``y`` or
+        ``tilt`` of its pose; or ``field_bias``.
     low, high : float
         Bounds, SI units.
     """
@@ -55,7 +56,7 @@ class Variable:
 
     @property
     def name(self) -> str:
-        """Name for tables and messages, e.g. ``M1 conic``."""
+        """Name of the variable for tables and messages, e.g. ``M1 conic``."""
         return f"{self.element} {self.quantity}".strip()
 
 
@@ -166,9 +167,10 @@ class Prescription:
         return Assembly(RigidTree(tuple(bodies)), elements, {"imaging": self.names, "to_stop": self.names[: stop + 1]})
 
     def tangents(self, variables: Sequence[Variable], sequence: str) -> SystemBatch:
-        """Return V equal systems for V variables; system v carries the derivatives with respect to variable v.
+        """Return V copies of the optical system, of which copy v carries the derivatives with respect to variable v.
 
-        ``sequence`` names the sequence of elements, ``imaging`` or ``to_stop``.
+        ``sequence`` names the elements that are traced: ``imaging`` (all, to the image) or ``to_stop`` (as far as the
+        stop).
         """
         assembly = self.assembly
         no_step = (self.names[-1], "scale", 0)  # scaling the image plane has no effect
@@ -193,6 +195,6 @@ def _or_zero(value: np.ndarray, tangent: np.ndarray | None) -> np.ndarray:
 
 
 def _step(variable: Variable) -> tuple[str, str, int]:
-    """Return the (body, kind of motion, axis) that a variable of position or tilt changes, to differentiate by it."""
+    """Return (body, kind of motion, axis) by which a ray trace is differentiated for a variable of position or tilt."""
     body, kind, axis = _STEPS[variable.quantity]
     return variable.element + body, kind, axis

@@ -145,7 +145,11 @@ def _differentiated(
     rays: DesignRays,
     chief: np.ndarray,
 ) -> DesignRays:
-    """Return traced rays together with their derivatives with respect to the variables."""
+    """Return traced rays together with their derivatives with respect to the variables.
+
+    ``chief`` are the launch points of the chief rays, whose derivatives follow from the condition that these rays pass
+    the stop's vertex.
+    """
     along, axes = beam_axes(beams.fields, prescription.field_bias)
     stepped = beam_axes(beams.fields, prescription.field_bias + 1j * COMPLEX_STEP)
     biased = np.array([v.quantity == BIAS for v in variables], dtype=float)
@@ -225,8 +229,8 @@ class Operands:
         ``wavefront`` (rms waves, piston and tilt removed) or ``spot`` (rms about the mean, in units of the wavelength
         times the focal ratio).
     distortion : float
-        Weight of the relative departure of chief rays from L = f tan W, as residual per relative departure; 0 leaves
-        distortion out.
+        Weight of distortion: factor by which the relative departure of a chief ray's image from L = f tan W is
+        multiplied to give a residual of the least squares; with 0, distortion is ignored.
     anamorphism : float, optional
         Largest allowed difference of f along the line from f across it, relative to f across; None: free.
     """
@@ -243,9 +247,16 @@ class Operands:
 
 @dataclass(frozen=True)
 class Passage:
-    """Surface that beams pass without touching it, the segment of the beams that does so, and the side in y.
+    """Beam segment that must pass a surface without touching it.
 
-    The segment leads from point number ``segment`` of the rays to the next.
+    Attributes
+    ----------
+    segment : int
+        Index of the point of the rays at which the segment begins; it ends at the next point.
+    surface : int
+        Index of the surface.
+    side : float
+        Side of the surface in y on which the segment passes: +1 for +y, -1 for -y.
     """
 
     segment: int
@@ -289,7 +300,7 @@ class Evaluation:
 
     @property
     def anamorphism(self) -> float:
-        """Ratio of the principal distance along the line to that across it."""
+        """Ratio of the principal distance along the imaged line to that across it, 1 without anamorphism."""
         return self.principal_distance / self.distance_across
 
     @property
@@ -311,7 +322,8 @@ class MeritFunction:
     operands : Operands
         Targets and limits.
     passages : tuple of Passage
-        Segments of the beams that pass surfaces, with these surfaces and the sides in y.
+        Beam segments that must clear surfaces, each with the surface and the side (+1 for +y, -1 for -y) on which it
+        passes it.
     """
 
     backend: Backend
@@ -412,7 +424,7 @@ class MeritFunction:
 
     @property
     def _focal_ratio(self) -> float:
-        """Required principal distance over pupil diameter, for the unit of spot sizes; 1 where it is free."""
+        """Required principal distance over pupil diameter, for the unit of spot sizes; 1 if no distance is required."""
         distance = self.operands.principal_distance
         return 1.0 if distance is None else distance / self.beams.diameter
 

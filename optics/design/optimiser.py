@@ -27,12 +27,12 @@ from optics.raytrace.aim import AimError
 from optics.raytrace.trace import BeamMissedError
 
 STEP_ITERATIONS = 4
-"""Number of iterations at each step in which the envelope is shortened, before the last step.
+"""Number of least-squares iterations at each step in which the envelope is shortened, before the last step.
 
 They are enough to stay near the optimum of that length.
 """
 ITERATIONS = 400
-"""Largest number of iterations at the last step."""
+"""Largest number of least-squares iterations at the last step, at which the envelope has its required length."""
 TOLERANCE = 1e-6
 """Relative decrease of the mean square error per iteration below which the search ends."""
 HELD = 2e-6
@@ -68,7 +68,8 @@ class ActiveConstraint:
     limit : float
         Limit, metres; for the anamorphism, relative to f.
     start : float
-        Violation of the constraint at the start, metres; negative for a margin.
+        Violation of the constraint in the initial prescription, metres (for the anamorphism, relative to f); negative
+        where it was fulfilled with a margin.
     sensitivity : float
         Decrease of the rms error over the fields per metre by which the limit is relaxed, waves/m, from the
         constraint's Lagrange multiplier.
@@ -140,8 +141,9 @@ def _violations(
     clearances : (P,) ndarray
         Distances between beams and the edges of surfaces, for P passages, metres.
     factor : float
-        Factor of the limits. With 0, and with derivatives with respect to V variables (last axis) instead of the
-        values, the result is the derivatives of the violations, (C, V).
+        Factor by which the limits are multiplied: 1 for values. With 0, and with the derivatives of the quantities
+        above with respect to V variables (last axis) instead of their values, the result is the derivatives of the
+        violations, (C, V).
     """
     out: list[Any] = []
     if operands.principal_distance is not None:
@@ -267,9 +269,10 @@ def descend(
 def _step(
     merit: MeritFunction, start: Prescription, variables: tuple[Variable, ...], iterations: int
 ) -> tuple[Prescription, int, bool]:
-    """Run one constrained least-squares search.
+    """Run one constrained least-squares search from a prescription.
 
-    The result is the prescription, the number of Jacobians, and True if the search converged.
+    Returned are the optimised prescription, the number of evaluations with derivatives, and True if the search
+    converged.
     """
     size = _sizes(start, variables)
 
@@ -344,7 +347,7 @@ def active_constraints(
 
 
 def _constraint_names(merit: MeritFunction, prescription: Prescription, names: Sequence[str]) -> list[str]:
-    """Return a distinct name for each constraint, by adding the surfaces to kinds that occur several times."""
+    """Return a distinct name for each constraint: its kind, and the surfaces if there are several of a kind."""
     surfaces = ("scene", *prescription.names)
     passages = iter(merit.passages)
     sides = iter(("long", "short"))
@@ -371,7 +374,7 @@ _AT_LIMIT = 20e-6
 
 
 def _sizes(prescription: Prescription, variables: Sequence[Variable]) -> np.ndarray:
-    """Return the typical size of each variable, in its SI unit, by which it is divided to become dimensionless."""
+    """Return the typical size of each variable in its SI unit, by which its values are scaled in the least squares."""
     least = [_SMALLEST[v.quantity] for v in variables]
     return np.asarray(np.maximum(np.abs(prescription.values(variables)), least))
 
@@ -387,7 +390,7 @@ _SMALLEST = {
     "tilt": 0.01,
     "field_bias": 0.01,
 }
-"""Quantity -> smallest size by which its variables are divided to become dimensionless, SI units."""
+"""Quantity -> smallest typical size of a variable of this kind in its SI unit, for scaling in the least squares."""
 
 
 def _require_fulfilled(merit: MeritFunction, after: Evaluation) -> None:
@@ -419,12 +422,14 @@ SAME = 0.01
 DRAWS_PER_SPREAD = 8
 """Number of random starts that may fail in a row before their spread about the nominal prescription is halved."""
 _SHARE = {"curvature": 0.01, "A4": 0.3, "A6": 0.3, "A8": 0.3}
-"""Quantity -> standard deviation of a random start relative to the value; for aspheric terms, to the largest of a kind.
+"""Quantity -> standard deviation of its random change in a random start, relative to its value in the nominal design.
+
+For an aspheric coefficient it is relative to the largest nominal coefficient of that order among the varied surfaces.
 """
 _SPREAD = {"conic": 0.3, "y": 1e-3, "tilt": 1e-3, BIAS: 1e-3}
-"""Quantity -> standard deviation of a random start for the other variables, SI units."""
+"""Quantity -> standard deviation of its random change in a random start, SI units, for quantities not in ``_SHARE``."""
 _PLACE = 0.01
-"""Standard deviation of positions along z in a random start, relative to the envelope."""
+"""Standard deviation of the random change of positions along z in a random start, relative to the envelope's length."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -436,7 +441,7 @@ class Attempt:
     drawn : bool
         True when the start was random; False when it is the prescription itself.
     steps : int
-        Number of steps of the envelope.
+        Number of steps in which the envelope was shortened from its initial to the required length.
     design : Design, optional
         Result; None where the constraints could not be fulfilled.
     problem : str
@@ -468,14 +473,14 @@ class Search:
 
     @property
     def best(self) -> Design:
-        """Design with the smallest rms error over the fields; the first of equals."""
+        """Design with the smallest rms error over the fields; of equal ones, that of the earliest start."""
         design = min(self.attempts, key=lambda attempt: attempt.error).design
         assert design is not None
         return design
 
     @property
     def agreeing(self) -> int:
-        """Number of starts that ended within ``SAME`` of the best, itself included."""
+        """Number of starts whose final rms error is within the fraction ``SAME`` of the best one's, itself included."""
         least = rms_error(self.best.after)
         return sum(attempt.error <= (1.0 + SAME) * least for attempt in self.attempts)
 

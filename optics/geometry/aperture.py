@@ -1,7 +1,7 @@
 """Clear apertures and light-blocking edges of surfaces, in the surface's own x, y frame.
 
-Every test of a point against an aperture uses the ``contains`` methods of the numbers classes here, which work on
-floats, NumPy arrays and Dr.Jit arrays in kernels.
+Whether a point lies in an aperture is always decided by the ``contains`` methods of ``DiskNumbers``, ``RingNumbers``,
+``RectangleNumbers`` and ``EllipseNumbers``, which work on floats, NumPy arrays and Dr.Jit arrays in kernels.
 
 A surface may have several edges; light passes where all of them let it. ``Edge`` is evaluated with NumPy only, at the
 points where traced rays meet the surface; kernels do not use it.
@@ -18,21 +18,21 @@ import numpy as np
 
 @dataclass(frozen=True, eq=False)
 class DiskNumbers:
-    """Disk about (x, y), in metres, with the square of its radius, in m^2."""
+    """Numbers of a disk about (x, y): its centre, in metres, and the square of its radius, in m^2."""
 
     x: Any
     y: Any
     radius_squared: Any
 
     def contains(self, x: Any, y: Any) -> Any:
-        """Return the mask of points inside, the edge included."""
+        """Return the mask of points x, y (metres) inside the disk, its edge included."""
         dx, dy = x - self.x, y - self.y
         return dx * dx + dy * dy <= self.radius_squared
 
 
 @dataclass(frozen=True, eq=False)
 class RingNumbers:
-    """Disk about (x, y), in metres, with the squares of its radius and of that of its concentric hole, in m^2."""
+    """Numbers of a disk with a concentric hole: centre (x, y), in metres, and squares of both radii, in m^2."""
 
     x: Any
     y: Any
@@ -40,7 +40,7 @@ class RingNumbers:
     hole_squared: Any
 
     def contains(self, x: Any, y: Any) -> Any:
-        """Return the mask of points inside, both edges included."""
+        """Return the mask of points x, y (metres) inside the ring, both edges included."""
         dx, dy = x - self.x, y - self.y
         r2 = dx * dx + dy * dy
         return (r2 <= self.radius_squared) & (r2 >= self.hole_squared)
@@ -48,7 +48,7 @@ class RingNumbers:
 
 @dataclass(frozen=True, eq=False)
 class RectangleNumbers:
-    """Rectangle about (x, y) with its half-widths, in metres."""
+    """Numbers of a rectangle about (x, y): its centre and half-widths, in metres."""
 
     x: Any
     y: Any
@@ -56,13 +56,13 @@ class RectangleNumbers:
     half_y: Any
 
     def contains(self, x: Any, y: Any) -> Any:
-        """Return the mask of points inside, the edge included."""
+        """Return the mask of points x, y (metres) inside the rectangle, its edge included."""
         return (abs(x - self.x) <= self.half_x) & (abs(y - self.y) <= self.half_y)
 
 
 @dataclass(frozen=True, eq=False)
 class EllipseNumbers:
-    """Ellipse about (x, y) with its semi-axes, in metres."""
+    """Numbers of an ellipse about (x, y): its centre and semi-axes, in metres."""
 
     x: Any
     y: Any
@@ -70,7 +70,7 @@ class EllipseNumbers:
     half_y: Any
 
     def contains(self, x: Any, y: Any) -> Any:
-        """Return the mask of points inside, the edge included."""
+        """Return the mask of points x, y (metres) inside the ellipse, its edge included."""
         u, v = (x - self.x) / self.half_x, (y - self.y) / self.half_y
         return u * u + v * v <= 1.0
 
@@ -240,7 +240,7 @@ class Ray:
             raise ValueError(f"a vane needs a width, found {self.width}")
 
     def contains(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-        """Return the mask of points inside, the edge included."""
+        """Return the mask of points x, y (metres) inside the strip, its edge included."""
         return np.asarray((x >= self.centre[0]) & (np.abs(y - self.centre[1]) <= 0.5 * self.width))
 
 
@@ -265,7 +265,7 @@ class Polygon:
             raise ValueError(f"a polygon needs three corners or more, found {len(self.corners)}")
 
     def contains(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-        """Return the mask of points inside, by the parity of the sides that a line along x crosses."""
+        """Return the mask of points x, y (metres) inside, by the parity of the sides that a line along x crosses."""
         inside = np.zeros(np.broadcast_shapes(np.shape(x), np.shape(y)), dtype=bool)
         last_x, last_y = self.corners[-1]
         for next_x, next_y in self.corners:
@@ -319,7 +319,7 @@ class Edge:
 
 
 def outer_edge(aperture: Aperture | None, edges: Sequence[Edge]) -> Aperture | None:
-    """Return the smallest outer edge given for a surface (polygons excluded), else its aperture."""
+    """Return the smallest outer edge given for a surface (polygons excluded), or its aperture if there is none."""
     stated = [edge.shape for edge in edges if not edge.blocks and isinstance(edge.shape, Aperture)]
     return min(stated, key=lambda shape: shape.enclosing.radius, default=aperture)
 

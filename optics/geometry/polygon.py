@@ -15,13 +15,13 @@ import numpy as np
 from optics.numerics.quadrature import gauss
 
 _NO_LIMIT = 1e30
-"""Limit of the half-plane of a side without length: finite, so that it can be multiplied."""
+"""Limit that replaces that of a side of zero length, which has no direction; finite, so that it can be multiplied."""
 
 _BLOCK_NODES = 2**13
 """Number of boundary nodes processed in one block: their polynomials stay in the processor's cache."""
 
 _COINCIDENT = 1e-13
-"""Distance below which two corners coincide."""
+"""Distance below which two corners of a polygon count as one, in the unit of their coordinates."""
 
 
 def area(polygons: np.ndarray) -> np.ndarray:
@@ -81,7 +81,8 @@ def covered(polygons: np.ndarray, points: np.ndarray, smallest: float = 0.0) -> 
 def hull(points: np.ndarray) -> np.ndarray:
     """Return the convex hulls of N sets of P points, counterclockwise, as polygons (N, V, D) of V corners.
 
-    ``points`` (N, P, D) have x and y in the first two of D columns; the others are carried along.
+    The first two of the D columns of ``points`` (N, P, D) are x and y, which decide the hull; the other columns belong
+    to the points and stay with them.
     """
     x, y = points[..., 0], points[..., 1]
     rows = np.arange(len(points))
@@ -104,7 +105,7 @@ def hull(points: np.ndarray) -> np.ndarray:
 
 
 def clip(polygons: np.ndarray, normal: np.ndarray, limit: np.ndarray) -> np.ndarray:
-    """Return the part of each polygon where normal . (x, y) <= limit.
+    """Return the part of each polygon where the scalar product of ``normal`` and (x, y) is at most ``limit``.
 
     The algorithm is that of Sutherland and Hodgman, Commun. ACM 17, 32 (1974).
 
@@ -113,9 +114,9 @@ def clip(polygons: np.ndarray, normal: np.ndarray, limit: np.ndarray) -> np.ndar
     polygons : (N, V, D) ndarray
         N convex polygons of V corners, with x and y in the first two of D columns.
     normal : (N, 2) ndarray
-        Normals of the clipping lines.
+        One normal for each polygon.
     limit : (N,) ndarray
-        Limits along the normals.
+        One limit for each polygon: for a unit normal, the distance of the clipping line from the origin along it.
 
     Returns
     -------
@@ -173,8 +174,8 @@ def _packed(corners: np.ndarray, selected: np.ndarray) -> np.ndarray:
 def sides(windows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return outward unit normals (N, W, 2) and limits (N, W) of the W sides of N counterclockwise polygons.
 
-    A point lies inside a side where its product with the normal is at most the limit. A side without length, whose
-    direction would be rounding error, gets no limit.
+    A point lies on the inner side of a side where its scalar product with the normal is at most the limit. A side
+    without length, whose direction would be rounding error, gets a limit that no point exceeds.
     """
     step = np.roll(windows[..., :2], -1, axis=1) - windows[..., :2]
     length = np.hypot(step[..., 0], step[..., 1])
@@ -193,7 +194,7 @@ def intersect(polygons: np.ndarray, normal: np.ndarray, limit: np.ndarray) -> np
     normal : (N, W, 2) ndarray
         Outward normals of the half-planes.
     limit : (N, W) ndarray
-        Limits along the normals.
+        Largest scalar products of a normal and (x, y) inside.
 
     Returns
     -------
@@ -229,8 +230,9 @@ def difference(polygons: np.ndarray, holes: np.ndarray, order: Iterable[int] | N
 
     Returns
     -------
-    list of (N, ., D) ndarray
-        Convex polygons, many of them empty, that together cover what is left.
+    list of (N, U, D) ndarray
+        For each order, convex polygons of U corners, many of them empty, that together cover the polygon without its
+        hole.
     """
     normal, limit = sides(holes)
     out = []
@@ -273,18 +275,27 @@ def quadrature(polygons: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray
 def from_boundary(
     nodes: np.ndarray, rise: np.ndarray, low: np.ndarray, high: np.ndarray, count: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return nodes and area weights over regions given by their boundaries, as ``quadrature`` does for polygons.
+    """Return nodes and area weights for integrals over regions that are given by nodes on their boundaries.
+
+    They integrate polynomials of degree below ``count`` in x and in y exactly, if the boundary nodes do.
 
     Parameters
     ----------
     nodes : (N, P, 2) ndarray
-        P nodes on the boundary of each of N regions.
+        P quadrature nodes (x, y) on the boundary of each of N regions.
     rise : (N, P) ndarray
-        Weights of the nodes in integrals over dy.
+        Quadrature weights of these nodes for line integrals over dy along the boundary.
     low, high : (N, 2) ndarray
         Opposite corners of boxes about the regions.
     count : int
         Number of nodes along each side of the box.
+
+    Returns
+    -------
+    points : (N, count^2) ndarray
+        Nodes in the box as complex numbers x + iy.
+    weights : (N, count^2) ndarray
+        Area weights.
     """
     rows = len(nodes)
     middle, half = 0.5 * (low + high), 0.5 * (high - low)
@@ -311,7 +322,7 @@ def _moments(nodes: np.ndarray, rise: np.ndarray, count: int) -> np.ndarray:
     nodes : (N, P, 2) ndarray
         P nodes on the boundary of each region.
     rise : (N, P) ndarray
-        Weights of the nodes in integrals over dy.
+        Quadrature weights of these nodes for line integrals over dy along the boundary.
     count : int
         Number of polynomials along each axis.
     """

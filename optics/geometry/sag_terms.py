@@ -1,8 +1,8 @@
-"""Kinds of sag terms added to a conic with even powers of the radius.
+"""Terms of a surface's sag in addition to the conic and the even powers of the radius, of several kinds.
 
-A kind is a frozen dataclass whose fields are numbers: floats in a ``Surface``, arrays over systems in a batch, Dr.Jit
-arrays in a kernel. They are 0 by default, and a term of zeros adds exactly nothing, so that all surfaces of a batch or
-scene share the code of all their terms.
+A kind of term (``XYPolynomial``, ``ZernikeSag``) is a frozen dataclass whose fields are numbers: floats in a
+``Surface``, arrays over systems in a batch, Dr.Jit arrays in a kernel. They are 0 by default, and a term of zeros adds
+exactly nothing, so that all surfaces of a batch or scene share the code of all their terms.
 """
 
 from __future__ import annotations
@@ -20,13 +20,13 @@ from optics.numerics.number_tree import FrozenMap
 
 @runtime_checkable
 class SagTerm(Protocol):
-    """Protocol of a kind of sag term: a frozen dataclass of numbers, without a ``__post_init__``.
+    """Interface of every kind of sag term: a frozen dataclass of numbers, without a ``__post_init__``.
 
     Attributes
     ----------
     POWERS : mapping of str to int
-        Name of each field, in field order, to the power of the metre in its unit (-3 for 1/m^3). Files are read by it,
-        and a scaled body scales the number by it.
+        Name of each field, in the order of the fields -> power of the metre in its unit (-3 for 1/m^3). Files are read
+        with it, and the numbers of an expanded body are scaled with it.
     """
 
     POWERS: ClassVar[Mapping[str, int]]

@@ -57,11 +57,11 @@ _Rings = dict[int, list[int]]
 
 
 class OpenBodyError(PhysicalError, ValueError):
-    """The half-spaces do not bound a body."""
+    """Error: half-spaces do not bound a body, as their intersection is infinite."""
 
 
 class EmptyBodyError(PhysicalError, ValueError):
-    """The half-spaces have no common body, or one thinner than ``MERGE_LENGTH``."""
+    """Error: half-spaces have no common body, or one thinner than ``MERGE_LENGTH``."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,9 +125,9 @@ def _integers(plane: Iterable[float]) -> _Plane:
 
 
 def _box(planes: list[_Plane], first: int) -> tuple[list[_Corner], _Rings]:
-    """Return corners and faces of the box from which bodies are cut, and append its planes to ``planes``.
+    """Return corners and faces of the large box from which bodies are cut, and append its planes to ``planes``.
 
-    The planes of the box are numbered from ``first``.
+    The six planes of the box get the numbers ``first``, ``first`` + 1, and so on.
     """
     extent = int(MAX_EXTENT)
     corners = [(x, y, z, 1) for x in (-extent, extent) for y in (-extent, extent) for z in (-extent, extent)]
@@ -141,7 +141,10 @@ def _box(planes: list[_Plane], first: int) -> tuple[list[_Corner], _Rings]:
 
 
 def _cut(corners: list[_Corner], rings: _Rings, planes: Sequence[_Plane], k: int) -> None:
-    """Cut off everything beyond plane number ``k``; a plane that cuts nothing off leaves no face."""
+    """Cut off the part of a body beyond plane number ``k``; a plane that cuts nothing off makes no face.
+
+    ``corners`` and ``rings`` are the corners and faces of the body, which are changed.
+    """
     a, b, c, d = planes[k]
     side = {}
     for v in {v for ring in rings.values() for v in ring}:
@@ -242,7 +245,7 @@ class Coating(Enum):
 
 
 class SolidError(PhysicalError, ValueError):
-    """The faces do not enclose a body."""
+    """Error: the faces of a solid do not enclose a body."""
 
 
 @dataclass(frozen=True)
@@ -254,7 +257,7 @@ class Face:
     name : str
         Name within the solid, e.g. ``window``, ``roof_a``.
     body : str
-        Path of the tree's body that carries it (the solid's own, or a child of it when the face can have an angle error
+        Path of the rigid body that carries it (the solid's own, or a child of it when the face can have an angle error
         of its own).
     coating : Coating
         Surface treatment.
@@ -275,7 +278,7 @@ class Solid:
     Attributes
     ----------
     path : str
-        Path of its body in the tree.
+        Path of its rigid body in the tree of bodies.
     material : str
         Name in the catalogues ``optics.materials.glass`` and ``optics.materials.material``.
     faces : tuple of Face

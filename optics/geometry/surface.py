@@ -1,4 +1,4 @@
-"""Surfaces: ideal shape and figure error, on NumPy arrays and, as a level function, in Dr.Jit kernels."""
+"""Optical surfaces: ideal shape and figure error, as NumPy functions and as equation G = 0 in Dr.Jit kernels."""
 
 from __future__ import annotations
 
@@ -88,13 +88,13 @@ class GridFigure:
 
     @property
     def numbers(self) -> GridNumbers:
-        """Position, spacing and size of the grid for a kernel, whose table begins with the coefficients ``spline``."""
+        """Position, spacing and size of the grid, for a kernel whose table begins with the coefficients ``spline``."""
         dx, dy = self.spacing
         rows, columns = self.values.shape
         return GridNumbers(self.bounds[0], self.bounds[2], 1.0 / dx, 1.0 / dy, float(columns), float(rows), 0.0)
 
     def plus(self, other: GridFigure) -> GridFigure:
-        """Return the sum of two figures on the same samples; exact.
+        """Return the exact sum of two figures that are given at the same samples.
 
         Raises
         ------
@@ -205,7 +205,7 @@ class SurfaceNumbers:
     terms : tuple of SagTerm
         Further terms of the sag, at most one of each kind.
     figure, grid : FigureNumbers and GridNumbers, optional
-        Departures from that shape.
+        Figure error as a polynomial and on a grid.
     """
 
     curvature: Any = None
@@ -224,7 +224,7 @@ class SurfaceNumbers:
 def level(
     x: Any, y: Any, z: Any, surface: SurfaceNumbers, table: Any = None, active: Any = True
 ) -> tuple[Any, Any, Any, Any]:
-    """Return the level function G of a surface and its gradient, on Dr.Jit arrays.
+    """Return the function G(x, y, z) that is zero on a surface, and its gradient, on Dr.Jit arrays.
 
     With c the curvature and k the conic constant of the surface, h the sum of all terms beyond the conic and of the
     figure, and w = z - h(x, y), the surface is where
@@ -406,14 +406,14 @@ class Surface:
 
     @property
     def zernike_figure(self) -> ZernikeFigure | None:
-        """Zernike part of the figure, or None."""
+        """Zernike part of the figure error, or None without one."""
         if isinstance(self.figure, SummedFigure):
             return self.figure.terms
         return self.figure if isinstance(self.figure, ZernikeFigure) else None
 
     @property
     def grid_figure(self) -> GridFigure | None:
-        """Grid part of the figure, or None."""
+        """Part of the figure error that is given on a grid, or None without one."""
         if isinstance(self.figure, SummedFigure):
             return self.figure.grid
         return self.figure if isinstance(self.figure, GridFigure) else None

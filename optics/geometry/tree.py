@@ -53,7 +53,7 @@ class Body:
         return self.path.rpartition("/")[0]
 
     def moved(self, motion: Motion) -> Body:
-        """Return the body whose nominal pose is the one that a rigid motion gives this body."""
+        """Return the body with a new nominal pose: the present one changed by a rigid motion."""
         local_rotation, offset, _ = _affine([motion], [self])
         rotation, translation = self.pose.rotation, self.pose.translation
         return replace(self, pose=Pose(product(rotation, local_rotation[0]), translation + matvec(rotation, offset[0])))
@@ -81,7 +81,8 @@ class Motion:
     index : float
         Change of the refractive index of a glass body.
     index_gradient : tuple of float
-        Gradient of the index change in the body's frame, zero at its origin, 1/m.
+        Gradient of the index change in the body's frame, 1/m; the index change that it causes is zero at the body's
+        origin.
     grid : GridFigure, optional
         Surface error of a mirror or face on a grid, in addition to ``figure``.
     radius : float
@@ -112,7 +113,7 @@ class Motion:
 
     @property
     def dispersion(self) -> float:
-        """Relative change of a glass's dispersion that follows from the change of its Abbe number."""
+        """Relative change of a glass's dispersion, 1 / (1 + ``abbe``) - 1, due to the change of its Abbe number."""
         return 1.0 / (1.0 + self.abbe) - 1.0
 
     def component(self, kind: str, axis: int) -> float:
@@ -145,7 +146,7 @@ class Motion:
 
 
 AT_REST = Motion()
-"""Motion of a body that a state does not name: none."""
+"""Motion of a body that a perturbed state does not list: no displacement and no other change."""
 
 State = Mapping[str, Motion]
 """Perturbed state: body path -> motion; bodies not named stay at their nominal pose."""
@@ -173,12 +174,12 @@ class PlacedBodies:
     scale: np.ndarray
 
     def pose(self, path: str, state: int = 0) -> Pose:
-        """Return the world pose of one body in one state; of complex poses the real part."""
+        """Return the world pose of one body in one state; if poses are complex (with a derivative), their real part."""
         i = self.index[path]
         return Pose(self.rotation[state, i].real, self.translation[state, i].real)
 
     def size(self, path: str) -> np.ndarray:
-        """Return the size of one body relative to nominal in each of S states, (S,); of complex sizes the real part."""
+        """Return the size of one body relative to nominal in each of S states, (S,); if complex, the real part."""
         return np.asarray(self.scale[:, self.index[path]].real)
 
 
@@ -317,7 +318,7 @@ class RigidTree:
 
     @cached_property
     def _levels(self) -> tuple[tuple[Body, ...], ...]:
-        """Bodies grouped by their depth in the tree."""
+        """Bodies grouped by their depth in the tree, from the roots on."""
         far: dict[str, int] = {}
         for body in self.bodies:
             far[body.path] = far[body.parent] + 1 if body.parent else 0
@@ -336,7 +337,7 @@ class RigidTree:
 
     @cached_property
     def _nominal(self) -> tuple[np.ndarray, np.ndarray]:
-        """Nominal world rotations (bodies, 3, 3) and translations (bodies, 3)."""
+        """Nominal world rotations (bodies, 3, 3) and translations (bodies, 3), metres."""
         return self._at_rest(np.float64)
 
     @cached_property
@@ -345,7 +346,10 @@ class RigidTree:
         return self._at_rest(np.complex128)
 
     def _at_rest(self, dtype: Any) -> tuple[np.ndarray, np.ndarray]:
-        """Return the nominal world rotations (bodies, 3, 3) and translations (bodies, 3) in a data type."""
+        """Return nominal world rotations (bodies, 3, 3) and translations (bodies, 3), metres, as ``dtype``.
+
+        ``dtype`` is the NumPy type float or complex; the poses are computed in its arithmetic.
+        """
         rotation, translation = np.empty((len(self.bodies), 3, 3), dtype), np.empty((len(self.bodies), 3), dtype)
         for i, body in enumerate(self.bodies):
             rotation[i], translation[i] = body.pose.rotation, body.pose.translation
@@ -404,8 +408,9 @@ def _local_motions(
 def compose(first: State, then: State, bodies: Mapping[str, Body]) -> State:
     """Return the state that applies ``then`` on top of ``first``.
 
-    In every body's frame a point x goes to first(then(x)). Exact for the rigid parts; figures, conic constants and
-    indices add.
+    A point x in a body's frame is moved by ``then`` first, and the result by ``first``, both in the body's frame: x
+    goes to first(then(x)). The result is exact for rotations, shifts and scales; figures, changes of the conic constant
+    and of the refractive index are added.
 
     Raises
     ------
@@ -438,7 +443,10 @@ def compose_each(sequences: Sequence[Sequence[State]], bodies: Mapping[str, Body
 
 
 def _composed_pairs(pairs: Sequence[tuple[Motion, Motion]], bodies: Sequence[Body]) -> list[Motion]:
-    """Return, for each of N bodies, the one motion that applies a pair of motions, taken about the body's origin."""
+    """Return, for each of N bodies, the one motion that is equal to a pair of motions (first, then).
+
+    Its pivot is the body's origin; a point x moves to first(then(x)).
+    """
     (rot_1, offset_1, scale), (rot_2, offset_2, _) = (_affine([pair[k] for pair in pairs], bodies) for k in range(2))
     rotation, offset = product(rot_1, rot_2), matvec(rot_1, scale[:, None] * offset_2) + offset_1
     rotate = _composed_rotations(pairs, rotation)
@@ -465,7 +473,7 @@ def _composed_rotations(
 ) -> list[tuple[float, float, float]]:
     """Return the rotation vectors of N composed rotations with matrices ``rotations`` (N, 3, 3).
 
-    Most motions rotate nothing; they keep their vectors.
+    Where one motion of the pair does not rotate, the other's vector is returned unchanged.
     """
     out = [then.rotate if any(then.rotate) else first.rotate for first, then in pairs]
     indices = [k for k, (first, then) in enumerate(pairs) if any(first.rotate) and any(then.rotate)]
@@ -479,6 +487,7 @@ def _composed_rotations(
 
 
 def _sum(first: GridFigure | None, then: GridFigure | None) -> GridFigure | None:
+    """Return the sum of two grid figures, of which either may be None."""
     if first is None or then is None:
         return then if first is None else first
     return first.plus(then)

@@ -146,7 +146,7 @@ class Polygon:
 
 @dataclass(frozen=True, eq=False)
 class Disk:
-    """Disk or ellipse: the points centre + radius * stretch @ p with |p| <= 1.
+    """Disk or ellipse: the points centre + radius * stretch @ p, with p all points of the unit disk.
 
     Attributes
     ----------
@@ -311,7 +311,7 @@ Shape = Polygon | Disk | HalfPlane
 
 @dataclass(frozen=True, eq=False)
 class _Edges:
-    """Midpoints, vectors and outward normals (of the edges' lengths) of V edges, (V, 2) each."""
+    """V edges of a polygon: midpoints, edge vectors, and outward normals as long as the edges, (V, 2) each, metres."""
 
     middle: np.ndarray
     vector: np.ndarray
@@ -329,8 +329,8 @@ class _Edges:
     def sum(self, kx: np.ndarray, ky: np.ndarray) -> np.ndarray:
         """Return the sum over the edges of (k . n) exp(-i k . m) sinc(k . d/2), for each wave vector k, in rad/m.
 
-        n is the outward normal of an edge, m its midpoint and d its vector, in metres; ``kx`` (., C) and ``ky`` (R, .)
-        are the components of k for C columns and R rows.
+        n is the outward normal of an edge, m its midpoint and d its vector, in metres; ``kx`` and ``ky`` are the
+        components of k: (1, C) and (R, 1) for a grid of C columns and R rows, or both of one shape.
         """
         total = np.zeros(np.broadcast_shapes(kx.shape, ky.shape), complex)
         for m, d, n in zip(self.middle, self.vector, self.normal, strict=True):
@@ -426,7 +426,7 @@ def _polyline(
 
 
 def _apply(point_map: PointMap, points: np.ndarray) -> np.ndarray:
-    """Return N mapped points (N, 2), after checking shape and finiteness."""
+    """Return the images (N, 2) of N points under a map, after checks that they have this shape and are finite."""
     mapped = np.asarray(point_map(points), float)
     if mapped.shape != points.shape:
         raise ValueError(f"the map must take (N, 2) to (N, 2), but took {points.shape} to {mapped.shape}")

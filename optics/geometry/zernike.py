@@ -12,7 +12,10 @@ import numpy as np
 MAX_NOLL = 66
 """Highest supported Noll index (all terms to radial order 10); beyond it monomials lose digits."""
 RANK_TOLERANCE = 1e-6
-"""Relative size (singular value over the largest) below which combinations of Zernike terms are excluded from a fit."""
+"""Limit below which a combination of Zernike terms is excluded from a fit, because the points do not determine it.
+
+It applies to the singular value of the combination relative to the largest one.
+"""
 
 
 def noll_to_nm(index: int) -> tuple[int, int]:

@@ -2,9 +2,9 @@
 
 Lobes. The ABg and Harvey-Shack lobes depend only on d = |beta - beta0|, the distance of the scattered from the specular
 direction in the plane of direction cosines (components of the unit vectors along the surface; Harvey 1976; Pfisterer,
-"Approximated scatter models for stray light analysis", OPN 2011). The BSDF f is taken *per power of the specular beam
-that it leaves*, so that f(d) d^2(beta) is the scattered fraction into d^2(beta) = cos(theta) d(Omega), and the total
-integrated scatter
+"Approximated scatter models for stray light analysis", OPN 2011). The BSDF f is relative to *the power of the specular
+beam*, from which the scattered light is taken, so that f(d) d^2(beta) is the scattered fraction into d^2(beta) =
+cos(theta) d(Omega), and the total integrated scatter
 
     TIS(beta0) = integral of f(|beta - beta0|) over |beta| < 1
 
@@ -54,7 +54,8 @@ MAX_DISTANCE = 2.0
 """Largest possible distance of two directions in the plane of direction cosines."""
 
 _FLAT = 1e-9
-"""Tolerance of |1 - g/2| below which the integral takes its logarithmic form."""
+"""Tolerance of |1 - g/2| below which the integral of (1 + (d/l)^2)^(-g/2) over a disk is taken as a logarithm (g = 2).
+"""
 
 
 @dataclass(frozen=True)
@@ -82,7 +83,7 @@ class Lobe:
 
     @property
     def numbers(self) -> tuple[float, float, float, float]:
-        """Share, scale, exponent, and 1 for ABg or 0 for Harvey-Shack."""
+        """Numbers of the lobe for the path tracer: share, scale, exponent, and 1 for ABg or 0 for Harvey-Shack."""
         return self.share, self.scale, self.exponent, float(self.abg)
 
 
@@ -127,7 +128,10 @@ class ABg:
         return self.b ** (1.0 / self.g) if self.g > 0.0 else 1.0
 
     def _upper(self, reach: float) -> float:
-        """Return the integral of the lobe's upper bound over distances below ``reach``, per specular power."""
+        """Return the integral of the lobe's upper bound over distances below ``reach``, per specular power.
+
+        ``reach`` is in direction cosines.
+        """
         bound = self.a / self.b * _largest_ratio(self.g) if self.g > 0.0 else self.a / (1.0 + self.b)
         return bound * _harvey_integral(self._scale, self.g, reach)
 
@@ -164,7 +168,10 @@ class HarveyShack:
         return _require_samplable(Lobe(self._upper(MAX_DISTANCE), self.l, -self.s, False))
 
     def _upper(self, reach: float) -> float:
-        """Return the integral of the lobe over distances below ``reach``; the lobe is its own upper bound."""
+        """Return the integral of the lobe over distances below ``reach``, as a fraction of the specular power.
+
+        ``reach`` is in direction cosines; the lobe is its own upper bound.
+        """
         return self.b0 * _harvey_integral(self.l, -self.s, reach)
 
 
@@ -271,7 +278,7 @@ def _harvey_integral(scale: float, g: float, reach: float) -> float:
 
 
 def _require_samplable(lobe: Lobe) -> Lobe:
-    """Return the lobe; raise ValueError if its upper bound integrates to more than the specular power."""
+    """Return the lobe; raise ValueError if its upper bound, used for sampling, exceeds all of the light."""
     if lobe.share > 1.0:
         raise ValueError(
             f"the scatter lobe is too strong to be sampled: its upper bound is {lobe.share:.4g} of the light (> 1)"
@@ -280,7 +287,10 @@ def _require_samplable(lobe: Lobe) -> Lobe:
 
 
 def _check_total(scatter: Scatter, upper: float) -> None:
-    """Raise ValueError if a lobe scatters more than all of the light."""
+    """Raise ValueError if a lobe scatters more than all of the light.
+
+    ``upper`` is the integral of its upper bound; only if that exceeds 1 is the exact integral computed.
+    """
     if upper <= 1.0:  # an upper bound below 1 settles it without quadrature
         return
     total = total_scatter(scatter)  # such lobes scatter most at normal incidence
@@ -289,11 +299,12 @@ def _check_total(scatter: Scatter, upper: float) -> None:
 
 
 STEPS = 90
-"""Number of intervals of the angle of incidence, from 0 to 90 degrees, for which a table's distributions are computed.
+"""Number of intervals of the angle of incidence, from 0 to 90 degrees, for which a scatter table's sampling is
+computed.
 """
 LEAST_RINGS, LEAST_SECTORS = 240, 36
 MOST_CELLS = 120_000
-"""Largest number of cells (rings times sectors) of a table."""
+"""Largest number of cells (rings of the radial angle times sectors of the azimuth) of a scatter table's sampling."""
 _CHECKED = np.arange(0.0, 91.0, 5.0)
 """Angles of incidence, degrees, at which a table's total scatter is checked in addition to the table's own angles."""
 _GAUSS = (0.5 - 0.5 / np.sqrt(3.0), 0.5 + 0.5 / np.sqrt(3.0))
@@ -358,13 +369,13 @@ class ScatterTable:
 
     @property
     def rings(self) -> int:
-        """Number of cells along the radial angle; every interval of the table is divided into the same number."""
+        """Number of sampling cells along the radial angle; all intervals of the table have equally many."""
         intervals = len(self.radial) - 1
         return intervals * -(-LEAST_RINGS // intervals)
 
     @property
     def sectors(self) -> int:
-        """Number of cells along the azimuth, over 180 or 360 degrees."""
+        """Number of sampling cells along the azimuth, over 180 or 360 degrees."""
         intervals = max(len(self.azimuth) - 1, 1)
         return intervals * -(-LEAST_SECTORS // intervals)
 
@@ -421,7 +432,7 @@ class ScatterTable:
 
     @cached_property
     def _edges(self) -> tuple[np.ndarray, np.ndarray]:
-        """Radial and azimuthal edges of the cells, radians."""
+        """Edges of the sampling cells along the radial angle and along the azimuth, radians."""
         span = self.azimuth if len(self.azimuth) > 1 else np.array([0.0, np.pi])
         out = []
         for axis, count in ((self.radial, self.rings), (span, self.sectors)):
@@ -430,7 +441,11 @@ class ScatterTable:
         return out[0], out[1]
 
     def _power(self, incidence: float) -> np.ndarray:
-        """Return the scattered fraction into each cell, (rings, sectors); a mirrored cell includes its mirror image."""
+        """Return the fraction of the incident power that is scattered into each sampling cell, (rings, sectors).
+
+        ``incidence`` is the angle of incidence in radians; where only half of the azimuths is tabulated, a cell
+        includes its mirror image.
+        """
         table, (radial, azimuth) = self._at(incidence), self._edges
         power = np.zeros((self.rings, self.sectors))
         dr, dp = np.diff(radial)[:, None], np.diff(azimuth)[None, :]
@@ -446,7 +461,7 @@ class ScatterTable:
 
     @cached_property
     def sampling(self) -> ScatterSampling:
-        """Cumulative distributions from which scattered directions are drawn."""
+        """Cumulative distributions of the scattered power, from which scattered directions are drawn."""
         radial, azimuth = self._edges
         share, rings, sectors = [], [], []
         for angle in np.linspace(0.0, 0.5 * np.pi, STEPS + 1):
@@ -731,8 +746,8 @@ class Finish:
     def numbers(self) -> tuple[float, ...]:
         """Numbers for the path tracer.
 
-        They are reflectance, transmission, 1 for bare glass, diffuse fraction, and share, scale, exponent and kind of
-        the lobe.
+        They are reflectance, transmission, 1 for bare glass (else 0), diffuse fraction, and the four numbers of the
+        scatter lobe (``Lobe.numbers``).
         """
         lobe = (0.0, 1.0, 2.0, 0.0) if self.scatter is None else self.scatter.lobe.numbers
         return (self.reflectance, self.transmission, float(self.bare), self.diffuse, *lobe)
@@ -758,7 +773,7 @@ BARE = Finish(bare=True)
 """Polished bare glass."""
 
 GROUND = Finish(diffuse=0.04)
-"""Ground and blackened glass, seen from either side."""
+"""Ground and blackened surface of glass: 4 % of the light is scattered by Lambert's law, on either side."""
 
 BLACK = Finish(reflectance=0.005, diffuse=0.035, scatter=PAINT)
 """Diffuse black paint: 4 % of the light comes back, most of it by Lambert's law."""
@@ -767,7 +782,7 @@ SILICON = Finish(reflectance=0.3, records=True)
 """Bare silicon detector, which records all the light it does not reflect."""
 
 ABSORBER = Finish()
-"""Perfectly black surface."""
+"""Perfectly black surface, which absorbs all light."""
 
 COATING_STEPS = 360
 """Number of intervals of the angle of incidence, from 0 to 90 degrees, of a coating's lookup table."""

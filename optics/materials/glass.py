@@ -27,7 +27,7 @@ from optics.numerics.array_math import UnphysicalError
 from optics.numerics.number_tree import FrozenMap
 
 REFERENCE_TEMPERATURE = 293.15
-"""Temperature at which the dispersion formulas hold, kelvin (20 C)."""
+"""Temperature of the glass to which the dispersion formulas refer, kelvin (20 C)."""
 SCHOTT_RANGE = TemperatureRange.celsius(
     -100.0, 140.0, 'Schott\'s measurements of dn/dT: Hartmann, "Optical Glass", SPIE Press 2014, sec. 3.7'
 )
@@ -506,7 +506,7 @@ def refractive_index(
     wavelength : array_like
         Wavelengths in air, metres, any shape.
     medium : {"air", "vacuum"}
-        What the index is against: air of 20 C and 1013 hPa, as makers state it, or vacuum.
+        Medium relative to which the index is given: air of 20 C and 1013 hPa, as in manufacturers' data, or vacuum.
     temperature : float
         Temperature of the glass, kelvin; other than 293.15 K only where the change of the index is known.
 

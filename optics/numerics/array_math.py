@@ -23,7 +23,7 @@ from numpy.typing import ArrayLike, NDArray
 
 
 def _is_numpy(x: Any) -> bool:
-    """Return True for Python and NumPy numbers and arrays."""
+    """Return True for a Python or NumPy number or array, False for a Dr.Jit array."""
     return isinstance(x, int | float | np.ndarray | np.generic)
 
 
@@ -103,7 +103,7 @@ A low satellite moves by 8 mm in a microsecond, over which a curve through its m
 tolerance costs no accuracy.
 """
 _DIGITS = 1e-15
-"""Relative tolerance of an end far from zero: nine units in the last place."""
+"""Relative tolerance of ``in_span`` for an end far from zero: about nine units in the last place of float64."""
 
 
 def in_span(value: ArrayLike, first: ArrayLike, last: ArrayLike) -> NDArray[np.bool_]:
@@ -128,7 +128,7 @@ def in_span(value: ArrayLike, first: ArrayLike, last: ArrayLike) -> NDArray[np.b
 
 
 def index_of_value(value: float, values: Sequence[float]) -> int | None:
-    """Return the index (from 0) of the entry that a value equals to rounding; None where there is none."""
+    """Return the index of the entry of ``values`` that is equal to ``value`` to rounding; None if there is none."""
     nearest = min(range(len(values)), key=lambda k: abs(values[k] - value), default=None)
     return None if nearest is None or not in_span(value, values[nearest], values[nearest]) else nearest
 
@@ -142,7 +142,7 @@ class PhysicalError(Exception):
 
 
 class UnphysicalError(PhysicalError, ValueError):
-    """A value is physically impossible together with the others; the message says which and why."""
+    """Error: a value is physically impossible together with the others; the message says which value and why."""
 
 
 def check_range(name: str, values: np.ndarray | float, low: float, high: float, tolerance: float) -> None:

@@ -57,7 +57,7 @@ NAMES = ("llvm", "cuda")
 
 
 class BackendUnavailable(RuntimeError):
-    """The machine cannot run the requested backend (no GPU driver, no usable LLVM)."""
+    """Error: the machine cannot run the requested backend (no GPU driver, no usable LLVM)."""
 
 
 @dataclass(frozen=True)
@@ -231,7 +231,7 @@ def one_kernel_thread() -> Iterator[None]:
 
 
 THREADS_VARIABLE = "TWIN_THREADS"
-"""Environment variable that limits ``cores``, for processes that share the machine with others of their kind."""
+"""Environment variable with the largest number of cores that ``cores`` returns, for processes that share a machine."""
 ONE_THREAD = {
     THREADS_VARIABLE: "1",
     "OMP_NUM_THREADS": "1",
@@ -239,7 +239,7 @@ ONE_THREAD = {
     "MKL_NUM_THREADS": "1",
     "NUMEXPR_NUM_THREADS": "1",
 }
-"""Environment variables of a worker process, so that it and its linear algebra run on one thread."""
+"""Environment variables with which a worker process and its linear algebra run on one thread."""
 
 
 def cores() -> int:

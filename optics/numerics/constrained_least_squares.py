@@ -18,11 +18,14 @@ from scipy.linalg import solve_triangular
 from scipy.optimize import nnls
 
 _FIRST_DAMPING, _LEAST_DAMPING, _MOST_DAMPING = 1e-6, 1e-20, 1e6
-"""Damping relative to the squared norms of the Jacobian's columns: initial, smallest, and where the search gives up."""
+"""Damping relative to the squared norms of the Jacobian's columns.
+
+They are the first damping, the smallest one, and the one above which the search ends without a better point.
+"""
 _RIDGE = 1e-12
-"""Ridge added to the unit diagonal of the dual problem: constraints may be dependent or contradictory."""
+"""Number added to the unit diagonal of the dual problem, as constraints may be dependent or contradictory."""
 _MAX_PENALTY = 1e3
-"""Largest penalty of a violation: constraints that contradict each other have no finite multipliers."""
+"""Largest factor of the sum of violations in the merit; contradictory constraints have no finite multipliers."""
 _MIN_GAIN_RATIO = 1e-3
 """Smallest ratio of actual to predicted decrease of the merit for which a step is accepted."""
 
@@ -79,7 +82,10 @@ class Solution:
 
 
 Evaluate = Callable[[np.ndarray, bool], Sample | None]
-"""Function that returns the sample at x, with derivatives if the second argument is true; None rejects the step."""
+"""Function of x that returns residuals and constraints there, with derivatives if its second argument is true.
+
+It returns None where x is not admissible, which rejects the step.
+"""
 
 
 def violations(constraints: np.ndarray, equal: np.ndarray) -> np.ndarray:
@@ -173,7 +179,10 @@ def constrained_least_squares(
 
 
 def _merit(sample: Sample | None, equal: np.ndarray, penalty: float) -> float:
-    """Return the cost plus ``penalty`` times the violations; infinite where there is no sample."""
+    """Return the merit by which steps are judged: cost plus ``penalty`` times the sum of violations.
+
+    It is infinite where there is no sample; ``equal`` is the mask of the constraints that are equations.
+    """
     if sample is None or not np.all(np.isfinite(sample.residuals)):
         return np.inf
     return sample.cost + penalty * float(violations(sample.constraints, equal).sum())

@@ -11,13 +11,16 @@ from typing import Any, TypeVar
 
 # written in two parts, since in a wheel the joined word is the prefix of the modules' names
 PREFIX = "space_camera_twin" + "."
-"""Prefix of the names of the groups of entry points; the name of the table follows."""
+"""First part of the names of entry-point groups that extend a table; the name of the table follows."""
 
 Value = TypeVar("Value")
 
 
 class EntryPointError(Exception):
-    """An entry of another distribution cannot be used; the message names distribution, group, entry and remedy."""
+    """Error: an entry of another distribution cannot be used.
+
+    The message names distribution, group, entry and remedy.
+    """
 
 
 @dataclass(frozen=True)
@@ -69,7 +72,7 @@ class ExtensionTable(UserDict[str, Value]):
 
     @cached_property
     def data(self) -> dict[str, Any]:  # type: ignore[override]
-        """Name -> value, or the entry from which the value is loaded, or the error to raise when it is read."""
+        """Name -> value, or the entry point that provides it, or the error to raise if the entry point is broken."""
         table: dict[str, Any] = dict(self._own)
         for entry in entries():
             if entry.group == self.group and (other := table.setdefault(entry.name, entry)) is not entry:

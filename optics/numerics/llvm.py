@@ -22,7 +22,7 @@ OLDEST = 17
 
 
 class LibraryMissing(ImportError):
-    """A shared library that Dr.Jit or Mitsuba needs is missing; the message says what to install."""
+    """Error: a shared library that Dr.Jit or Mitsuba needs is missing; the message says what to install."""
 
 
 def ensure_llvm() -> Path | None:

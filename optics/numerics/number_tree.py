@@ -20,7 +20,7 @@ Value = TypeVar("Value")
 
 
 class FrozenMap(dict[Key, Value]):
-    """Dict that refuses changes; hashable when its values are."""
+    """Immutable dict: every change raises an error. It is hashable when its values are."""
 
     def __hash__(self) -> int:  # type: ignore[override]
         return hash(frozenset(self.items()))
@@ -65,7 +65,10 @@ def _collect(tree: Any, path: Path, out: dict[Path, Any]) -> None:
 
 
 def form_of(tree: Tree) -> Tree:
-    """Return the tree with each number replaced by its index in the list of all its numbers (``numbers_in``)."""
+    """Return the tree with each number replaced by its index in the list of all its numbers (``numbers_in``).
+
+    Trees of equal form differ in their numbers only.
+    """
     indices = count()
     return map_leaves(lambda number: next(indices), tree)
 

@@ -21,14 +21,14 @@ MAX_ITERATIONS = 25
 
 
 class AimError(PhysicalError, RuntimeError):
-    """No ray from the given point reaches the target."""
+    """Error: no ray of the requested kind reaches the target point, or the search for it does not converge."""
 
 
 @dataclass(frozen=True, eq=False)
 class RayFan:
-    """Family of rays for each of N rays in each of B systems, with two parameters a, b that aim it.
+    """N rays in each of B systems that can be aimed, each by two parameters a and b.
 
-    The parameters move the direction or the launch point.
+    The parameters move the ray's direction or its launch point.
 
     Attributes
     ----------
@@ -49,7 +49,7 @@ class RayFan:
     moves_position: bool = False
 
     def at(self, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return launch points and unit directions, (B, N, 3) each, for the parameters (a, b) of each ray.
+        """Return launch points (metres) and unit directions, (B, N, 3) each, for given parameters (a, b) of each ray.
 
         ``q`` (B, N, 2) are these parameters, for N rays in each of B systems.
         """
@@ -98,7 +98,7 @@ def aim(
     systems : SystemBatch
         B systems that end at the target element; apertures are ignored.
     fan : RayFan
-        Families of N rays for each system.
+        N rays for each system, with two parameters each that aim them.
     target : ndarray
         Target x, y on that element, metres at its nominal size, broadcastable to (B, N, 2): points of an aperture,
         which expands with its body.
@@ -165,7 +165,7 @@ def aim(
 
 
 def _solve(matrix: np.ndarray, right: np.ndarray) -> np.ndarray:
-    """Return the solutions (..., 2) of 2 x 2 systems by Cramer's rule; not finite where singular."""
+    """Return the solutions (..., 2) of systems of two linear equations by Cramer's rule; not finite if singular."""
     (a, b), (c, d) = np.moveaxis(matrix, (-2, -1), (0, 1))
     x, y = np.moveaxis(right, -1, 0)
     with np.errstate(divide="ignore", invalid="ignore"):

@@ -24,7 +24,7 @@ class Interaction(Enum):
     REFRACT = "refract"
     PASS = "pass"
     TOTAL = "total"
-    """Total reflection inside glass; a ray that is not beyond the critical angle is lost."""
+    """Total internal reflection in glass; a ray whose angle of incidence is below the critical angle is lost."""
 
     # hash by identity: hashing by name makes looking up a recorded trace as slow as launching it
     __hash__ = object.__hash__
@@ -79,7 +79,7 @@ class Element:
 
     @property
     def figure_disk(self) -> ZernikeFigure:
-        """Zernike figure to which a state's figure terms are added: ``Surface.figure_disk`` over the clear aperture.
+        """Zernike figure to whose disk the Zernike terms of a perturbed state refer (``Surface.figure_disk``).
 
         Raises
         ------
@@ -92,7 +92,7 @@ class Element:
         return self.surface.figure_disk(outer)
 
     def figured(self, motion: Motion) -> Surface:
-        """Return the surface changed as a motion says: in radius, conic constant and figure.
+        """Return the surface with the changes of radius, conic constant and figure error that a motion of its body has.
 
         Raises
         ------
@@ -148,7 +148,7 @@ class Assembly:
     media : mapping of str to float
         Path of a glass body -> its refractive index in vacuum.
     above_d : mapping of str to float
-        Path of a glass body of known dispersion -> that index minus the one at the d line.
+        Path of a glass body of known dispersion -> that index minus the index at the d line (587.6 nm).
     """
 
     tree: RigidTree
@@ -181,11 +181,11 @@ class Assembly:
 
     @cached_property
     def system_cache(self) -> dict[Any, Any]:
-        """Cache of numbers of the nominal elements, which ``optics.raytrace.system.assemble`` fills and reads."""
+        """Cache of the numbers of the nominal elements, which ``optics.raytrace.system.assemble`` fills and reads."""
         return {}
 
     def index(self, solid: str, motion: Motion = AT_REST) -> float:
-        """Return the refractive index of a glass body with a motion, at the origin of its frame."""
+        """Return the vacuum refractive index of a glass body, changed by a motion, at the origin of its frame."""
         return self.media[solid] + motion.index + self.above_d.get(solid, 0.0) * motion.dispersion
 
     def sequence(self, name: str) -> tuple[Element, ...]:
@@ -217,7 +217,7 @@ class Assembly:
     def with_nominal(self, state: State) -> Assembly:
         """Return the assembly whose nominal poses, surfaces and refractive indices are those of a state of this one.
 
-        States of the new assembly come on top, as in ``optics.geometry.tree.compose``.
+        A state of the new assembly is applied on top of that state (``optics.geometry.tree.compose``).
 
         Parameters
         ----------

@@ -1,6 +1,7 @@
 """Numbers of one element for the trace: its frame, shape and clear aperture, and the media on both sides.
 
-``Structure`` holds what determines the code of a kernel, as against the numbers that it works on.
+``Structure`` holds the properties that determine the code of a kernel (such as the kind of a surface); all others are
+numbers that the kernel reads.
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ from optics.raytrace.assembly import Assembly, Element, Interaction
 
 @dataclass(frozen=True)
 class Structure:
-    """Properties of one element that determine the code of a kernel, e.g. the kind of its surface."""
+    """Properties of an element that determine the code of the kernel that traces it, e.g. the kind of its surface."""
 
     interaction: Interaction
     plane: bool
@@ -136,7 +137,7 @@ def media_along(chain: Sequence[Element]) -> list[Medium]:
 
 
 def structure_of(elements: Sequence[Element]) -> Structure:
-    """Return the structure that serves the nominal elements at the same position of several sequences."""
+    """Return the structure of elements at one position of several sequences, so that one kernel can trace them all."""
     grid = any(_known_figure(e) is not None and e.surface.grid_figure is not None for e in elements)
     apertures = [None if e.aperture is None else type(e.aperture.numbers()) for e in elements]
     kinds = {(e.interaction, e.surface.is_plane, kind) for e, kind in zip(elements, apertures, strict=True)}
@@ -153,7 +154,7 @@ def structure_of(elements: Sequence[Element]) -> Structure:
 
 
 def _known_figure(element: Element) -> Figure | None:
-    """Return the figure of an element's surface; raise ValueError for a type that the trace does not support."""
+    """Return the figure error of an element's surface; raise ValueError if the ray trace does not support its type."""
     match element.surface.figure:
         case None | ZernikeFigure() | GridFigure() | SummedFigure() as figure:
             return figure
@@ -217,7 +218,7 @@ def _surface_numbers(
     states: Sequence[State],
     step: Sequence[tuple[str, str, int]] | None,
 ) -> SurfaceNumbers:
-    """Return the numbers of an element's shape in each state; the grid figure is added elsewhere."""
+    """Return the numbers of an element's shape (curvature, conic, figure) in each state, except its grid figure."""
     surface = element.surface
     curvature, conic, even = None, None, []
     if not structure.plane:
@@ -251,7 +252,8 @@ def _figure_numbers(
 
 
 _NO_GRID = GridFigure(np.zeros((4, 4)), (-1.0, 1.0, -1.0, 1.0))
-"""Zero grid, read by a system without a grid where others of its batch have one."""
+"""Figure of zeros on a grid, for an element without a grid figure that is traced together with elements that have one.
+"""
 
 
 def grid_numbers(elements: Sequence[Element], states: Sequence[State]) -> tuple[GridNumbers, np.ndarray]:

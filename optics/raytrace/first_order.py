@@ -24,11 +24,12 @@ class RayMatrix:
     Attributes
     ----------
     image_by_position, image_by_angle : (B, 2, 2) ndarray
-        d(x, y on the last element)/d(launch), in 1 and m/rad.
+        Derivatives of the position x, y on the last element with respect to the launch position (dimensionless) and to
+        the launch direction (m/rad), each along the two launch axes.
     direction_by_position, direction_by_angle : (B, 2, 2) ndarray
-        d(direction x, y on the last element)/d(launch), in 1/m and 1.
+        Derivatives of the direction cosines x, y at the last element, in 1/m and dimensionless.
     stop_by_position, stop_by_angle : (B, 2, 2) ndarray
-        d(x, y on the stop)/d(launch), in 1 and m/rad.
+        Derivatives of the position x, y on the stop, dimensionless and in m/rad.
     direction : (B, 3) ndarray
         Unit direction of the ray at the last element, in its frame.
     """
@@ -49,9 +50,9 @@ class FirstOrder:
     Attributes
     ----------
     scale : (B, 2, 2) ndarray
-        Derivative of the image position x, y with respect to the object angle about the two launch axes, with the stop
-        point held, metres per radian: the local principal distance along each axis, for the plane where the image is
-        taken; off-diagonal terms are rotation and anamorphism.
+        Derivative of the image position x, y with respect to the object angle about the two launch axes, for a fixed
+        point of the stop, metres per radian: the local principal distance along each axis, for the plane where the
+        image is taken; off-diagonal terms are rotation and anamorphism.
     principal_distance : (B,) ndarray
         Square root of the modulus of the determinant of ``scale``, metres.
     entrance_magnification : (B, 2, 2) ndarray
@@ -302,8 +303,8 @@ def chief_rays(
 class LineChange:
     """True changes of a line camera in B perturbed states against its nominal state.
 
-    The line is what the camera's line CCD images. L is the distance of a point from the centre of the line CCD and W
-    the angle of its chief ray from the line of sight.
+    "The line" is the line in object space that the camera's line CCD images. L is the distance of a point from the
+    centre of the line CCD and W the angle of its chief ray from the line of sight.
 
     Attributes
     ----------
@@ -312,9 +313,9 @@ class LineChange:
     d_gamma : (B,) ndarray
         Rotation of the imaged line about the line of sight, radians.
     principal_distance : (B,) ndarray
-        f = sum(L tan W)/sum(tan^2 W) over the line (paper 004, eq. 3), metres. L is counted in pixels times their
-        nominal pitch, so that f describes the angle of a pixel: a camera that expands together with its line CCD keeps
-        that angle, and so f.
+        f = sum(L tan W)/sum(tan^2 W) over the line (Li et al., 2020, doi 10.3788/IRLA20200143, eq. 3), metres. L is
+        counted in pixels times their nominal pitch, so that f describes the angle of a pixel: a camera that expands
+        together with its line CCD keeps that angle, and so f.
     d_f : (B,) ndarray
         Change of the principal distance, metres.
     nominal_distance : float

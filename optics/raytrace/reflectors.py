@@ -1,5 +1,9 @@
 """Reflectors of a monitor's beam, by kind: their bodies and faces, optical elements and clear apertures.
 
+A monitor is an autocollimator in a camera's focal plane; these reflectors lead its beam, which leaves the camera, to
+the mirror facet that sends it back. One kind returns a beam antiparallel and displaced (as the 180-deg prism), the
+other displaces it and keeps its direction (as the 0-deg prism).
+
 The 180-deg prism is a slice of a corner cube. Its frame has z along the beam that enters, x along the transfer, the
 origin in the middle of its window:
 
@@ -131,12 +135,12 @@ class ReflectorParts:
 
 
 def _no_offset(width: float) -> float:
-    """Return the lateral offset of a reflector whose beam lies in its middle: 0, whatever the width."""
+    """Return 0, the lateral distance of the beam from the middle of a reflector that it passes in the middle."""
     return 0.0
 
 
 def _origin(length: float, width: float) -> tuple[float, float, float]:
-    """Return the origin of the reflector's frame, (0, 0, 0), as its null point, whatever the length and width."""
+    """Return (0, 0, 0), the point about which rotations leave the beam unchanged if it is the frame's origin."""
     return (0.0, 0.0, 0.0)
 
 
@@ -177,7 +181,7 @@ _S = 1.0 / sqrt(2.0)
 
 
 def prism_180(mount: Mount) -> ReflectorParts:
-    """Return the parts of the 180-deg prism, which returns the beam antiparallel at a lateral distance."""
+    """Return the parts of the 180-deg prism, which returns the beam antiparallel and displaced along x."""
     length, width, hand = mount.length, mount.width, mount.hand
     off = roof_offset(width)
     half = 0.5 * width
@@ -340,7 +344,10 @@ def _thickness(width: float) -> float:
 
 
 def _mirror(name: str, position: Sequence[float], direction: np.ndarray) -> Passage:
-    """Return the reflection of the beam at a mirror with a face of its own, at a position (metres) and direction."""
+    """Return the reflection of the beam at a mirror that is a face by itself.
+
+    ``position`` is the beam's centre on the mirror, metres, and ``direction`` is its direction when it arrives.
+    """
     return Passage(name, name, Interaction.REFLECT, np.array(position), direction)
 
 
@@ -350,9 +357,10 @@ def _on_frame(
     apex: tuple[float, float, float],
     axis: int,
 ) -> ReflectorParts:
-    """Return the parts of a hollow reflector: mirrors on plates, held by a bar beyond them all along ``axis``.
+    """Return the parts of a hollow reflector: mirrors on plates, held by a bar beyond all of them along axis ``axis``.
 
-    Each mirror is given with its normal toward the light.
+    ``mirrors`` are the beam's reflections, each with the mirror's normal toward the light, and ``apex`` is the point
+    about which rotations leave the beam unchanged.
     """
     passages = [passage for passage, _ in mirrors]
     planes: list[Plane] = [
@@ -459,7 +467,10 @@ def _faces(
 
 
 def _footprint(path: str, passage: Passage, shared: set[str]) -> str:
-    """Return the body that carries a passage's element: the face's, or its child if the beam meets the face twice."""
+    """Return the path of the body that carries the optical element where the beam meets a face.
+
+    It is the face's body, or a child of it if the beam meets the face twice.
+    """
     face = f"{path}/{passage.face}"
     return f"{face}/{passage.name}" if passage.face in shared else face
 
@@ -471,7 +482,10 @@ def _centre(passages: list[Passage]) -> tuple[float, float, float]:
 
 
 def _axes(normal: np.ndarray, direction: np.ndarray | None) -> np.ndarray:
-    """Return the axes of a face's frame as columns: z along the normal, x along the arriving beam's tangential part."""
+    """Return the axes of a face's frame as columns (3, 3): z along the normal, x along the beam's tangential part.
+
+    ``direction`` is the direction of the beam that arrives; without one, x is arbitrary.
+    """
     z = normal / norm(normal)
     lean = np.zeros(3) if direction is None else direction - inner(direction, z) * z
     if norm(lean) < 1e-6:

@@ -94,7 +94,7 @@ class SystemBatch:
     size : (B,) ndarray
         Size of the last element's body relative to nominal.
     grids : tuple of ndarray, optional
-        Per element, the spline tables of all systems' grid figures, one after the other; None without any.
+        Per element, the spline coefficients of all systems' grid figures, one after the other; None without any.
     states : int
         Number of states S; systems are ordered sequence by sequence, B = sequences * S.
     """
@@ -111,7 +111,7 @@ class SystemBatch:
 
     @property
     def count(self) -> int:
-        """Number of systems B."""
+        """Number B of systems (element sequences in a perturbed state)."""
         return int(self.numbers.shape[1])
 
     @cached_property
@@ -150,7 +150,7 @@ class SystemBatch:
         return UploadedSystems(backend, self.structure, self.form, tuple(numbers_in(derived)), grids, self.count, True)
 
     def take(self, systems: np.ndarray) -> SystemBatch:
-        """Return some of the systems, given by their indices."""
+        """Return a batch of some of the systems, given by their indices."""
         if np.array_equal(systems, np.arange(self.count)):
             return self
 
@@ -186,11 +186,15 @@ class Poses:
     translation: np.ndarray
 
     def last(self) -> FrameNumbers:
-        """Return the poses of the last element of each system."""
+        """Return the world poses of the last element of each system, as ``FrameNumbers``."""
         return FrameNumbers.of(self.last_rows())
 
     def last_rows(self) -> np.ndarray:
-        """Return the 12 numbers of the last element's pose in each of B systems, (12, B), as in ``FrameNumbers``."""
+        """Return the poses of the last elements of B systems as 12 numbers each, (12, B).
+
+        For each axis of the world these are the shift and the row of the rotation matrix, in the order of
+        ``FrameNumbers``.
+        """
         both = np.concatenate([self.translation[:, -1, :, None], self.rotation[:, -1]], axis=-1)
         return np.ascontiguousarray(both.reshape(len(both), 12).T)
 
@@ -206,11 +210,11 @@ class UploadedSystems:
     structure : tuple of Structure
         Structure of each element.
     form : (tuple of ElementNumbers, FrameNumbers)
-        Row of each of L numbers per element, as in ``SystemBatch``.
+        For each element and for the last pose, its numbers, each replaced by its row in the table of L numbers.
     numbers : Dr.Jit arrays
         L arrays (B,); or one array (L * B,), number by number.
     grids : tuple
-        Spline tables per element, as in ``SystemBatch``.
+        Per element, the spline coefficients of all systems' grid figures; None without any.
     count : int
         Number of systems B.
     differentiable : bool
@@ -253,16 +257,16 @@ class UploadedSystems:
 
 @dataclass(frozen=True, eq=False)
 class _Shapes:
-    """Changes of shape and index in some states that determine the code of a kernel.
+    """Changes of shape and refractive index in a set of states for which a kernel needs other code.
 
     Attributes
     ----------
     orders : mapping of str to int
-        Body -> highest radial order of its figures.
+        Body -> highest radial order of the Zernike figures that states give it.
     gridded : frozenset of str
-        Bodies with a grid figure.
+        Bodies to which a state gives a grid figure.
     graded : frozenset of str
-        Glass bodies with an index gradient.
+        Glass bodies with an index gradient in a state.
     """
 
     orders: Mapping[str, int]
@@ -271,7 +275,7 @@ class _Shapes:
 
     @classmethod
     def of(cls, states: Sequence[State]) -> _Shapes:
-        """Return the changes that the motions of the states cause."""
+        """Return the bodies to which the motions of the states give figures or index gradients."""
         orders: dict[str, int] = {}
         gridded, graded = set(), set()
         for state in states:
@@ -287,7 +291,7 @@ class _Shapes:
 
 @dataclass(frozen=True, eq=False)
 class _Chains:
-    """Sequences of a batch: C chains of K elements each.
+    """Sequences of optical elements that are traced together: C chains of K elements each.
 
     Attributes
     ----------
@@ -341,7 +345,7 @@ class _Chains:
         return [chain[i] for chain in self.elements]
 
     def structure(self, shapes: _Shapes) -> tuple[Structure, ...]:
-        """Return the structure of the elements with the states' changes of shape."""
+        """Return the structure of each element, including what the states' changes of shape add to it."""
         changed, out = shapes.orders.keys() | shapes.gridded | shapes.graded, list(self.nominal)
         for i, nominal in enumerate(out):
             if changed.isdisjoint(self.depends[i]):
@@ -356,7 +360,7 @@ class _Chains:
         return tuple(out)
 
     def _graded(self, medium: int, shapes: _Shapes) -> bool:
-        """Return True when a medium has an index gradient in some chain and state."""
+        """Return True when medium number ``medium`` of a chain has an index gradient, in some chain and state."""
         return any(media[medium].solid in shapes.graded for media in self.media)
 
     def local_numbers(
@@ -391,17 +395,19 @@ class _Chains:
 
 @dataclass(frozen=True, eq=False)
 class _Sides:
-    """Sides of optical elements that one glass body fills, and where the numbers of their refractive index are kept.
+    """Places in the table of numbers that hold the refractive index of one glass body.
+
+    The index is needed at each side, before or after, of an optical element that the glass body fills.
 
     Attributes
     ----------
     rows, chains, bodies : (N,) ndarray of int
-        For each of N sides, the row of its index in the table of numbers, its chain, and the index of the element's
-        body.
-    gradient : ndarray of int
-        Sides that have an index gradient.
-    slopes : (3, ...) ndarray of int
-        Rows of the gradient's three components of those sides.
+        For each of N sides of elements, the row of its index in the table of numbers, its chain, and the index of the
+        element's body.
+    gradient : (G,) ndarray of int
+        Those G of the N sides whose numbers include an index gradient.
+    slopes : (3, G) ndarray of int
+        Rows of the three components of the gradient, for these sides.
     """
 
     rows: np.ndarray
@@ -413,25 +419,27 @@ class _Sides:
 
 @dataclass(frozen=True, eq=False)
 class _Design:
-    """Numbers of C chains of K elements in the nominal state, and how a state changes them.
+    """Numbers of C chains of K elements in the nominal state, and which of them a perturbed state changes.
+
+    The L numbers of a chain (poses, shapes, refractive indices) form a column of a table.
 
     Attributes
     ----------
     chains : _Chains
         The chains.
     structure, form : tuple
-        Structure of each element, and the row of each of L numbers, as in ``SystemBatch``.
+        Structure of each element; and the elements' numbers, each replaced by its row in the table.
     numbers : (L, C) ndarray
         Nominal numbers; those of frames are not set.
     grids : tuple of ndarray, optional
-        Spline tables of grid figures, as in ``SystemBatch``.
+        Per element, the spline coefficients of all chains' grid figures; None without any.
     scaling : mapping of int to (ndarray, ndarray, ndarray)
         Power -> rows and chains of the numbers that scale with that power of their bodies' sizes, and the indices of
         these bodies.
     glass : mapping of str to _Sides
         Glass body -> sides of elements that it fills.
     frame_rows : (K + 1, 12) ndarray of int
-        Rows of the elements' frames and of the last pose.
+        Rows of the 12 numbers of each element's frame, and of the pose of the last element.
     """
 
     chains: _Chains
@@ -445,7 +453,7 @@ class _Design:
 
     @classmethod
     def of(cls, assembly: Assembly, chains: _Chains, structure: tuple[Structure, ...]) -> _Design:
-        """Return the nominal numbers of chains of one structure."""
+        """Return the nominal numbers of chains whose elements have a given structure."""
         placed, frame = assembly.place(), FrameNumbers.of(np.zeros((12, len(chains.elements))))
         twice = replace(placed, scale=np.full_like(placed.scale, 2.0))
 
@@ -545,9 +553,10 @@ class _Design:
         states: Sequence[State],
         known: dict[tuple[str, int, float], np.ndarray],
     ) -> None:
-        """Add to ``out`` the states' changes of the shapes of the elements at position ``i``.
+        """Apply to ``out`` the states' changes of the shapes of the elements at position ``i`` of the chains.
 
-        ``known`` caches figures by body, order and radius.
+        They are changes of radius, conic constant and Zernike figure; ``known`` caches figures by body, order and
+        radius.
         """
         surface = self.form[0][i].surface
         for c, element in enumerate(self.chains.elements_at(i)):

@@ -189,17 +189,17 @@ MIN_LANE_RAYS = 1 << 15
 """Smallest number of rays for which each SIMD lane traces one system: fewer take some milliseconds either way."""
 
 MAX_RECORDINGS = 16
-"""Largest number of recordings (instructions kept for replay) of one trace in one thread.
+"""Largest number of recordings (sequences of instructions kept for replay) of one kind of trace in one thread.
 
-A trace is recorded anew where a bundle shares other numbers, such as a direction.
+A new one is needed when other arrays of the rays have width 1, such as a direction that all rays share.
 """
 
 CONVERGED = 1e-12
-"""Largest distance from the surface, metres, at which an intersection counts as valid."""
+"""Largest distance of a ray's end from the surface, metres, at which its intersection counts as valid."""
 
 
 class BeamMissedError(PhysicalError, RuntimeError):
-    """No ray of a bundle passes through a sequence."""
+    """Error: no ray of a beam passes through a sequence of elements."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -211,7 +211,8 @@ class Rays:
     position, direction, path, valid : Dr.Jit arrays
         Arrays of width systems * N for N rays each, lengths in metres; a direction that all rays share has width 1.
     systems : int
-        Number of systems that the rays are for, system by system; 1: every system gets all of them.
+        Number of systems that the rays belong to; the arrays hold the rays of one system after the other. With 1, every
+        system gets all rays.
     """
 
     position: Any
@@ -223,7 +224,7 @@ class Rays:
 
 @dataclass(frozen=True, eq=False)
 class Traced:
-    """Rays at the last element of a sequence.
+    """Rays of B systems at the last element of a sequence.
 
     Attributes
     ----------
@@ -372,7 +373,7 @@ def trace(
 
 @dataclass(frozen=True)
 class _TracePlan:
-    """Everything that the instructions of a trace depend on; all else is numbers that they read.
+    """Properties of a trace that determine its instructions; all others are numbers that the instructions read.
 
     Attributes
     ----------
@@ -387,11 +388,11 @@ class _TracePlan:
     differentiable : bool
         True when numbers or rays carry derivatives.
     evaluate : bool
-        True when kernels are launched.
+        True when kernels are launched; False when only their graph is built.
     section : int
-        Number of elements of a kernel.
+        Number of elements that one kernel traces.
     alone : bool
-        True when all elements of one structure share a kernel; ``section`` is then 1.
+        True when each element is a kernel of its own, shared by all elements of its structure; ``section`` is then 1.
     """
 
     backend: Backend
@@ -409,11 +410,11 @@ class _TracePlan:
         Parameters
         ----------
         form : tuple
-            Row of each number per element, as in ``UploadedSystems``.
+            For each element, its numbers, each replaced by its row in the table of numbers.
         numbers : tuple
-            Numbers and grids as in ``UploadedSystems``; number of systems, as an array of width 1, or None for one;
-            offset of the numbers, likewise, or None for 0; and the indices of the B systems (B,) where each takes its
-            rays one after the other, else None.
+            Table of numbers; spline coefficients of grid figures; number of systems, as an array of width 1, or None
+            for one; position of the first element's numbers in the table, likewise, or None for 0; and the indices of
+            the B systems (B,) if the rays of each are traced one after the other, else None.
         rays : tuple
             Position, direction, path and validity.
         shared : UInt
@@ -446,7 +447,7 @@ class _TracePlan:
         return shared if shared is None or self.alone else dr.arange(self.backend.UInt, dr.width(position)) // shared
 
     def _launch(self, leg: range, form: Any, lookup: _Lookup, rays: Any, hits: list[Any], outside: list[Any]) -> None:
-        """Launch the kernel that traces a range ``leg`` of elements, if kernels are launched at its end."""
+        """Launch the kernel that traces a range ``leg`` of elements, if the plan launches kernels (``evaluate``)."""
         import drjit as dr
 
         last = leg.stop == len(self.structure)
@@ -604,7 +605,10 @@ def _recorded(plan: _TracePlan, form: Any) -> Any:
 
 
 def require_rays(valid: np.ndarray, name: str) -> None:
-    """Raise BeamMissedError when one of B systems has no valid ray; ``valid`` (B, N) is the mask of N rays each."""
+    """Raise BeamMissedError when one of B systems has no valid ray.
+
+    ``valid`` (B, N) is the mask of N rays each, and ``name`` is what the error calls the beam.
+    """
     alive = np.asarray(np.any(valid.reshape(len(valid), -1), axis=1))
     if not alive.all():
         raise BeamMissedError(
@@ -638,7 +642,7 @@ def _full_width(backend: Backend, rays: Rays, count: int) -> tuple[Rays, Any]:
 
 
 def _lanes(systems: UploadedSystems, rays: int) -> Any:
-    """Return the indices of the B systems (B,), one for each SIMD lane, or None where they do not fill the lanes."""
+    """Return the indices of B systems, (B,), if each SIMD lane is to trace all rays of one system; else None."""
     import drjit as dr
 
     backend, threads = systems.backend, dr.thread_count()
@@ -661,11 +665,11 @@ class _Lookup:
     backend : Backend
         Backend of the rays.
     numbers : Dr.Jit arrays
-        Numbers, as in ``UploadedSystems``.
+        Numbers of all systems, one array per row or all rows in one array, as in ``UploadedSystems.numbers``.
     stride : UInt, optional
         Number of systems, as an array of width 1; None for a single one.
     start : UInt, optional
-        Offset of the first element's numbers, as an array of width 1; None for 0.
+        Position of the first element's numbers in the table, as an array of width 1; None for 0.
     system : UInt, optional
         System of each ray or lane; None for a single one.
     row : int

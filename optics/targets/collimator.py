@@ -13,7 +13,7 @@ from optics.numerics.number_tree import FrozenMap
 
 
 class TooNarrowError(PhysicalError, ValueError):
-    """The collimator's aperture is smaller than the camera's beam."""
+    """Error: the collimator's aperture is smaller than the camera's beam."""
 
 
 @dataclass(frozen=True)

@@ -41,16 +41,22 @@ A transfer function may add two more cycles: the rule's error on three cycles is
 """
 
 _LEAST_PANELS = 32
-"""Smallest number of intervals of integration, for a transfer function that is only piecewise smooth."""
+"""Smallest number of intervals into which an edge profile's integral over frequency is divided.
+
+A transfer function may be only piecewise smooth.
+"""
 
 LEAST_GUARD = 64.0
 """Default distance between the window and the periodic copies of the target, in units of 1/cut-off."""
 
 _FACTORS = (1.0, 4.0, 16.0, 64.0)
-"""Periods of the Fourier series for successively lower frequencies, in units of the first period."""
+"""Ratios of the periods of the Fourier series that are summed for successively lower frequencies."""
 
 _WIDTH = 1.5
-"""Width of a low pass (in frequency) times the distance of the copies; its kernel there is 1e-9 of its peak."""
+"""Width of a low pass in frequency, times the distance of the target's periodic copies.
+
+The low pass's kernel has then fallen to 1e-9 of its peak at that distance.
+"""
 
 _WIDTHS = 7.0
 """Frequency, in widths of a low pass, at which it counts as 0: it is 5e-11."""

@@ -152,7 +152,7 @@ The Nyquist frequency lies 11.5 pixels from its middle.
 """
 
 PINHOLE = 1.0
-"""Diameter of the pinhole's image, pixels."""
+"""Diameter of the image of a window's pinhole target, pixels."""
 
 
 def star_target(pitch: float, region: int) -> Target:

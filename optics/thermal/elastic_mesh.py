@@ -14,7 +14,7 @@ from optics.geometry.surface import Surface
 from optics.numerics.array_math import UnphysicalError
 
 MERGE_DISTANCE = 1e-3
-"""Relative distance, in spacings of the mesh, below which two corners are merged.
+"""Distance, relative to the mesh's spacing, below which two corners of a body are merged.
 
 The effect of a facet so small is far below the resolution of the elements.
 """
@@ -145,7 +145,7 @@ def _on_disk(u: np.ndarray, v: np.ndarray, inner: float) -> tuple[np.ndarray, np
 
 
 def _extruded(plane: np.ndarray, quads: np.ndarray, layers: int) -> MeshHex1:
-    """Return hexahedra over quadrilaterals, in ``layers`` from depth 0 to 1."""
+    """Return a mesh of hexahedra above quadrilaterals of a plane, in ``layers`` layers from depth 0 to 1."""
     count = len(plane)
     depth = np.linspace(0.0, 1.0, layers + 1)
     points = np.concatenate([np.column_stack([plane, np.full(count, d)]) for d in depth])

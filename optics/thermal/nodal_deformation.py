@@ -36,22 +36,23 @@ if TYPE_CHECKING:  # imported late: scipy is slow, and every job imports this mo
 TERMS = 36
 """Default number of Zernike terms, in Noll's order: all to the seventh radial order."""
 OFF_SURFACE = 2e-4
-"""Largest distance of a node from the nominal surface, in radii of the figure's disk.
+"""Largest distance from the nominal surface at which a node counts as on it, in radii of the figure's disk.
 
-Coordinates of seven digits and the chords of coarse elements stay below, the back of a mirror does not.
+Errors of coordinates with seven digits and of the chords of coarse elements are smaller; the back of a mirror is
+farther.
 """
 MIN_NODES = 16
 """Smallest number of nodes on the clear aperture."""
 MAX_GAP = 4.0
 """Largest allowed distance from a point of the aperture to its nearest node, in mean spacings of the nodes."""
 MAX_SCALE_CHANGE = 0.02
-"""Largest relative scale of the face; beyond it the displacements are taken to have another unit."""
+"""Largest accepted relative expansion of the face; beyond it the displacements probably have another unit."""
 MAX_SAG_CHANGE = 1e-3
-"""Largest change of sag, metres; beyond it the table is taken to have another unit or frame than it names."""
+"""Largest accepted change of sag, metres; beyond it the table probably has another unit or frame than it says."""
 PRINTED = 0.3
-"""Ratio of the leave-out error to the residual above which the residual is attributed to the mesh."""
+"""Ratio of the error at left-out nodes to the rms residual above which the residual is attributed to the mesh."""
 SEEN = 1e-9
-"""Error of sag, metres rms, below which no print-through is reported: 1/300 of a wave of reflected light."""
+"""Error of sag, metres rms, below which no mesh print-through is reported: 1/300 of a wave in reflected light."""
 
 _LATTICE = 5  # lattice points per node spacing, by which the cells are measured
 _FINEST = 1200  # largest number of lattice points along the aperture
@@ -62,7 +63,7 @@ _ROUNDING = 1e-14  # metres rms; a smaller residual is rounding and gets no grid
 
 
 class NodesError(PhysicalError, ValueError):
-    """The nodes of a table do not describe the optical face.
+    """Error: the nodes of a table do not describe the optical face.
 
     Attributes
     ----------
@@ -179,7 +180,8 @@ def nodal_deformation(
     weight = _cells(points[:, :2], aperture, spacing)
     rotation, shift, size = _similarity(points, moves, weight)
     if abs(size - 1.0) > MAX_SCALE_CHANGE:
-        raise NodesError(f"the nodes' displacements scale the face by {100.0 * (size - 1.0):.3g} %", _CHECK)
+        text = f"the nodes' displacements scale the face by {100.0 * (size - 1.0):.3g} %"
+        raise NodesError(f"{text}, more than {100.0 * MAX_SCALE_CHANGE:g} %: check their unit", _CHECK)
     # positions of the nodes in the moved frame, and their heights above the nominal surface
     positions = (points + moves - shift) @ rotation
     change = positions[:, 2] - surface.scaled(size).sag(positions[:, 0], positions[:, 1])

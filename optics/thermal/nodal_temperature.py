@@ -30,7 +30,7 @@ It makes the Delaunay tetrahedra of a regular lattice unique.
 _EDGE = 1e-6
 """Largest distance outside the outermost tetrahedra, in barycentric coordinates, at which a point counts as inside."""
 _MOST_STEPS = 2000
-"""Largest number of steps from tetrahedron to tetrahedron in the search for a point."""
+"""Largest number of steps from one tetrahedron to the next in the search for the one that contains a point."""
 
 
 class _Interpolator:
@@ -198,7 +198,10 @@ class NodalTemperature:
         return self._linear_at(places) + rest
 
     def _inside_rest(self, places: np.ndarray) -> np.ndarray:
-        """Return the interpolated deviation from the linear fit at points, kelvin; NaN outside the nodes."""
+        """Return the interpolated deviation from the nodes' linear fit at points, kelvin; NaN outside the nodes.
+
+        ``places`` are the points relative to the nodes' mean position, in units of the nodes' extents.
+        """
         if self._inside is None:
             return np.full(len(places), np.nan)
         return self._inside(self._placed(places))

@@ -68,7 +68,7 @@ class Displacement:
 
 
 class Displaced(Protocol):
-    """Protocol of a body whose displacement is known at every point."""
+    """Interface of a body whose displacement is known at every point."""
 
     def at(self, points: Any) -> np.ndarray:
         """Return the displacement at P points (P, 3) of the body, metres, (P, 3)."""
@@ -166,7 +166,7 @@ class Finder:
 
 
 def rigid_modes(points: np.ndarray) -> np.ndarray:
-    """Return the displacements of P points (P, 3) by unit shifts along and unit rotations about the axes, (6, 3 P)."""
+    """Return the displacements of P points (P, 3) due to unit shifts along and rotations about the axes, (6, 3 P)."""
     shifts = np.broadcast_to(np.eye(3)[:, None, :], (3, len(points), 3))
     turns = np.cross(np.eye(3)[:, None, :], points[None])
     return np.concatenate([shifts, turns]).reshape(6, -1)
@@ -313,9 +313,10 @@ class Kinematic:
         object.__setattr__(self, "points", points)
 
     def released(self, motion: np.ndarray) -> np.ndarray:
-        """Return the six components of displacement that this support holds at 0, metres, (6,).
+        """Return the six displacement components that the support holds at zero, metres, from those of its points.
 
-        ``motion`` (3, 3) are the displacements of its three points, metres.
+        They are those of point 0 in all directions, of point 1 perpendicular to the line from 0 to 1, and of point 2
+        perpendicular to the plane; ``motion`` (3, 3) are the displacements of the three points, metres.
         """
         along = self.points[1] - self.points[0]
         along = along / np.linalg.norm(along)
@@ -465,7 +466,11 @@ class ElasticBody:
         return chosen
 
     def _solved(self, load: np.ndarray, fixed: np.ndarray, values: np.ndarray) -> np.ndarray:
-        """Return the displacements (N, 3) of N nodes, metres, with the components ``fixed`` held at ``values``."""
+        """Return the displacements (N, 3) of N nodes, metres, due to a load, with some components prescribed.
+
+        ``load`` (3 N,) are forces divided by Young's modulus, m^2; ``fixed`` are the indices of the prescribed
+        components and ``values`` their displacements, metres.
+        """
         key = fixed.tobytes()
         if key not in self._factors:
             free = np.setdiff1d(np.arange(len(load)), fixed)

@@ -37,27 +37,39 @@ from optics.numerics.array_math import PhysicalError
 from optics.numerics.backend import cores, one_blas_thread
 
 MAX_POINTS = 256
-"""Largest number of grid points for one set of samples; longer grids are divided, since the work grows with the cube.
+"""Largest number of grid points whose field is interpolated from one set of samples; longer grids are divided.
+
+The work of computing the samples grows with the cube of the number of points.
 """
 
 _BEYOND, _BEYOND_IF_LOOSE = 4.0, 3.0
-"""Extent of the samples beyond each end of the points, in Nyquist distances: for 2e-12 and for 1e-8 accuracy."""
+"""Distances by which samples extend beyond each end of the grid, in multiples of the Nyquist distance.
+
+They give interpolation errors of at most `_TIGHT` and of `_LOOSE`.
+"""
 
 _TIGHT, _LOOSE = 2e-12, 1e-8
-"""Largest error of a wave of the band, of amplitude 1."""
+"""Largest errors at the grid points of a unit wave interpolated from its samples: normal and loose accuracy."""
 
 _OVER = 1.35
+"""Factor of the Nyquist number in the number of samples that is tried first."""
 _MORE, _MORE_IF_LOOSE = 22, 14
-"""First number of samples that is tried: ``_OVER`` times the Nyquist number, plus ``_MORE`` (or for 1e-8 accuracy)."""
+"""Numbers of samples added to ``_OVER`` times the Nyquist number, which gives the first number that is tried.
+
+They are for interpolation errors of at most `_TIGHT` and of `_LOOSE`.
+"""
 
 _BAND_RATIO = 1.1
-"""Ratio of successive bands for which samples are computed."""
+"""Ratio of one bandwidth to the next in the geometric series of bandwidths for which sets of samples are computed."""
 
 _MAX_RATIO = 0.8
-"""Ratio of samples to points above which all points are used instead."""
+"""Ratio of samples to grid points above which the field is computed at all points instead."""
 
 _MAX_BAND = 2.5
-"""Largest band, radians from one point to the next; beyond it the points undersample the field."""
+"""Largest phase of the field's waves, radians from one grid point to the next, for which samples are used.
+
+Beyond it, the points undersample the field.
+"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,7 +89,7 @@ class FieldSamples:
 
     @property
     def count(self) -> int:
-        """Number of samples."""
+        """Number M of samples."""
         return self.weights.shape[1]
 
     @classmethod
@@ -152,13 +164,13 @@ class PupilField:
     wavelength: float
 
     def __getitem__(self, piece: slice) -> PupilField:
-        """Return the field of some of the images."""
+        """Return the field of some of the images, selected by a slice."""
         return PupilField(self.u[piece], self.v[piece], self.eikonal[piece], self.amplitude[piece], self.wavelength)
 
     def scaled_by(self, size: np.ndarray) -> PupilField:
         """Return the field in coordinates x / size, y / size: those of pixels scaled by ``size``, (B,), in B images.
 
-        Phases u x + v y stay, and so does the power: an image is then photons per area of the nominal pixels.
+        Phases u x + v y and the power are unchanged, so that an image gives photons per area of the nominal pixels.
         """
         size = np.asarray(size)[:, None]
         return PupilField(self.u * size, self.v * size, self.eikonal, self.amplitude * size, self.wavelength)
@@ -255,7 +267,7 @@ def _from_samples(
 ) -> None:
     """Fill ``out`` (B, R, C) with the irradiance of B images at R rows and C columns, from samples of the field.
 
-    ``k`` is the wave number, 1/m; rows of samples are paired as in ``_irradiance``.
+    ``k`` is the wave number, 1/m; rows of samples at equal distances on both sides of the middle share their waves.
     """
     (x, columns), (y, rows) = across, down
     count, nodes = field.u.shape
@@ -288,7 +300,7 @@ def _real_rows(first: np.ndarray, factor: np.ndarray, count: int) -> np.ndarray:
     """Return the real, then the imaginary parts of ``first`` times the powers 0 .. ``count`` - 1 of ``factor``.
 
     Both are complex, (B, N) for N nodes in B images; the result has the shape (B, 2 count, N). The powers are built by
-    doubling as in ``_waves``.
+    doubling: the powers m, m + 1, ..., 2 m - 1 are the first m powers times ``factor``^m.
     """
     table = np.empty((len(first), count, first.shape[1]), np.complex128)
     table[:, 0] = first
@@ -373,13 +385,13 @@ _BLOCK_IMAGES = 2
 """Number of images whose wave tables are processed together: the tables should stay in the processor's cache."""
 
 _TABLES = 1 << 21
-"""Size of the wave tables of a block of nodes: memory does not grow with the number of nodes.
+"""Size, in numbers, of the tables of waves of a block of nodes, so that memory does not grow with the number of nodes.
 
 The order of the sums does not depend on it.
 """
 
 _NODES = 4096
-"""Number of nodes per block where the field is sampled."""
+"""Number of nodes of the pupil that are processed in one block where the field is computed at samples."""
 
 _BLOCK_SUM = 160
 """Number of nodes that are added up in one partial sum; the partial sums are then added.
@@ -452,10 +464,13 @@ def airy(radius: ArrayLike, wavelength: float, f_number: float, obscuration: flo
 
 
 FIT_ERROR = 1e-6
-"""Largest error of the matched transfer function; the kernel is enlarged until it is reached."""
+"""Largest accepted error of the kernel's transfer function; the kernel is enlarged until it is below."""
 
 MAX_REACH = 10
-"""Largest half-width of a kernel, in pixels: enough for three quarters of what pixels can sample."""
+"""Largest half-width of the pixel filter's kernel, in pixels.
+
+It suffices for images with frequencies up to three quarters of what the pixels can sample.
+"""
 
 
 class UnsampledImageError(PhysicalError, ValueError):

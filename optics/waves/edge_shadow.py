@@ -6,8 +6,8 @@ polynomials and inverted at the corners of the edge's outline. The blocked part 
 polygons, which ``optics.waves.pupil_shadow`` subtracts from the pupil exactly.
 
 ``IlluminatedStop`` is a quadrature over the illuminated part of a stop. A smooth integrand is integrated over the whole
-disk by Gauss' rule, and each shadow is subtracted by a rule of its own that ends at its sides. So edges leave no
-raster.
+disk by Gauss' rule, and each shadow is subtracted by a rule of its own that ends at its sides. Edges are thus not
+sampled on a raster.
 """
 
 from __future__ import annotations
@@ -38,14 +38,20 @@ its polygon.
 """
 
 FINE_SHARE, COARSE_SHARE = 3e-4, 3e-3
-"""Changes of a shadow's share of the stop with twice as many sides: up to the first, the smaller number of sides is
-used, up to the second the larger one, whose error is a third of the change."""
+"""Limits of the change of a shadow's area, as a fraction of the stop, when round edges get twice as many sides.
+
+Up to the first, the smaller number of sides is used; up to the second, the larger one, whose error is a third of the
+change.
+"""
 
 MOST_PIECES = 160
 """Largest number of polygons of a shadow: the time of a transfer function grows with the square of their number."""
 
 _WINDOW, _WINDOW_SIDES = 1.2, 16
-"""Radius and number of sides of the polygon about the unit disk to which outlines are clipped before projection."""
+"""Radius, in radii of the stop, and number of corners of a polygon around the stop to which outlines are clipped.
+
+Outlines outside the stop have no effect on its light.
+"""
 
 _STEPS, _CLOSE = 12, 1e-9
 """Largest number of Newton steps for a corner, and tolerance of its position in radii of the stop."""
@@ -70,7 +76,7 @@ class StopOutlines:
     blocked: tuple[np.ndarray, ...] = ()
 
     def __add__(self, other: StopOutlines) -> StopOutlines:
-        """Return the outlines of both together, as of the edges of two surfaces."""
+        """Return the outlines of both objects together, such as those of the edges of two surfaces."""
         return StopOutlines(self.clear + other.clear, self.blocked + other.blocked)
 
     def take(self, images: np.ndarray | slice) -> StopOutlines:
@@ -282,7 +288,7 @@ def outlines_on_stop(
 
 
 def _passes_all(edge: Edge, around: np.ndarray, bright: np.ndarray) -> bool:
-    """Return True for a clear edge without a hole that passes all illuminated rays, with a margin.
+    """Return True for an edge without a hole, inside which light passes, if all illuminated rays pass with a margin.
 
     ``around`` (B, N, 2) are the positions of N rays in B images, moved outward by the margin, and ``bright`` is the
     mask of illuminated rays.
@@ -293,14 +299,16 @@ def _passes_all(edge: Edge, around: np.ndarray, bright: np.ndarray) -> bool:
 
 
 _BEAM_MARGIN = 1.1
-"""Scale of the beam about its middle within which a clear edge may block something: nodes do not reach the beam's edge.
+"""Factor by which the beam is enlarged about its middle to test whether an edge blocks some of it.
+
+The quadrature nodes that represent the beam do not reach its rim.
 """
 
 
 def _covers(edge: Edge, ring: Circle, terms: np.ndarray) -> bool:
-    """Return True when the disk within a ring's outer edge contains all of the stop in every image.
+    """Return True when the disk inside a ring's outer edge contains the whole beam in every image.
 
-    ``terms`` are the coefficients of the polynomials that map the stop to the surface.
+    ``terms`` are the coefficients of the polynomials that map a point of the stop to its ray's point on the surface.
     """
     disk = Edge(replace(ring, inner=0.0), edge.blocks, edge.rotation)
     (outline,), _ = next(_outlines(disk, ROUND_SIDES[0]))
@@ -389,7 +397,7 @@ def _divided(corners: np.ndarray) -> np.ndarray:
 
 
 _PARTS = 8
-"""Number of parts into which each side of a rectangle is divided."""
+"""Number of parts into which each side of a rectangle is divided, as it may be curved when projected onto the stop."""
 
 
 def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
@@ -471,7 +479,7 @@ _MIN_HALF_WIDTH = 1e-6
 
 
 def _outside(clear: list[np.ndarray], count: int) -> list[np.ndarray]:
-    """Return what lies outside all clear polygons in the window about the stop, as convex polygons.
+    """Return the part of a window about the stop that lies in none of the clear polygons, as convex polygons.
 
     ``clear`` are polygons (B, V, 2) of V corners in B images.
     """
@@ -483,7 +491,7 @@ def _outside(clear: list[np.ndarray], count: int) -> list[np.ndarray]:
 
 @dataclass(frozen=True, eq=False)
 class SurfaceEdges:
-    """Edges of a camera's surfaces as B images see them.
+    """Edges of a camera's surfaces, and where the rays of B images meet these surfaces.
 
     Attributes
     ----------
@@ -501,7 +509,7 @@ class SurfaceEdges:
 
     @cached_property
     def passed(self) -> list[np.ndarray]:
-        """Masks of the N rays of B images that come through all surfaces up to each one, (B, N) per surface."""
+        """Masks of the rays that no edge up to and including each surface blocks, (B, N) for N rays of B images."""
         through = [
             np.all([edge.passes(place[..., 0], place[..., 1]) for edge in self.edges[name]], axis=0)
             for name, place in self.places.items()

@@ -167,23 +167,24 @@ def orthonormal_parts(
 
 @dataclass(frozen=True, eq=False)
 class PartFit:
-    """Wavefront fit over a part of the unit disk, piston and tilt removed.
+    """Fit of Zernike terms to a wavefront over a part of the unit disk, after removal of piston and tilt.
 
     Attributes
     ----------
     level : (3,) ndarray
-        Piston and the two tilts that were removed, coefficients of Z1 to Z3.
+        Piston and the two tilts that were removed, coefficients of Z1 to Z3, in the unit of the path differences
+        (waves).
     coefficients : (last,) ndarray
-        Least-squares coefficients of the Zernike terms in Noll's order; terms that are similar over the part are
-        correlated.
+        Least-squares coefficients of the Zernike terms in Noll's order, waves rms over the whole disk; terms that are
+        similar over the part are correlated.
     parts : (last,) ndarray
-        Contributions to the rms, as from ``orthonormal_parts``.
+        Contributions of the terms to the rms, waves, after they are made orthonormal over the part one after the other.
     rms : float
-        Rms of the path differences.
+        Rms of the path differences without piston and tilt, waves.
     residual_rms : float
-        Rms of the path differences minus the fit.
+        Rms of the path differences minus the fit, waves.
     strehl : float
-        Square of the modulus of the mean phasor, for path differences in waves.
+        Strehl ratio: squared modulus of the mean of exp(2 pi i times the path difference in waves).
     """
 
     level: np.ndarray

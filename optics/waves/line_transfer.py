@@ -8,8 +8,8 @@ need not be divided into pieces, and no wavefront is extrapolated into the dark.
 
 Across the lines the rule is Fejer's, between the positions where outlines begin, end or have a corner. Where edges of
 the two pupils cross, at another position for every shift, the integrand has a kink, and the error falls with the square
-of the number of lines. A third of the lines is a rule of its own; with other nodes on the cells it gives an error
-estimate, and lines are added until the error is small.
+of the number of lines. A rule on every third line with other nodes on the cells gives an error estimate, and lines are
+added until the error is small.
 
 ``optics.waves.optical_transfer`` serves any frequencies and defocus.
 """
@@ -37,19 +37,18 @@ from optics.waves.pupil_stack import EVEN_WEIGHT, PupilFunction
 from optics.waves.pupil_terms import polynomials, products, smooth_terms
 
 RIM_SIDES = 2048
-"""Number of sides of the polygon of equal area that represents the pupil's edge: within 4e-7 of it, inside and outside.
-"""
+"""Number of sides of the polygon of equal area that represents a pupil's own edge: within 4e-7 of it."""
 
 LINE_SIDES = 192
-"""Number of sides of the polygon of equal area that represents a round edge: within 1e-4 of its radius, on both sides.
-"""
+"""Number of sides of the polygon of equal area that represents another round edge: within 1e-4 of its radius."""
 
 LINES = (400, 720, 1440, 3240)
-"""Numbers of lines across the pupil, tried in this order until the error is small enough."""
+"""Numbers of lines across the pupil that are tried in turn until the transfer function's error is small enough."""
 
 CONVERGED = 1e-4
-"""Change of a transfer function from a third of the lines below which there are enough: the error is then a tenth of
-it.
+"""Largest change of a transfer function, if only a third of the lines is used, with which there are enough lines.
+
+Its error with all lines is then about a tenth of this change.
 """
 
 FEW_OUTLINES = 2
@@ -59,15 +58,16 @@ _MIN_LINES = 9
 """Smallest number of lines between two positions where outlines begin or end."""
 
 _CORNER = 0.3
-"""Smallest change of direction of an outline at a corner, radians; that of a round outline from side to side is
-smaller.
+"""Smallest change of direction between two sides of an outline that counts as a corner, radians.
+
+In polygons that represent round outlines it is smaller.
 """
 
 _SHORT_CELLS = 0.005, 0.04
 """Largest lengths of a cell, in radii of the pupil, with which one and two nodes suffice; longer cells get three."""
 
 _TURNS = 0.2
-"""Largest change of phase over a cell, radians, with which it gets no further node.
+"""Largest change of phase over a cell, radians, for which the cell gets no additional node.
 
 Near the cut-off there are few cells without an edge.
 """
@@ -76,11 +76,12 @@ _BLOCK_NODES = 2**14
 """Number of nodes processed in one block: some arrays of 200 kB that stay in the cache."""
 
 _APART = 1e-6
-"""Smallest distance of two positions between which there are lines, in radii of the pupil."""
+"""Smallest distance, in radii of the pupil, between two positions across the pupil for lines to be put between them."""
 
 _LONGEST_CELL = 0.06
-"""Largest length of a cell, in radii of the pupil: longer steps of a shift are several cells, so that the last one ends
-little beyond the pupil.
+"""Largest length of a cell, in radii of the pupil.
+
+A longer step of the shift is divided into several cells, so that the last cell ends little beyond the pupil.
 """
 
 
@@ -165,7 +166,10 @@ def vignetted_pupils(
 
 
 def unvignetted_at(cut: VignettedPupil, points: np.ndarray) -> np.ndarray:
-    """Return the mask of N points of the normalised pupil, complex (N,), that no edge except the pupil's own blocks."""
+    """Return the mask (N,) of N pupil points, complex, that no edge except the pupil's own blocks.
+
+    Points are in normalised coordinates, in which the pupil's edge is near the unit circle.
+    """
     out = np.ones(len(points), bool)
     for polygons, clear in ((cut.clear, True), (cut.blocked, False)):
         for polygon in polygons:
@@ -292,9 +296,9 @@ def _chebyshev_nodes(count: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _first_nodes(pitch: float, phase: float) -> int:
-    """Return the initial number of nodes on a cell of length ``pitch`` (radii of the pupil).
+    """Return the number of Gauss nodes to start with on a cell of length ``pitch`` (radii of the pupil).
 
-    The phase changes over the cell by up to ``phase`` radians.
+    ``phase`` is the largest change of the wavefront's phase over the cell, radians.
     """
     more = nodes_for(phase, 0) if phase > 1.0 else int(phase > _TURNS)
     return int(np.searchsorted(_SHORT_CELLS, pitch)) + 1 + more
@@ -327,7 +331,9 @@ def _chords(polygon: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]
 
 @dataclass(frozen=True, eq=False)
 class _Lines:
-    """N lines along the shift, and the positions where light begins and ends on them, in radii of the pupil.
+    """N lines across a pupil, parallel to the shift, and the positions where light begins and ends on them.
+
+    Lengths are in radii of the pupil; the shift is along x.
 
     Attributes
     ----------
@@ -336,7 +342,7 @@ class _Lines:
     weight : (N,) ndarray
         Weights of the rule across them.
     coarse : (N,) ndarray
-        Weights of the rule on a third of the lines, 0 for the others.
+        Weights of a coarser rule that uses every third line, for an error estimate; 0 for the other lines.
     begins, ends : (N, K) ndarray
         Ends of up to K illuminated intervals on each line; both equal where there is none.
     bright : (N, K) ndarray of bool
@@ -381,7 +387,7 @@ class _Lines:
         return cls(y, weight, coarse, begins, ends, bright, float(np.min(rim)), float(np.max(rim)))
 
     def third(self) -> _Lines:
-        """Return the third of the lines that is a rule of its own."""
+        """Return every third line, with the weights of the coarser quadrature rule on these lines."""
         used = self.coarse != 0.0
         y, weight, begins, ends, bright = (a[used] for a in (self.y, self.coarse, self.begins, self.ends, self.bright))
         return _Lines(y, weight, weight, begins, ends, bright, self.low, self.high)
@@ -428,10 +434,10 @@ def _fejer(count: int) -> np.ndarray:
 
 @cache
 def _cell_weights(count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return I = ``count`` Gauss nodes and weights on a cell [0, 1], (I,) each, and polynomials of partial integrals.
+    """Return I = ``count`` Gauss nodes and weights on a cell [0, 1], (I,) each, and polynomials for parts of the cell.
 
-    The polynomials, Legendre coefficients over [-1, 1] of shape (I + 1, I), are the integrals of the Lagrange
-    polynomials from a position to the cell's end.
+    The value of polynomial i at a position is the weight of node i in the integral from this position to the cell's
+    end. The polynomials are Legendre coefficients over [-1, 1], (I + 1, I).
     """
     node, weight = gauss(count)
     order = np.arange(count)
@@ -502,22 +508,24 @@ def _autocorrelation(
 
 @dataclass(frozen=True, eq=False)
 class _Edges:
-    """Positions where light begins or ends on lines, P of them, line by line; lines are divided into cells of I nodes.
+    """P positions ("edges") where light begins or ends on the lines across a pupil, ordered by line.
+
+    Each line is divided into cells of equal length with I Gauss nodes each.
 
     Attributes
     ----------
     row : (P,) ndarray of int
-        Line of each edge.
+        Index of the line of each edge.
     cell : (P,) ndarray of int
-        Cell that contains it.
+        Index of the cell that contains it.
     bent : (P,) ndarray
         Position in the cell, from 0 to 1.
     sign : (P,) ndarray
         1 where light begins, -1 where it ends.
     behind : (I, P) ndarray
-        Weights of the cell's nodes behind the edge.
-    rest : ndarray
-        Polynomials of partial integrals that give ``behind``, as from ``_cell_weights``.
+        Weights of the cell's nodes in the integral from the edge to the cell's end.
+    rest : (I + 1, I) ndarray
+        Polynomials of ``_cell_weights`` that give ``behind`` as a function of the edge's position.
     """
 
     row: np.ndarray
@@ -538,10 +546,28 @@ class _Edges:
         return cls(row, cell, position - cell, sign, _rest(position - cell, rest), rest)
 
     def counted(self, start: int, lines: int, cells: int, weight: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the illuminated fraction of each node of some lines, and the indices of nodes of cells with an edge.
+        """Return the weight of light at every node of some lines, relative to Gauss' weight, and the nodes near edges.
 
-        The shapes are (lines, I, cells) and (I, P), for I nodes per cell and P edges. The fraction steps up and down at
-        the edges; in their cells it is the fraction behind the edge.
+        Where a cell has no edge the relative weight is 1 in light and 0 in the dark; in a cell with edges it is the
+        weight of the node in the integral over the illuminated part, divided by that over the whole cell.
+
+        Parameters
+        ----------
+        start : int
+            Index of the first line.
+        lines : int
+            Number of lines.
+        cells : int
+            Number of cells of a line.
+        weight : (I,) ndarray
+            Weights of the I nodes of a cell.
+
+        Returns
+        -------
+        (lines, I, cells) ndarray
+            Relative weights.
+        (I, P) ndarray of int
+            Indices, in the flattened first result, of the nodes of cells that contain the P edges of these lines.
         """
         rows = slice(*np.searchsorted(self.row, [start, start + lines]))
         cell_index, size, nodes = (self.row[rows] - start) * cells + self.cell[rows], lines * cells, len(weight)
@@ -556,17 +582,17 @@ class _Edges:
     def pairs(
         self, lines: np.ndarray, count: int, weight: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Return corrections for pairs of edges of one line whose cells coincide at a shift.
+        """Return corrections of the autocorrelation for two edges of one line that lie in the same cell after a shift.
 
-        The illuminated fraction of such a pair is not the product of the two fractions.
+        The weights of the light common to both copies of the line are not the products of the weights of each.
 
         Parameters
         ----------
         lines : ndarray
-            Weights of the lines.
+            Quadrature weights of the lines.
         count : int
-            Number of shifts, in cells.
-        weight : ndarray
+            Number of shifts, in steps of one cell.
+        weight : (I,) ndarray
             Weights of the I nodes of a cell.
 
         Returns
@@ -574,9 +600,9 @@ class _Edges:
         first, second : (Q,) ndarray of int
             Indices of the two edges of Q pairs.
         step : (Q,) ndarray of int
-            Shift.
+            Shift, in cells, at which their cells coincide.
         more : (I, Q) ndarray
-            Additional weights of the cells' nodes.
+            Weights of the cell's nodes to be added to the products.
         """
         first, second = _same_rows(self.row)
         step = self.cell[first] - self.cell[second]
@@ -589,17 +615,17 @@ class _Edges:
 
 
 def _rest(position: np.ndarray, polynomials_of_rest: np.ndarray) -> np.ndarray:
-    """Return the weights of a cell's I nodes for the part of the cell behind P positions, (I, P).
+    """Return the weights of a cell's I nodes in the integrals from P positions to the cell's end, (I, P).
 
-    ``position`` (P,) runs from 0 to 1 in the cell.
+    ``position`` (P,) runs from 0 to 1 in the cell; ``polynomials_of_rest`` are those of ``_cell_weights``.
     """
     return np.asarray(polynomials_of_rest.T @ legendre.legvander(2.0 * position - 1.0, len(polynomials_of_rest) - 1).T)
 
 
 def _same_rows(row: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return all ordered pairs of items that have the same value in ``row``, as two arrays of indices.
+    """Return all ordered pairs of items with the same value in ``row``, as two arrays of item indices.
 
-    ``row`` (P,) is ascending, for P items.
+    ``row`` (P,) is ascending, for P items; an item is also paired with itself.
     """
     counts = np.bincount(row)
     start = np.cumsum(counts) - counts

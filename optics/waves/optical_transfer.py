@@ -145,7 +145,7 @@ def _band(wavelengths: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np.
 
 
 LEAST_ALONG = 8
-"""Number of nodes on the chords for a constant phase: the amplitude is nearly uniform."""
+"""Number of nodes along a chord of the overlap for a constant phase; it is small, as the amplitude is even."""
 
 MOST_NODES = 2**20
 """Largest number of nodes for one frequency.
@@ -155,7 +155,10 @@ merit of a few such frequencies would take a quarter of an hour.
 """
 
 LEAST_ACROSS = 13
-"""Number of nodes across the chords for a constant phase: their length varies like half a period of a sine."""
+"""Number of nodes across the chords of the overlap for a constant phase.
+
+The chords' length varies across them like half a period of a sine.
+"""
 
 
 def _correlate(
@@ -203,9 +206,11 @@ def _correlate(
 
 
 def _products(pupil: PupilFunction, points: np.ndarray, shift: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return products of the amplitudes of both shifted pupils, and differences of their eikonals and normal cosines.
+    """Return products of amplitude, and differences of eikonal and normal cosine, of two shifted copies of a pupil.
 
-    They are taken half a shift ahead of and half a shift behind the complex points of the overlap.
+    A point c of their overlap is, in the pupil's own coordinates, c + s/2 in one copy and c - s/2 in the other, with s
+    its shift. ``points`` (S, Q) are Q complex points c for each of S complex shifts ``shift`` (S,); each result is (S,
+    Q), the eikonal in metres, the normal cosine dimensionless.
     """
     ahead, behind = points + 0.5 * shift[:, None], points - 0.5 * shift[:, None]
     (path, light), (path_behind, light_behind) = pupil.values(ahead), pupil.values(behind)
@@ -215,10 +220,23 @@ def _products(pupil: PupilFunction, points: np.ndarray, shift: np.ndarray) -> tu
 def _spans(
     pupil: PupilFunction, shift: np.ndarray, right: np.ndarray, left: np.ndarray, wave: np.ndarray, defocus: np.ndarray
 ) -> np.ndarray:
-    """Return the range of the phase across and along the chords of S overlaps for the worst defocus, (2, S).
+    """Return how fast the integrand's phase changes across and along the chords of S overlaps, (2, S).
 
-    The unit is radians per radian of the angle in which Gauss nodes are evenly spaced: half the range of a linear
-    phase.
+    It is the largest change for any defocus, in radians of phase per radian of the angle a in which Gauss nodes cos(a)
+    are evenly spaced. For a phase that is linear along a chord, it is half of the phase's range.
+
+    Parameters
+    ----------
+    pupil : PupilFunction
+        Pupil of the image.
+    shift : (S,) ndarray
+        Complex shifts of the pupil against itself, in its normalised coordinates.
+    right, left : (2, S) ndarray
+        Angles of the overlap's corners on the edges of the two copies, from ``PupilEdge.corners``.
+    wave : (S,) ndarray
+        Wave numbers, rad/m.
+    defocus : ndarray
+        Shifts of the detector, metres.
     """
     probe = (_PROBE, np.ones_like(_PROBE))
     points, _ = pupil.edge.overlap(shift, right, left, probe, probe)
@@ -235,7 +253,11 @@ def _spans(
 def _blocks(
     used: np.ndarray, across: np.ndarray, along: np.ndarray, layers: int
 ) -> Iterator[tuple[np.ndarray, int, int]]:
-    """Yield the indices of shifts with similar ranges of phase, and their numbers of nodes, in bounded blocks."""
+    """Yield groups of shifts that need similar numbers of quadrature nodes, and these numbers across and along chords.
+
+    A group is limited by memory. ``used`` are the indices of the shifts, ``across`` and ``along`` the changes of phase
+    of each (``_spans``), and ``layers`` is the number of positions of the detector.
+    """
     order = np.argsort(along)[::-1]
     start = 0
     while start < len(order):
@@ -255,8 +277,7 @@ def _blocks(
 
 
 FINER = (4, 8, 16, 32, 64)
-"""Numbers of additional nodes along each direction that are tried, in this order, until a transfer function converges.
-"""
+"""Numbers of additional nodes along each direction that are tried in turn until a transfer function converges."""
 
 CONVERGED = 2e-4
 """Largest change of a transfer function due to additional nodes with which there are enough nodes."""
@@ -265,7 +286,8 @@ WORST_TRANSFER = 1e-3
 """Largest allowed change of a transfer function due to additional nodes; beyond it an error is raised."""
 
 _TEST_FREQUENCIES = np.array([[x, 0.0] for x in (0.12, 0.3, 0.55, 0.8)] + [[0.0, y] for y in (0.2, 0.4, 0.6, 0.9)])
-"""Frequencies at which numbers of nodes are compared, in units of the cut-off along both axes."""
+"""Frequencies at which results with different numbers of nodes are compared, relative to the cut-off along each axis.
+"""
 
 
 def with_enough_nodes(pupil: PupilFunction, wavelength: float) -> PupilFunction:
@@ -319,10 +341,13 @@ def with_enough_nodes(pupil: PupilFunction, wavelength: float) -> PupilFunction:
 
 
 TABLE_TAIL = 1e-6
-"""Largest coefficient in the last quarter of a table's series, for a transfer function that is 1 at zero frequency."""
+"""Largest accepted coefficient in the last quarter of the series of a tabulated transfer function.
+
+The transfer function is 1 at zero frequency.
+"""
 
 _DENSE = (1536, 512)
-"""Number of cells of a table's spline from zero to the cut-off, and around the circle."""
+"""Number of cells of the spline of a tabulated transfer function from zero to the cut-off, and around the circle."""
 
 _PAD = 12
 """Number of cells by which the spline is extended beyond its edges.
@@ -331,7 +356,7 @@ The effect of an edge on a cubic spline falls by a factor of 0.27 per cell.
 """
 
 _MOST_NODES = 400
-"""Largest number of radial nodes of a table."""
+"""Largest number of frequencies along the radius at which a tabulated transfer function is computed."""
 
 _SHADOW_GRID = (48, 64)
 """Number of steps from zero to the cut-off, and over half the circle, for a shadow's contribution to a table.
@@ -357,7 +382,8 @@ class TransferTable:
     to_shift : (2, 2) ndarray
         Matrix from cycles/m to normalised shifts at the shortest wavelength.
     reach : ndarray
-        Fourier terms of the longest normalised shift over exp(2 i direction), complex.
+        Complex coefficients of a polynomial in exp(2 i direction), whose real part is the longest shift with an overlap
+        (the cut-off) in that direction, in normalised pupil coordinates.
     spline : ndarray
         Spline coefficients over shift / longest shift and direction, complex.
     """
@@ -470,10 +496,12 @@ def _centroid(pupil: PupilFunction, wavelength: float, defocus: float) -> np.nda
 def _polar_terms(
     pupil: PupilFunction, wavelengths: np.ndarray, defocus: float, centroid: np.ndarray, rings: int, arms: int
 ) -> np.ndarray:
-    """Return Chebyshev and Fourier coefficients of the transfer function at K wavelengths about its centroid.
+    """Return Chebyshev and Fourier coefficients of the transfer function at K wavelengths, about the image's centroid.
 
-    The result is complex, (K, rings, 2 arms). Chebyshev polynomials are of the arc cosine of shift / cut-off, Fourier
-    terms of the direction, in the order of ``np.fft.fft``.
+    The result is complex, (K, rings, 2 arms). Chebyshev polynomials are of the arc cosine of (frequency / cut-off),
+    Fourier terms of the frequency's direction, in the order of ``np.fft.fft``. ``rings`` and ``arms`` are the numbers
+    of frequencies along the radius and of directions over half the circle, ``centroid`` (2,) is in metres, and
+    ``defocus`` is a shift of the detector, metres.
     """
     node = np.cos(np.pi * (np.arange(rings) + 0.5) / rings)
     direction = np.pi * np.arange(arms) / arms
@@ -491,7 +519,7 @@ def _about(
 ) -> np.ndarray:
     """Return the transfer function at K wavelengths and normalised shifts of any shape, (K, *shape).
 
-    The phase of the image's centroid is removed; ``part`` selects the clear pupil or the shadow.
+    The phase due to the position of the image's centroid is removed; ``part`` selects the clear pupil or the shadow.
     """
     repeated = np.repeat(wavelengths, shift.size)
     values = _correlate(pupil, np.tile(shift.ravel(), len(wavelengths)), repeated, np.array([defocus]), part)
@@ -509,7 +537,25 @@ def _shadow_table(
     radius: np.ndarray,
     directions: int,
 ) -> np.ndarray:
-    """Return the shadow's contribution to a table of the transfer function, complex, at given radii and directions."""
+    """Return the shadow's contribution to the band's transfer function on a polar grid, complex, (R, directions).
+
+    Parameters
+    ----------
+    pupil : PupilFunction
+        Pupil with a shadow.
+    wavelengths : (K,) ndarray
+        K wavelengths, metres.
+    share : (K,) ndarray
+        Weights of the wavelengths, with sum 1.
+    defocus : float
+        Shift of the detector, metres.
+    centroid : (2,) ndarray
+        Centroid of the image, metres, whose phase is removed.
+    radius : (R,) ndarray
+        R frequencies, relative to the cut-off of the shortest wavelength in the same direction.
+    directions : int
+        Number of directions, evenly spaced over the circle.
+    """
     rings, arms = _SHADOW_GRID
     direction = np.pi * np.arange(arms) / arms
     ratio = np.arange(rings) / rings
@@ -532,8 +578,10 @@ def _shadow_table(
 
 
 ACROSS, ALONG, IN_SHADOW = 24, 18, 12
-"""Numbers of nodes of ``VariedTransfer`` across and along the chords of an overlap, and along each side of a shadow's
-box: with one wave of error at the edge of the pupil the MTF is accurate to 1e-6."""
+"""Numbers of nodes of ``VariedTransfer`` across and along the chords of an overlap, and on each side of a shadow's box.
+
+With one wave of wavefront error at the edge of the pupil the MTF is then accurate to 1e-6.
+"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -619,9 +667,12 @@ class VariedTransfer:
         return float(abs(sum(np.sum(terms.phasors) for terms in self.colours)))
 
     def modulation(self, paths: np.ndarray) -> np.ndarray:
-        """Return the MTF (0 to 1) when the optical paths of the rays exceed those of the known pupil by ``paths``.
+        """Return the MTF (0 to 1) at the one frequency of this object for varied optical paths, (...).
 
-        ``paths`` (..., K N) are for N rays at each of K traced wavelengths, metres.
+        Parameters
+        ----------
+        paths : (..., K N) ndarray
+            Optical paths of N rays at each of K traced wavelengths minus those of the known pupil, metres.
         """
         whole: np.ndarray | int = 0
         for terms in self.colours:
@@ -652,7 +703,10 @@ class VariedTransfer:
 def _wavelength_terms(
     pupil: PupilFunction, frequency: np.ndarray, wavelength: float, cosines: np.ndarray, degree: int
 ) -> tuple[np.ndarray, np.ndarray] | None:
-    """Return phasors and phase matrix of one wavelength (see ``_WavelengthTerms``); None beyond its cut-off.
+    """Return the known pupil's phasors and the phase matrix of one wavelength, or None beyond its cut-off.
+
+    The phasors are at the nodes of the overlap of the pupil with its copy shifted by the frequency, times quadrature
+    weights; the matrix maps optical paths at the N rays to phase changes at these nodes (see ``_WavelengthTerms``).
 
     Parameters
     ----------

@@ -27,7 +27,10 @@ to 4e-6 where the same arc cuts twice.
 """
 
 FEW_SIDES = 64
-"""Number of sides of that polygon for many pupils at once: 16 times the errors."""
+"""Number of sides of the polygon that represents a pupil's edge if many pupils are computed at once.
+
+The errors are 16 times those with ``RIM_SIDES``.
+"""
 
 MAX_PIECE = 0.5
 """Largest size along x and y of a polygon of a shadow, in radii of the pupil; larger ones are divided.
@@ -50,7 +53,7 @@ _ANGLE_TOLERANCE = 1e-12
 """Angle of an arc, radians, below which it is zero to rounding."""
 
 _MIN_TERM = 1e-10
-"""Size below which a Fourier term of an edge's radius is omitted."""
+"""Modulus below which a Fourier term of the radius of a pupil's edge is omitted, in radii of the pupil."""
 
 _AREA_TOLERANCE = 1e-5
 """Tolerance of the area of a part of a polygon, for a pupil of radius 1: arcs are integrated by Gauss' rule."""
@@ -83,7 +86,8 @@ class PupilShadow:
         polygons : (B, K, V, 2) ndarray
             K polygons of V corners in the pupil planes, which do not overlap.
         harmonics : (2H + 1, B) ndarray
-            Complex harmonics, of orders -H to H, of the pupils' edges.
+            Complex coefficients c_n, n = -H to H, of the edges' points sum c_n exp(i n a), with a the angle on the
+            stop's rim.
         rim_sides : int
             Number of sides of the polygon that represents an edge.
         """
@@ -97,10 +101,10 @@ class PupilShadow:
 
     @cached_property
     def least_nodes(self) -> int:
-        """Number of nodes on each side of a region's box for the wavefronts of cameras near their focus.
+        """Number of quadrature nodes on each side of the box about a region of a shadow, for cameras near their focus.
 
-        In corners of the box a wavefront is extrapolated beyond the pupil. Together with the nodes that the phase needs
-        (``quadrature.nodes_for``) the transfer function is accurate to 1e-5, also with 0.06 waves of spherical
+        The wavefront is extrapolated beyond the pupil in corners of the box. With the nodes that its phase needs in
+        addition (``quadrature.nodes_for``) the transfer function is accurate to 1e-5, also with 0.06 waves of spherical
         aberration and astigmatism.
         """
         return 1 + int(np.ceil(8.0 * float(np.max(np.ptp(self.pieces, axis=-2), initial=0.0))))
@@ -222,9 +226,10 @@ _CORNER_LIMITS = (12, 20, 32, 52)
 
 
 def _similar(*corners: np.ndarray) -> Iterator[tuple[np.ndarray | slice, tuple[int | None, ...]]]:
-    """Yield groups of polygons with similar numbers of corners, and upper bounds of these numbers for each set.
+    """Yield groups (indices) of polygons with similar numbers of corners, and upper bounds of these numbers.
 
-    The bounds are None where all polygons form one group.
+    ``corners`` are the numbers of corners for one or more sets of polygons; a group's k-th members in all sets are
+    processed together, and there is a bound for each set. The bounds are None where all polygons form one group.
     """
     if max((int(np.max(count, initial=0)) for count in corners), default=0) <= _CORNER_LIMITS[0]:
         yield slice(None), (None,) * len(corners)
@@ -373,8 +378,8 @@ def tiled(pieces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def edge_radius(harmonics: np.ndarray) -> np.ndarray:
     """Return the K Fourier terms (B, K) of the radius of B edges, as a function of the angle about the origin.
 
-    The radius is the real part of the sum of c_k exp(i k angle) with these terms c_k; ``harmonics`` are those of the
-    edges.
+    The radius is the real part of the sum of c_k exp(i k angle) with these terms c_k. ``harmonics`` (2H + 1, B) are the
+    coefficients d_n, n = -H to H, of the edges' points sum d_n exp(i n a), with a the angle on the stop's rim.
     """
     last = len(harmonics) // 2
     order = np.abs(np.arange(-last, last + 1))
@@ -558,9 +563,9 @@ def _radius_and_slope(terms: np.ndarray, phasor: np.ndarray) -> tuple[np.ndarray
 
 
 def in_rows(owner: np.ndarray, rows: int) -> tuple[np.ndarray, np.ndarray, int]:
-    """Return how to arrange F items in an array with one row per owner: their order, columns, and the rows' length.
+    """Return how to arrange F items in a table with one row per owner: order of the items, their columns, longest row.
 
-    ``owner`` (F,) is the row of each item.
+    ``owner`` (F,) is the row to which each item belongs, one of ``rows``.
     """
     order = np.argsort(owner, kind="stable")
     counts = np.bincount(owner, minlength=rows)

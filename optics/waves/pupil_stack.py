@@ -38,8 +38,8 @@ from optics.waves.pupil_terms import (
 DEGREE = 8
 """Degree of the polynomials for eikonal and amplitude over a pupil without vignetting.
 
-The library's gf7 leaves an eikonal residual of 1e-8 wavelengths, nominal or perturbed; with 5 nm of every Zernike term
-to seventh order on each mirror it leaves 2e-5.
+For the example camera gf7 the residual of the eikonal (optical path over the pupil) is 1e-8 wavelengths, nominal or
+perturbed; with 5 nm of every Zernike term to seventh order on each mirror it is 2e-5.
 """
 
 VIGNETTED_DEGREES = (DEGREE, 10, 12, 14, 16, 18, 20)
@@ -50,7 +50,9 @@ optimal.
 """
 
 MORE_DEGREES = (24, 28)
-"""Further degrees for a pupil from which no shadows are subtracted; otherwise their values in the dark are too large.
+"""Further polynomial degrees that are tried for a vignetted pupil from which no shadows are subtracted.
+
+With shadows they are not used, as the polynomials' values in the dark, which are subtracted again, are too large.
 """
 
 VIGNETTED_RINGS = 20
@@ -62,8 +64,8 @@ A thin ring or a crescent of light has to contain enough rays for the polynomial
 VIGNETTED_RESIDUAL = 1e-4
 """Rms eikonal residual up to which a fit to a vignetted pupil is accepted at once, wavelengths.
 
-The best of VIGNETTED_DEGREES may leave more. The errors of the polynomials are largest along the edges, at which the
-overlap of a pupil with itself ends.
+The residual with the best of VIGNETTED_DEGREES may be larger. The errors of the polynomials are largest along the
+edges, at which the overlap of a pupil with itself ends.
 """
 
 WORST_RESIDUAL = 1e-3
@@ -73,11 +75,14 @@ It changes the transfer function by about (2 pi)^2 of its square, 4e-5, where th
 """
 
 LEAST_ALONG = 6
-LEAST_ACROSS = 10
-LEAST_SHADOW = 2
-"""Numbers of nodes along and across the chords of an overlap, and on each side of a shadow's box, for a constant phase.
+"""Number of nodes along each chord of a pupil's overlap with its shifted copy, for a constant phase.
 
-The transfer function is then accurate to 2e-6, and to 5e-5 with shadows."""
+With it and ``LEAST_ACROSS`` the transfer function of a clear pupil is accurate to 2e-6.
+"""
+LEAST_ACROSS = 10
+"""Number of chords across a pupil's overlap with its shifted copy, for a constant phase."""
+LEAST_SHADOW = 2
+"""Number of nodes on each side of a shadow's box, for a constant phase: transfer functions are accurate to 5e-5."""
 
 MIN_ILLUMINATED = (DEGREE + 1) * (DEGREE + 2) // 2
 """Smallest number of illuminated nodes for a fit: the number of polynomials of the lowest degree."""
@@ -85,7 +90,7 @@ MIN_ILLUMINATED = (DEGREE + 1) * (DEGREE + 2) // 2
 EVEN_WEIGHT = 1e-2
 """Weight of nodes in the dark relative to illuminated ones, in fits of direction cosines and amplitudes.
 
-These vary so little that no higher polynomials are needed.
+These vary so little over the pupil that no polynomials of higher degree are needed.
 """
 
 _BLOCK = 2**14
@@ -105,7 +110,8 @@ class PupilStack:
     axes : (B, 2, 2) ndarray
         Derivatives of (u, v) with respect to (x, y).
     harmonics : (2H + 1, B) ndarray
-        Complex harmonics, of orders -H to H, of the edges in p.
+        Complex coefficients c_n, n = -H to H, of the edges' points p = sum c_n exp(i n a), with a the angle on the
+        stop's rim.
     eikonal_terms, amplitude_terms : (B, D + 1, D + 1) ndarray
         Coefficients of the products T_i(x) T_j(y) of Chebyshev polynomials to degree D: of the eikonal, metres, and of
         the amplitude density (unit power: its square integrates to 1 over du dv).
@@ -151,7 +157,8 @@ class PupilStack:
         eikonal : (B, N) ndarray
             Eikonal (optical path of each ray's plane wave to the image point), metres.
         amplitude : (B, N) ndarray
-            Amplitudes of the nodes as in ``optics.waves.diffraction.PupilField``, positive.
+            Amplitudes of the nodes times their areas in direction cosines, as in
+            ``optics.waves.diffraction.PupilField``, positive.
         nodes : PupilNodes
             N nodes of a quadrature over the stop's unit disk.
         degree : int
@@ -233,7 +240,8 @@ class PupilStack:
         eikonal : (B, N) ndarray
             Eikonal, metres.
         amplitude : (B, N) ndarray
-            Amplitudes of the nodes as in ``optics.waves.diffraction.PupilField``.
+            Amplitudes of the nodes times their areas in direction cosines, as in
+            ``optics.waves.diffraction.PupilField``.
         nodes : PupilNodes
             Quadrature over the stop's unit disk.
         wavelength : float
@@ -259,8 +267,8 @@ class PupilStack:
     def bend(self) -> np.ndarray:
         """Departure of each of B edges from an ellipse, (B,), in units of the pupil's radius.
 
-        It is the sum of the moduli of the edge's harmonics, each times the square of its order. ``transfer`` allows at
-        most ``optics.waves.pupil_terms.WORST_BEND``.
+        It is the sum of n^2 |c_n| over the edge's harmonics c_n, n their order. ``transfer`` allows at most
+        ``optics.waves.pupil_terms.WORST_BEND``.
         """
         last = len(self.harmonics) // 2
         return np.asarray(np.arange(-last, last + 1) ** 2 @ np.abs(self.harmonics) - 1.0)
@@ -323,9 +331,10 @@ class PupilStack:
         return np.asarray(total / self.power[:, None])
 
     def _shifts(self, frequency: np.ndarray, wavelengths: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the normalised shifts that M frequencies mean at K wavelengths, and the wave number of each, rad/m.
+        """Return the shifts of a pupil against itself for M frequencies at K wavelengths, and wave numbers, rad/m.
 
-        Shifts are complex, (B, K * M) for B pupils; wave numbers have the shape (K * M,).
+        Shifts are complex, in normalised pupil coordinates, (B, K * M) for B pupils; wave numbers have the shape (K *
+        M,).
         """
         steps = (wavelengths[:, None, None] * frequency).reshape(-1, 2)
         moved = np.linalg.solve(self.axes, np.broadcast_to(steps.T, (len(self.axes), 2, len(steps))))
@@ -381,7 +390,11 @@ class PupilStack:
         return np.asarray(np.einsum("k,bkm->bm", share, values.reshape(len(values), len(share), len(frequency))))
 
     def _pieces(self, wave: float, shifts: int, points: int) -> Iterator[tuple[np.ndarray, int, int]]:
-        """Yield groups of pupils that need the same numbers of nodes, in blocks of bounded size."""
+        """Yield groups of pupils that need the same numbers of nodes, and these numbers across and along chords.
+
+        ``wave`` is the largest wave number, rad/m, ``shifts`` the number of shifts of each pupil, and ``points`` the
+        largest number of points in a group.
+        """
         along = np.array([nodes_for(float(span), LEAST_ALONG) for span in wave * self.span])
         for count in np.unique(along):
             rows = int(count) + LEAST_ACROSS - LEAST_ALONG
@@ -454,9 +467,10 @@ def clear_power(harmonics: np.ndarray, amplitude_terms: np.ndarray) -> np.ndarra
     Parameters
     ----------
     harmonics : (2H + 1, B) ndarray
-        Complex harmonics, of orders -H to H, of their edges.
+        Complex coefficients c_n, n = -H to H, of the edges' points sum c_n exp(i n a), with a the angle on the stop's
+        rim.
     amplitude_terms : (B, D + 1, D + 1) ndarray
-        Amplitude coefficients of degree D, as in ``PupilStack``.
+        Coefficients of the products T_i(x) T_j(y) of Chebyshev polynomials to degree D, of the amplitude density.
     """
     edges, nothing = PupilEdge(harmonics), np.zeros(len(amplitude_terms), complex)
     right, left, _ = edges.corners(nothing)
@@ -469,7 +483,8 @@ def _edges(terms: np.ndarray, degree: int) -> tuple[np.ndarray, np.ndarray, np.n
     """Return centres (B, 2), axes (B, 2, 2) and harmonics (2H + 1, B) of the edges of B pupils.
 
     The edges are the images of the unit circle under polynomial maps with K coefficients per coordinate, ``terms`` (B,
-    2, K). Harmonics have the orders -H to H.
+    2, K). Harmonics are the coefficients c_n, n = -H to H, of the edges' points sum c_n exp(i n a), with a the angle on
+    the unit circle.
     """
     samples = 4 * degree
     angle = 2.0 * np.pi * np.arange(samples) / samples
@@ -657,7 +672,8 @@ def circular_pupil(f_number: float, eikonal_terms: np.ndarray | None = None) -> 
     f_number : float
         Focal ratio of the beam.
     eikonal_terms : ndarray, optional
-        Wavefront over the unit disk as in ``PupilFunction``, metres; none by default.
+        Coefficients of the products T_i(x) T_j(y) of Chebyshev polynomials of the eikonal over the unit disk, metres; a
+        perfect wavefront by default.
     """
     aperture = 0.5 / f_number
     flat = np.zeros((1, 1)) if eikonal_terms is None else np.asarray(eikonal_terms, float)

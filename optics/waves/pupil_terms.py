@@ -104,8 +104,11 @@ def to_terms(nodes: PupilNodes, degree: int) -> np.ndarray:
 
 
 BASE_DEGREE, STIFFNESS = 8, 1e-6
-"""Degree of the polynomials that are continued into the dark, and the penalty on the squares of their coefficients
-times their orders above those of a plane, relative to the squared residuals in the light."""
+"""Degree of the polynomials by which a wavefront is continued into the dark part of a pupil, and strength of smoothing.
+
+The strength is the penalty, relative to the squared residuals in the light, on the squares of coefficients times their
+orders, except those of a plane.
+"""
 
 DARK_WEIGHT = 1e-6
 """Weight of a dark node relative to an illuminated one, for the remainder of a wavefront."""
@@ -175,17 +178,21 @@ _CLOSE = 1e-13
 
 @dataclass(frozen=True, eq=False)
 class PupilEdge:
-    """Smooth convex edge that is nearly the unit circle; or S such edges, one for each of S shifts.
+    """Smooth convex pupil edge that is nearly the unit circle, or S such edges, one for each of S shifts.
+
+    A shift displaces a copy of the pupil, whose overlap with the pupil gives the optical transfer function at one
+    frequency; edge number k is that of the pupil to which shift number k applies. Coordinates are in radii of the stop.
 
     Attributes
     ----------
     harmonics : (2H + 1,) or (2H + 1, S) ndarray
-        Complex harmonics of the orders -H to H; that of order 1 is 1, those of the orders 0 and -1 are 0.
+        Complex coefficients c_n, n = -H to H, of the edge's points x + iy = sum c_n exp(i n a), with a the angle on the
+        stop's rim, in radians; c_1 is 1, c_0 and c_-1 are 0.
 
     Raises
     ------
     ValueError
-        The edge is too far from the unit circle.
+        The edge is too far from an ellipse: sum n^2 |c_n| exceeds 1 + ``WORST_BEND``.
     """
 
     harmonics: np.ndarray

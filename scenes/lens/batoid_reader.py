@@ -46,7 +46,7 @@ _OF_OPTICS = frozenset(
     "type name surface coordSys inMedium outMedium medium items obscuration backDist sphereRadius pupilSize "
     "pupilObscuration R_outer R_inner parent stopSurface".split()
 )
-"""Keys of an optic that describe its position and function, or the start of a wavefront calculation."""
+"""Keys of an optic that describe its position, media and function, or where batoid starts a wavefront calculation."""
 
 
 class _Reader:
@@ -315,7 +315,7 @@ class _Reader:
                 raise self.error((*key, "type"), "this type of medium is not supported", kind, known)
 
     def _keep_sellmeier(self, index: float, b_and_c: list[float]) -> None:
-        """Store a Sellmeier glass under its index.
+        """Store the dispersion formula of a Sellmeier glass under its refractive index, by which it is found later.
 
         The file states no wavelength range, so one between the poles of the formula is assumed.
         """

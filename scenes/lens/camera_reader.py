@@ -104,7 +104,7 @@ def with_flat_image(lens: Prescription) -> Prescription:
 PITCH = 7e-6
 """Default pixel pitch of the line CCD, in metres."""
 LARGEST_TILT, TURNED = math.radians(45.0), 1e-12
-"""Largest tilt of an image about x, in radians, and largest sine of its tilt about y that is only rounding."""
+"""Largest tilt of an image about x, in radians, and largest sine of its tilt about y that counts as rounding error."""
 FAR = 1e6
 """Distance beyond which an object is at infinity, in metres: programs write 1e9 millimetres and more for infinity."""
 SAME = 1e-9
@@ -349,9 +349,11 @@ def _tangents_at(model: CameraModel, lens: Prescription, heights: np.ndarray, ba
 
 
 _SMALL_STEP, _STEPS, _REACHED = 1e-6, 40, 1e-9
-"""Tangent for the scale in the middle of the image, largest number of steps to a height, and tolerance of the last but
-one step relative to the largest height. With a distortion of 50 % it reaches 1e-12; heights without a ray do not
-converge."""
+"""Constants of the search for the field direction of a given image height: step of the direction's tangent from which
+the scale in the middle of the image is computed, largest number of iterations, and largest change in the last but
+one iteration, relative to the largest height. With a distortion of 50 % the result is then right to 1e-12 of that
+height; the iteration does not converge for heights that no ray reaches.
+"""
 
 
 def _check(lens: Prescription) -> None:
@@ -469,7 +471,8 @@ def _terms(lens: Prescription, surface: LensSurface, shape: Surface) -> dict[str
         last = max(shape.figure.terms, default=0)
         if last > LAST_NOLL:
             problem = "Zernike terms, or a polynomial, of a higher order than a camera's file allows"
-            raise lens.error(problem, surface.line, f"Z{last}", f"Z1 to Z{LAST_NOLL}, polynomials to order 7")
+            allowed = f"Noll terms Z1 to Z{LAST_NOLL}, and x-y polynomials up to order 7"
+            raise lens.error(problem, surface.line, f"Z{last}", allowed)
         given = {f"Z{j}": a for j, a in shape.figure.terms.items()}
         x0, y0 = shape.figure.centre
         terms.append(ZernikeSag(radius=shape.figure.radius, x0=x0, y0=y0, **given))

@@ -65,7 +65,7 @@ def prescription_of(model: CameraModel) -> Prescription:
 
 
 def _cut(model: CameraModel, name: str) -> tuple[Any, ...]:
-    """Return a surface's clear aperture, line number, glass (both empty here) and further edges."""
+    """Return a surface's clear aperture, line of the file and glass (both empty here), and its further edges."""
     edges = model.edges.get(name, ())
     if name == model.spec.stop or not edges:
         return model.apertures[name], 0, "", edges
@@ -77,7 +77,10 @@ def _cut(model: CameraModel, name: str) -> tuple[Any, ...]:
 
 
 def field_angles(model: CameraModel) -> tuple[tuple[float, float], ...]:
-    """Return centre, ends and corners of the field as angles (x, y), in radians, whose tangents are the direction's."""
+    """Return centre, ends and corners of the field as angles along and across the line, in radians.
+
+    Each direction is (tan x, tan y, 1) for the angles (x, y).
+    """
     spec = model.spec
     sides = [(1.0, 0.0), (-1.0, 0.0), (0.0, 1.0), (0.0, -1.0)]
     shares = [(0.0, 0.0), *sides, *product((1.0, -1.0), repeat=2)]
@@ -219,7 +222,7 @@ def _number(value: float) -> str:
 
 
 def _plain(text: str) -> str:
-    """Return a text with printable ASCII characters alone."""
+    """Return a text in which double quotes and characters other than printable ASCII are replaced by question marks."""
     return "".join(c if " " <= c <= "~" and c != '"' else "?" for c in text)
 
 

@@ -41,7 +41,7 @@ from scenes.lens.statements import (
 
 UNITS = {"M": 1e-3, "MM": 1e-3, "C": 1e-2, "CM": 1e-2, "I": 25.4e-3, "IN": 25.4e-3}
 _POWERS = {name: 4 + 2 * k for k, name in enumerate("ABCDEFGHJ")}
-"""Command -> power of the radius. CODE V skips the letter I."""
+"""Name of a CODE V command for an aspheric coefficient, A to J -> power of the radius; CODE V skips the letter I."""
 
 OF_NO_EFFECT = frozenset(
     # the program's version and author, weights, vignetting solves, variables, couplings, zoom lists, colours,
@@ -133,7 +133,15 @@ def statements(lines: list[str]) -> list[Statement]:
 
 
 def _cut(text: str, mark: str) -> list[str]:
-    """Return the parts of a text between marks, ignoring marks inside quotes."""
+    """Return the parts of a text between separators, ignoring separators inside quotes.
+
+    Parameters
+    ----------
+    text : str
+        The text.
+    mark : str
+        Separator: a single character.
+    """
     parts, quote = [""], ""
     for k, c in enumerate(text):
         if quote:

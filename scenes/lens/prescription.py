@@ -199,7 +199,7 @@ def facing(surface: LensSurface) -> LensSurface:
 
 
 OVER = Pose(np.diag([1.0, -1.0, -1.0]))
-"""Pose of a rotation by 180 deg about x."""
+"""Pose of a rotation by 180 deg about x, which reverses the z axis of a surface's frame."""
 
 
 def turned_over(surface: LensSurface) -> LensSurface:
@@ -253,7 +253,7 @@ def polynomial_of(shape: Surface) -> dict[tuple[int, int], float]:
 
 
 def without_rim(surface: LensSurface) -> LensSurface:
-    """Return a stop without its outer edge; a hole in it stays."""
+    """Return a stop surface without the outer edge of its aperture; a central hole in it is kept."""
     rim = surface.aperture
     hole = Edge(Circle(rim.inner, rim.centre), blocks=True) if isinstance(rim, Circle) and rim.inner else None
     return replace(surface, aperture=None, edges=(*(() if hole is None else (hole,)), *surface.edges))
@@ -275,10 +275,11 @@ def written(value: float, kind: Kind) -> str:
 
 
 _ROUNDING = {ANGLE.si: 1e-14, LENGTH.si: 1e-15}
-"""SI unit -> rounding error of sums and differences of such numbers; the wavelength of light is 1e8 times as much."""
+"""SI unit -> rounding error of sums and differences of numbers in this unit; a wavelength of light is 1e8 times larger.
+"""
 
 _LARGEST_EDGE = 100.0
-"""Size in metres above which an edge is ignored."""
+"""Size of an aperture or obscuration, in metres, above which it is ignored because no light reaches it."""
 
 
 def edge_entries(edges: Iterable[Edge]) -> list[dict[str, Any]]:
@@ -442,8 +443,8 @@ class Prescription:
     wavelengths : tuple[float, ...]
         All wavelengths that the file names, in metres.
     fields : tuple[tuple[float, float], ...]
-        Directions (x, y) from which light comes, as angles of their tangents, in radians; empty where the file defines
-        its fields otherwise.
+        Field angles (x, y), in radians: light travels along (tan x, tan y, 1); empty where the file defines its fields
+        otherwise.
     field_kind : str
         Kind of the file's fields, for messages.
     pupil : Pupil or None

@@ -27,7 +27,7 @@ from scenes.yaml.errors import InputError, Issue, shown
 from scenes.yaml.input_file import read_bytes
 
 LARGEST_FILE = 16 << 20
-"""Largest file, in bytes; prescriptions have some ten thousand."""
+"""Largest file, in bytes; ordinary prescriptions have some ten thousand bytes."""
 LONGEST_LINE = 100_000
 LARGEST_NUMBER = 1e20
 """Largest number: objects at infinity are written as 1e10 to 1e18 millimetres."""
@@ -213,7 +213,9 @@ NO_GLASSES: Glasses = FrozenMap()
 FARTHEST = 1e8
 """Distance beyond which an object is at infinity, in metres; programs write it as 1e10 or 1e13 millimetres."""
 D_LINE, _D_WIDTH = ABBE_LINES[0], 0.1e-9
-"""Wavelength at which the index of a glass without a catalogue is stated, and how near to it one has to be, metres."""
+"""Wavelength of the helium d line, at which a glass without catalogue data has its index, and largest difference from
+it at which that index is used, in metres.
+"""
 
 
 def glass_key(name: str) -> str:
@@ -274,7 +276,21 @@ def named_glasses(glasses: Glasses, surfaces: Iterable[LensSurface]) -> Glasses:
 
 
 def require_d_line(source: Source, what: str, name: str, wavelength: float, line: int) -> None:
-    """Raise InputError for a glass known only by its d-line index if the wavelength, in metres, is another one."""
+    """Raise InputError for a glass known only by its d-line index if the light has another wavelength.
+
+    Parameters
+    ----------
+    source : Source
+        The file.
+    what : str
+        Kind of glass, for the message.
+    name : str
+        Name of the glass in the file.
+    wavelength : float
+        Wavelength of the light, in metres.
+    line : int
+        Line of the file.
+    """
     if abs(wavelength - D_LINE) > _D_WIDTH:
         problem = f"a {what} glass has an index at 587.56 nm only"
         raise source.error(problem, line, f"{name} at {wavelength * 1e9:.6g} nm", "a catalogue's glass")
@@ -413,7 +429,9 @@ def own_glasses() -> Glasses:
 
 
 def read_catalogues(paths: Sequence[str | Path]) -> Glasses:
-    """Return the twin's glasses and those of AGF files, which take precedence, the first file before the others.
+    """Return the built-in glasses and those of AGF catalogue files.
+
+    A glass of the files replaces the built-in one of the same name, and a glass of an earlier file that of a later one.
 
     Parameters
     ----------

@@ -1,1 +1,1 @@
-"""Optical models of specifications: bodies, elements, solids, thermal and disturbance models."""
+"""Models built from checked input files: bodies, optical elements, glass solids, thermal and disturbance models."""

@@ -23,7 +23,7 @@ from scenes.yaml.units import ANGLE, LENGTH, format_quantity
 
 _RINGS = 5
 _ACROSS, _ALONG = (0.0, 0.5, 1.0), (-1.0, 0.0, 1.0)
-"""Fields as fractions of the half angles; the others follow by symmetry."""
+"""Coordinates x and y of a design's field points, as fractions of the half angles; the others follow by symmetry."""
 
 
 class CameraDesignSetup(ExperimentSetup[CameraDesignSpec]):

@@ -63,8 +63,9 @@ of the field; the smallest mistake, a radius instead of a diameter, is a factor 
 """
 
 SAME_PUPIL = 0.01
-"""Largest relative difference between the beam that fills the stop and the beam from which the stop's size was
-computed. About an axis there is none; cameras with rotated surfaces map one circle to another curve and back.
+"""Largest relative difference between the diameter of the beam that fills the stop and that of the beam from which the
+stop's size was computed. They are equal in cameras with an axis of symmetry; cameras with rotated surfaces map a circle
+to another curve on the stop and back.
 """
 
 
@@ -189,7 +190,7 @@ Candidates = Iterator[tuple[str, str, CameraSpec]]
 
 
 def _single(spec: CameraSpec) -> Candidates:
-    """Yield corrections of one number of one surface."""
+    """Yield the camera with one number of one surface corrected, for each likely mistake."""
     for name, mirror in spec.mirrors.items():
         for key, words, value, text in _changes(mirror):
             mirrors = {**spec.mirrors, name: mirror.model_copy(update={key: value})}
@@ -205,7 +206,7 @@ def _together(spec: CameraSpec) -> Candidates:
 
 
 def _places(spec: CameraSpec) -> Candidates:
-    """Yield corrections of one number of the image plane or of the field."""
+    """Yield the camera with one number of the image plane or of the field corrected, for each likely mistake."""
     image = spec.image
     changes: list[tuple[KeyPath, str, dict[str, Any]]] = []
     for z, words in _lengths("z", image.z):
@@ -407,7 +408,7 @@ def pupil_diameter(backend: Backend, to_stop: SystemBatch, axis: CameraAxis, rad
 def axis_data(
     backend: Backend, imaging: SystemBatch, spec: CameraSpec, axis: CameraAxis, first: np.ndarray
 ) -> Paraxial:
-    """Return the paraxial data about the axis of a camera.
+    """Return the paraxial data (focal length, focus, pupils) about the axis of a camera.
 
     Parameters
     ----------
@@ -649,7 +650,7 @@ class CameraModel:
 
     @property
     def mirrors(self) -> tuple[str, ...]:
-        """Mirror names in the order of the light from the scene."""
+        """Names of all surfaces (mirrors, lens faces and stop) in the order of the light from the scene."""
         return tuple(self.spec.mirrors)
 
     @cached_property
@@ -670,8 +671,8 @@ class CameraModel:
         Parameters
         ----------
         hits : callable
-            Function from a mirror's name to the points at which rays meet it, (..., 2 or 3) array of x, y (and z) in
-            the mirror's own frame, in metres of the nominal mirror.
+            Function from a mirror's name to the points at which rays meet it: (..., 2 or 3) array of x, y (and z) in
+            the mirror's own frame, in metres; for a mirror changed by heat, divided by its expansion.
         """
         through: np.ndarray | bool = True
         for name, edges in self.edges.items():
@@ -682,9 +683,9 @@ class CameraModel:
 
     @property
     def line_principal_distance(self) -> float:
-        """Principal distance along the line about the central chief ray, in metres: image shift per field angle.
+        """Principal distance along the line about the central chief ray, in metres.
 
-        It is f in the papers.
+        It is the image shift per field angle in radians; the papers listed in docs/conventions.md call it f.
         """
         return float(abs(self.first_order.scale[0, 0, 0]))
 

@@ -40,9 +40,9 @@ _RINGS = 3
 """Rings of the quadrature over the stop: exact for squares of wavefronts to fifth order."""
 
 EVEN = 10_000
-"""Number of rays, evenly over the stop, of a beam that edges of surfaces vignette. The vignetted share is then right to
-0.1 % and the rms wavefront error of the rest to 0.2 % (HSC at nine fields against a million rays). Rings of Gauss'
-rule, which an edge may follow, were wrong by up to a fifth.
+"""Number of rays, evenly distributed over the stop, in a beam that edges of surfaces vignette. The vignetted fraction
+is then right to 0.1 % and the rms wavefront error of the rest to 0.2 % (Hyper Suprime-Cam at nine fields, compared
+with a million rays). Gauss' rule on rings was wrong by up to a fifth, since an edge may run along a ring.
 """
 
 _STEPS = 6
@@ -54,7 +54,9 @@ _MOST_RAYS = 500_000
 """Largest number of rays traced together, to limit memory."""
 
 _FEW_FIELDS = tuple((x, y) for x in (0.0, 1.0) for y in (-1.0, 0.0, 1.0))
-"""Fields of the quick check: a camera of surfaces of revolution is the same on both sides of its plane of symmetry."""
+"""Fields of the quick check, as fractions of the half field along the line and along the track: one half of the field
+suffices, since a camera of surfaces of revolution is symmetric about a plane.
+"""
 
 
 @dataclass(frozen=True)
@@ -74,7 +76,7 @@ class FocalPlane:
 
     @classmethod
     def of(cls, camera: CameraSpec) -> FocalPlane:
-        """Return the image plane that a camera's file states."""
+        """Return the position and tilt of the image plane that a camera's file gives."""
         return cls(camera.image.z, camera.image.tilt or 0.0)
 
 

@@ -67,10 +67,10 @@ HEAT = ("temperature", "gradient")
 SINGLE = ("scale", "radius", "conic", "index", "temperature")
 """Kinds of components without an axis, of which a body has only one, such as its scale."""
 _NEEDS = {"gradient": "temperature"}
-"""Kind -> permission that a node must have for it, where the two have different names."""
+"""Kind of component -> action that a node must allow for it, for kinds whose name differs from that of the action."""
 
 _Where = Callable[[str, KeyPath, Problem], Issue]
-"""Function that makes an issue from the name of a cause, a key of it and a problem."""
+"""Function that makes the issue (file, line and message) of a problem at a key of a cause, from these three."""
 
 
 @dataclass(frozen=True)
@@ -107,7 +107,7 @@ class Component:
 
     @property
     def what(self) -> str:
-        """Name of the component without the body: ``shift z``."""
+        """Kind and axis of the component without the body's path, such as ``shift z``."""
         if self.kind in SINGLE:
             return self.kind
         return f"{self.kind} {f'Z{self.axis}' if self.kind == 'figure' else AXES[self.axis]}"
@@ -213,7 +213,8 @@ def prior_of_spec(spec: DisturbancesSpec, instrument: Instrument, issue: _Where 
     instrument : Instrument
         Instrument whose bodies move.
     issue : callable or None
-        Function that makes an issue of a problem at a key of a cause; by default an issue of the file itself.
+        Function that returns the error report for a fault, given the cause's name, the key in it and the text of the
+        fault; by default the report points into the disturbances file.
 
     Raises
     ------

@@ -164,8 +164,8 @@ class _BuildArguments:
     spec, cameras, backend, free_beams, free_bodies
         Arguments of ``build_instrument``.
     text : str
-        Text of the specifications, used as cache key: the order of their parts is that of the results, and equality
-        ignores it.
+        Text of the specifications. It makes specifications that are equal but list their parts in another order
+        different keys of the cache, since the order determines that of the results.
     read : tuple[tuple[str, Mapping[KeyPath, int]], ...]
         File and lines of each specification, named in later errors; equal specifications may differ in them.
     """
@@ -368,7 +368,7 @@ def _channels(spec: InstrumentSpec, camera: str, model: CameraModel) -> list[Cha
 
 
 def _monitor_bodies(plane_root: str, channels: list[Channel]) -> list[Body]:
-    """Return the bodies of the boards at the ends of the line CCD, with their reticles and area CCDs."""
+    """Return the bodies of the boards at both ends of the line CCD, with their pinholes (reticles) and area CCDs."""
     bodies = []
     for channel in channels:
         bodies.append(Body(f"{plane_root}/{channel.name}", Pose(np.eye(3), np.array([*channel.ccd, 0.0]))))
@@ -379,7 +379,7 @@ def _monitor_bodies(plane_root: str, channels: list[Channel]) -> list[Body]:
 
 
 def _ccd_elements(channels: list[Channel]) -> dict[str, Element]:
-    """Return name -> optical element of each channel's area CCD."""
+    """Return name -> optical element of the area CCD of every monitor channel."""
     keys = {channel: f"{channel.key}/area_ccd" for channel in channels}
     return {key: Element(key, channel.ccd_body, plane(), Interaction.PASS) for channel, key in keys.items()}
 

@@ -28,9 +28,9 @@ class Instrument:
     spec : InstrumentSpec
         Content of the instrument's file.
     assembly : Assembly
-        Bodies, elements, sequences.
+        Tree of rigid bodies, optical elements on them, and sequences in which light meets the elements.
     cameras : Mapping[str, CameraModel]
-        Name -> model.
+        Name of a camera -> its traced model.
     channels : tuple[Channel, ...]
         All monitor channels, camera by camera, left before right.
     nodes : Mapping[str, NodeInfo]
@@ -42,7 +42,7 @@ class Instrument:
     baffles : tuple[Plate, ...]
         Black plates, used by the path tracer, the shadows and the pictures.
     as_built : State
-        Departures of positions and shapes from the drawing. The assembly includes them, so that the nominal state, {},
+        Departures of positions and shapes from the design. The assembly includes them, so that the nominal state, {},
         is the instrument as built.
     """
 
@@ -82,9 +82,10 @@ class Instrument:
 
     @property
     def separation(self) -> Mapping[str, float]:
-        """Camera -> distance between its left and right area CCD (the papers' L), in metres.
+        """Camera -> distance between the centres of its left and right area CCD, in metres.
 
-        It is the largest distance between its area CCDs if it has no such pair. Empty without a monitor.
+        The papers listed in docs/conventions.md call it L. It is the largest distance between any two area CCDs of the
+        camera if it has no such pair. Empty without a monitor.
         """
         out: dict[str, float] = {}
         for name in self.cameras if self.channels else ():
@@ -112,7 +113,8 @@ class MisplacedError(PhysicalError, ValueError):
     remedy : str
         Advice on the value to choose there.
     channel : tuple[str, str] or None
-        Camera and name of the channel concerned, whose own key takes precedence; None if no single channel is.
+        Camera and name of the channel concerned: where the file has a key for this channel, that is the one to change.
+        None if no single channel is concerned.
     """
 
     def __init__(self, problem: str, key: KeyPath, remedy: str, channel: tuple[str, str] | None = None) -> None:
@@ -121,7 +123,7 @@ class MisplacedError(PhysicalError, ValueError):
 
 
 def key_of(path: str) -> KeyPath:
-    """Return the key of the instrument's file that defines a body, in its form for all channels."""
+    """Return the key of the instrument's file that defines a body; for parts of channels the key for all channels."""
     if path.startswith(CENTRAL_PRISM):
         return (CENTRAL_KEY,)
     prism = prism_of(path)

@@ -31,21 +31,24 @@ from scenes.yaml.errors import KeyPath, unknown
 from scenes.yaml.node_table import read_nodes, read_temperatures
 
 COARSE_CELLS, FINE_CELLS = 12, 16
-"""Finite elements across a mirror for nonlinear temperatures; the difference of both results is the mesh error."""
+"""Numbers of finite elements across a mirror in the two computations of its deformation by nonlinear temperatures.
+
+The difference of their results estimates the discretisation error.
+"""
 PER_SIDE = (4, 6)
 """Finite elements along the longest side of a prism, coarse and fine."""
 LINEAR_TO = 1e-4
-"""Largest departure from a linear field, in kelvin, allowed at nodes of a body without finite elements: a metre of
-aluminium expands by 2 nm.
+"""Largest departure from a linear temperature field, in kelvin, allowed at nodes of a body without finite elements. It
+expands a metre of aluminium by 2 nm.
 """
 ROUNDING = 1e-9
-"""Residual of a field, in kelvin, below which it is zero."""
+"""Departure from a linear temperature field, in kelvin, below which it counts as zero."""
 LEAST_INSIDE = 0.5
 """Smallest fraction of the body's volume that the nodes must cover; with less they belong to another body, frame or
 unit.
 """
 SHOWN_OUTSIDE = 1e-3
-"""Fraction of the body's volume outside the nodes above which a warning is given."""
+"""Fraction of a body's volume outside the region that a table's nodes cover, above which a warning is given."""
 SEEN_HEAT = 1e-3
 """Interpolation error between nodes, in kelvin rms, below which no warning is given."""
 MESHED_TO = 0.1
@@ -132,7 +135,7 @@ class HeatedBody:
         return out
 
     def warnings(self, path: str) -> tuple[str, ...]:
-        """Return warnings about the table of the body ``path``."""
+        """Return warnings about the temperature table of the body ``path``: coverage, interpolation and mesh."""
         out = []
         if self.coverage is not None and self.coverage.outside > SHOWN_OUTSIDE:
             out.append(
@@ -440,9 +443,10 @@ def on_deformed(
     moved: State,
     heated: Mapping[str, HeatedBody] | None = None,
 ) -> State:
-    """Return the state in which the motions of a state act on bodies deformed by tables of nodes.
+    """Return the state that combines motions of bodies with the deformations that tables of nodes describe.
 
-    The deformations are those of tables of displaced nodes and of the residuals of tables of temperatures.
+    The motions act on the deformed bodies. The deformations are those of tables of displaced nodes and of the residuals
+    of tables of temperatures.
 
     Parameters
     ----------

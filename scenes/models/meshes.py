@@ -30,7 +30,7 @@ BOARD_EDGE = 0.020
 """Margin of the board beyond the outermost part that it carries, in metres."""
 
 CHIP = 0.0005
-"""Thickness of detector chips as drawn, in metres."""
+"""Thickness of detector chips in drawings, in metres."""
 
 
 def mirror_mesh(surface: Surface, aperture: Aperture, back: float) -> trimesh.Trimesh:

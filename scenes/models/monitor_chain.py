@@ -120,7 +120,7 @@ def leaving_beams(
 def _leaving(
     model: CameraModel, channels: Sequence[Channel], distance: float, to_base: Pose, backend: Backend
 ) -> list[LeavingBeam]:
-    """Return the beams of channels whose prisms' windows have one distance from the camera, in metres.
+    """Return the beams of channels whose prism windows have the same distance from the camera, in metres.
 
     An error names the first channel without a beam.
     """
@@ -138,7 +138,10 @@ def _leaving(
 def _traced_out(
     model: CameraModel, channels: Sequence[Channel], distance: float, to_base: Pose, backend: Backend
 ) -> list[LeavingBeam]:
-    """Trace the beams of channels with windows at one distance together; an error names all of them."""
+    """Trace together the beams of channels whose prism windows have the same distance from the camera, in metres.
+
+    An error names all of these channels.
+    """
     frame = model.camera_frame
     reference = Pose(frame.rotation, frame.apply(np.array([0.0, 0.0, distance])))
     bare = model.bare_assembly(apertures=False)
@@ -426,7 +429,7 @@ def _aimed(
 def _missed(
     assembly: Assembly, channel: Channel, backend: Backend, position: np.ndarray, direction: np.ndarray
 ) -> MisplacedError:
-    """Return an error that names the first element that a channel's outgoing rays miss.
+    """Return an error that names the first element whose clear aperture a channel's outgoing rays miss.
 
     Parameters
     ----------
@@ -504,6 +507,6 @@ def _columns(x: np.ndarray, z: np.ndarray) -> np.ndarray:
 
 
 def _facet_axes(normal: np.ndarray) -> np.ndarray:
-    """Return the rotation matrix of a facet's frame: z along its normal, x along the line (against Y)."""
+    """Return the rotation matrix of a facet's frame: z along its normal, x along the line CCD, toward the base's -Y."""
     x_axis = transverse_axes(normal, np.array([0.0, -1.0, 0.0]))[0]
     return _columns(x_axis, normal)

@@ -59,7 +59,7 @@ class MonitorDesignSetup(ExperimentSetup[MonitorDesignSpec]):
 
     @classmethod
     def parts(cls, test: MonitorDesignSpec) -> dict[str, Any]:
-        """Read the start instrument with its cameras, and the parts that the design may choose, by field."""
+        """Read the start instrument, its cameras and the parts to choose from; return field -> content."""
         start = load.load_instrument(test.instrument, test, ("instrument",))
         if start.as_built:
             problem = f"{start.name} is an instrument as built; a layout starts from a drawing"
@@ -101,12 +101,13 @@ class MonitorDesignSetup(ExperimentSetup[MonitorDesignSpec]):
 
 @dataclass(frozen=True)
 class Beam:
-    """Beam of a layout, at both ends of both cameras' lines.
+    """Monitor beam of a layout: the numbers of the four mirrored channels at both ends of both cameras' lines.
 
     Attributes
     ----------
     pupil_x, pupil_y : float
-        Middle in the entrance pupil, toward the central prism and toward its own end of the line, in metres.
+        Centre of the beam in the entrance pupil: distance from the pupil's centre toward the central prism (x) and
+        toward the channel's end of the line (y), in metres.
     width : float
         Diameter of its return face, in metres.
     field : float
@@ -116,15 +117,15 @@ class Beam:
     prism_0_distance : float
         Distance of its rhomboid from the return face, in metres.
     shift : float
-        Displacement by its rhomboid, in metres.
+        Displacement of the beam by its rhomboid, in metres.
     spread_x, spread_y : float
-        Position of its facet relative to the apex, in metres.
+        Position of its facet relative to the central prism's apex, along the base's X and Y, in metres.
     prisms : str
-        Name of its prisms in the design.
+        Name of its pair of prisms in the design's file.
     photons : float or None
         Photons of its spot per frame; None for the monitor's number.
     area_ccd : str
-        Name in the design of the area CCD, the same for all channels.
+        Name of the area CCD in the design's file, the same for all channels.
     """
 
     pupil_x: float
@@ -258,7 +259,7 @@ def layout_spec(setup: MonitorDesignSetup, beams: Layout) -> instruments.Instrum
 
 
 def _light(setup: MonitorDesignSetup) -> float:
-    """Return the number of photons per spot and frame for beams that specify none."""
+    """Return the number of photons per spot and frame for beams without a number of their own."""
     return setup.test.photons_per_frame or setup.instrument.autocollimator.reticle.photons_per_frame
 
 
@@ -270,7 +271,19 @@ def channel_name(side: str, number: int) -> str:
 def _channel(
     setup: MonitorDesignSetup, beam: Beam, field: float, offset: tuple[float, float]
 ) -> instruments.ChannelSpec:
-    """Return the specification of one channel of a beam."""
+    """Return the specification of one monitor channel of a beam.
+
+    Parameters
+    ----------
+    setup : MonitorDesignSetup
+        The design.
+    beam : Beam
+        The beam.
+    field : float
+        Field angle of the channel's area CCD from the visual axis, in radians; positive at the +Y end of the line.
+    offset : tuple[float, float]
+        Centre (X, Y) of the beam in the entrance pupil, in metres.
+    """
     monitor = setup.instrument.autocollimator
     rim = monitor.prism_180.width - monitor.return_face.aperture, monitor.prism_0.width - monitor.return_face.aperture
     chosen = (setup.test.prisms or {}).get(beam.prisms)

@@ -231,7 +231,7 @@ class Clearances:
 
     @classmethod
     def of(cls, instrument: Instrument) -> Clearances:
-        """Return the nominal clearances of an instrument."""
+        """Return the gaps between all pairs of bodies of an instrument in its nominal state."""
         placed = instrument.assembly.place()
         bodies = convex_bodies(instrument, placed)
         paths = tuple(bodies)
@@ -494,7 +494,7 @@ def _disk(rays: int = RAYS) -> np.ndarray:
 
 
 def _full_disk() -> np.ndarray:
-    """Return N points over the unit disk up to just inside its edge, by the tolerance of ray aiming, (N, 2)."""
+    """Return N points on rings over the unit disk, (N, 2), with a margin of 0.1 % inside its edge for ray aiming."""
     angle = 2.0 * np.pi * np.arange(_AROUND) / _AROUND
     ring = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
     return np.concatenate([np.zeros((1, 2)), *((k + 1) / _RINGS * (1.0 - 1e-3) * ring for k in range(_RINGS))])
@@ -650,7 +650,7 @@ def check_beams(instrument: Instrument, backend: Backend) -> None:
 
 
 def moved_into_beams(instrument: Instrument, backend: Backend, state: State) -> tuple[str, ...]:
-    """Return warnings about bodies that block monitor beams in a perturbed state, without a full stop.
+    """Return warnings, without a full stop, about bodies that block monitor beams in a perturbed state.
 
     Edges of clear apertures vignette the simulated spots; bodies do not.
     """
@@ -829,7 +829,7 @@ def _through(
 
 
 def _used(instrument: Instrument, path: str, segments: np.ndarray) -> np.ndarray:
-    """Return a mask (N,) of the imaging rays that pass the entrance aperture of a prism's own channel.
+    """Return a mask (N,) of the imaging rays that pass through the entrance aperture of a prism of a monitor channel.
 
     Parameters
     ----------

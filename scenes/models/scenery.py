@@ -42,8 +42,8 @@ from scenes.specs.resolved import ResolvedJob
 from scenes.yaml.finish_files import MeasuredScatter, read_bsdf, read_coating
 
 LEAST_CLEARANCE = 1e-5
-"""Distance beyond a surface at which a leaving path starts to look for the next one, in metres: some twenty roundings
-of float32 at 4 m. For curved surfaces the departure of the triangles is added.
+"""Distance beyond a surface at which a leaving path starts to look for the next one, in metres: some twenty rounding
+errors of float32 coordinates of 4 m. For curved surfaces the distance between triangles and surface is added.
 """
 
 IN_PLANE = 1e-9
@@ -83,7 +83,7 @@ class Finishes:
     metallised: Finish | None = None
 
     def of(self, coating: Coating) -> Finish:
-        """Return the finish of a glass face with this coating."""
+        """Return the finish of a face of a glass body that has this coating."""
         return {
             Coating.MIRROR: self.mirror if self.metallised is None else self.metallised,
             Coating.TRANSMITTING: self.coated,
@@ -113,7 +113,7 @@ class Detector:
 
     @property
     def shape(self) -> tuple[int, int]:
-        """Number of rows and columns."""
+        """Number of rows and number of columns of its pixels."""
         return self.rows, self.columns
 
 
@@ -138,7 +138,7 @@ class SceneSurface:
     triangles : (T, 3) ndarray of int
         Vertex numbers of its T triangles.
     front, back, outside : Finish
-        Finish met from +z, from -z, and outside the clear apertures.
+        Finish on the +z side, on the -z side, and outside the clear apertures.
     apertures : tuple[Aperture, ...]
         Up to two clear apertures.
     ends : bool

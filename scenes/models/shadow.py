@@ -51,8 +51,10 @@ _LAST = 0.999
 """Fraction of the path to the image up to which bodies count: at its end all rays meet."""
 
 _WINDOW, _WINDOW_SIDES = 1.05, 8
-"""Relative radius and sides of the polygon around the stop's disk to which outlines are clipped before their rays are
-found exactly."""
+"""Radius, in radii of the stop, and number of sides of a polygon around the stop to which outlines are clipped.
+
+Clipping comes before their exact rays are traced, which are needed near the stop only.
+"""
 
 _STEPS = 4
 
@@ -138,7 +140,7 @@ class Shadows:
         return cls(pieces, owners, *nodes_in_shadows(pieces, _NODES))
 
     def and_edges(self, outlines: Callable[[int], StopOutlines], name: str) -> Shadows:
-        """Return these shadows together with those of the edges of the camera's own surfaces.
+        """Return these shadows combined with those that the edges of the camera's own surfaces cast.
 
         Parameters
         ----------
@@ -214,7 +216,7 @@ class TracedBeams:
     owner : (B,) ndarray of int
         Number of the state that each image belongs to.
     systems : SystemBatch
-        Systems from the scene to the image, B.
+        The B optical systems, one for each image, from the scene to the image.
     rays : ImagingRays
         Rays of the images.
     heading : (3,) or (B, 3) ndarray
@@ -291,7 +293,7 @@ class ImagingShadows:
         return centre, size
 
     def _end(self, beams: TracedBeams) -> np.ndarray:
-        """Return the distance along the light from the launch points to the first mirror's middle, for B beams.
+        """Return the distance along the light from its launch points to the middle of the first mirror, for B beams.
 
         Returns
         -------
@@ -400,7 +402,8 @@ class _Bundle:
     Attributes
     ----------
     start, end : (B, K, 3) ndarray
-        K polynomial coefficients of the rays' points at both surfaces, in metres, for ``products``.
+        Coefficients of the K polynomials in the stop's x and y (``optics.waves.pupil_terms.products``) whose sums are
+        the rays' points at the first and the second surface, in metres.
     middle : (B, 2, 3) ndarray
         Mean points at both surfaces, in metres.
     spread : (B, 2, 3, 2) ndarray

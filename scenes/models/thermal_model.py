@@ -147,7 +147,7 @@ SPACING = 0.25
 CELLS = 8
 """Number of finite elements across a mirror."""
 TERMS = 15
-"""Number of Zernike terms of a deformed face, to fourth order."""
+"""Number of Zernike terms by which a deformed face is described: all up to fourth order."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -321,7 +321,7 @@ class ThermalModel:
         return self._owners[path]
 
     def _pieces(self, path: str) -> list[Solid]:
-        """Return a solid and the solids that are parts of it."""
+        """Return a solid (a glass body) together with the smaller solids that are parts of it."""
         return [solid for piece, solid in self.solids.items() if self._owner(piece) == path]
 
     def fields(self, temperatures: Mapping[str, _Field], pieces: bool = True) -> dict[str, _Field]:
@@ -438,7 +438,7 @@ class ThermalModel:
         motions: State | None = None,
         progress: Callable[[str], None] = lambda path: None,
     ) -> State:
-        """Return the perturbed state in which bodies have given temperatures, with other motions on top.
+        """Return the perturbed state in which bodies have given temperatures and, in addition, given motions.
 
         Parameters
         ----------

@@ -54,7 +54,7 @@ class ReadingsSpec(Spec):
     Attributes
     ----------
     after : str | None
-        Last one of `moves` that had been made before this measurement; by default no move.
+        Name of the last of the `moves` that was made before this measurement; by default none had been made.
     """
 
     after: Name | None = None
@@ -267,18 +267,25 @@ class SightReadingsSpec(ReadingsSpec):
 
     Attributes
     ----------
-    alpha, beta : float | None
-        Rotation of the line of sight about the camera's Y (alpha) or X (beta), in radians.
+    alpha : float | None
+        Rotation of the line of sight about the camera's Y, in radians.
+    beta : float | None
+        Rotation of the line of sight about the camera's X, in radians.
     gamma : float | None
-        Roll of the line about the line of sight, in radians.
+        Rotation of the line CCD about the line of sight, in radians.
     principal_distance : float | None
         Change of the principal distance, in metres.
-    sigma_alpha, sigma_beta, sigma_gamma : float | None
-        Standard deviation of this angle, in radians; omitted for an angle that is not measured.
+    sigma_alpha : float | None
+        Standard deviation of `alpha`, in radians; omitted if it is not measured.
+    sigma_beta : float | None
+        Standard deviation of `beta`, in radians; omitted if it is not measured.
+    sigma_gamma : float | None
+        Standard deviation of `gamma`, in radians; omitted if it is not measured.
     sigma_principal_distance : float | None
         Standard deviation of the principal distance, in metres; omitted if it is not measured.
     correlation : tuple[tuple[float, ...], ...] | None
-        Correlation matrix of the measured quantities in this order; by default they are uncorrelated.
+        Correlation matrix of the measured quantities in the order alpha, beta, gamma, principal distance; by default
+        they are uncorrelated.
     """
 
     alpha: Turn | None = None
@@ -446,7 +453,7 @@ class ActuatorSpec(CompensatorSpec):
     carrying
         Further bodies that move rigidly with it.
     range
-        Largest amount in either direction, for all moves together.
+        Largest total amount of all moves together, in either direction.
     step
         Step of which the amount is a multiple, as with shims; by default any amount is possible.
     accuracy
@@ -562,7 +569,7 @@ class AsBuiltSpec(Spec):
 
 
 def unknown_within(text: str, found: object, names: Mapping[str, Any], within: tuple[str, ...]) -> Problem:
-    """Return the problem of a name, used at a key below this mapping, that does not exist."""
+    """Return the problem of a name that a key below this mapping uses and that is not among the known names."""
     problem = unknown(text, found, tuple(names))
     return Problem(problem.problem, problem.found, problem.allowed, problem.suggestion, within=within)
 
@@ -583,7 +590,7 @@ class AsBuiltSetup(ExperimentSetup[AsBuiltSpec]):
 
     @classmethod
     def parts(cls, test: AsBuiltSpec) -> dict[str, Any]:
-        """Read the nominal job, and the disturbances from which a simulated instrument is drawn, by field."""
+        """Read the nominal job and the simulated instrument's disturbances; return field of the set-up -> content."""
         base, simulated = resolve_on(test, test.instrument, test.prior), test.simulate
         if simulated is None or simulated.prior is None:
             return {"base": base}

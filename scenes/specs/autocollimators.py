@@ -1,4 +1,7 @@
-"""Test with two autocollimators, the principle experiment of paper 001 (section 3.1)."""
+"""Test with two autocollimators and two mirrors on a turntable.
+
+It is the principle experiment of paper 001 (Wang et al. 2018, section 3.1), which is cited in docs/conventions.md.
+"""
 
 from __future__ import annotations
 
@@ -35,9 +38,9 @@ class LensSpec(Spec):
     back_radius : float
         Radius of curvature of the surface toward the focal plane, in metres.
     thickness : float
-        Thickness on the axis, in metres.
+        Thickness of the lens on its axis, in metres.
     glass : str
-        Glass of the catalogue.
+        Name of the lens's glass in the catalogue.
     diameter : float
         Clear aperture of both surfaces, in metres.
     focal_distance : float
@@ -75,7 +78,7 @@ class AutocollimatorSpec(Spec):
     lens : LensSpec
         Lens of the collimator.
     reticle : ReticleSpec
-        Light source.
+        Light source: an illuminated pinhole in the focal plane.
     area_ccd : AreaCcdSpec
         Detector; its offset counts from the pinhole to the centre of the pixel grid along the system's Y (horizontal)
         and X (up), in metres.
@@ -84,7 +87,7 @@ class AutocollimatorSpec(Spec):
     distance : float
         Distance from the lens's front vertex to the turntable's centre, in metres.
     frames : int
-        Number of frames in a reading.
+        Number of frames averaged in a reading.
     """
 
     wavelength: Wavelength
@@ -129,12 +132,16 @@ class MirrorsSpec(Spec):
 
 
 class StandSpec(Spec):
-    """Half of the angle between the two mirrors on the turntable in the main series about each axis.
+    """Half of the angle between the two mirrors on the turntable in the main series, by axis of rotation.
 
     Attributes
     ----------
-    X, Y, Z : float
-        Half of the angle between the mirrors for rotations about this axis, in radians.
+    X : float
+        Half of the angle between the mirrors for rotations of the turntable about X, in radians.
+    Y : float
+        Half of the angle between the mirrors for rotations of the turntable about Y, in radians.
+    Z : float
+        Half of the angle between the mirrors for rotations of the turntable about Z, in radians.
     """
 
     X: HalfAngle
@@ -149,12 +156,18 @@ class ProgrammeSpec(Spec):
     ----------
     steps : int
         Number of steps after the first reading at zero.
-    small, table, large : float
-        Step size, in radians: a smaller one, that of the main series (`table`) and a larger one.
-    narrow, wide : float
-        Half angle theta between the mirrors, in radians, in the narrow or the wide arrangement.
+    small : float
+        Step of the turntable in a series with smaller steps than the main series, in radians.
+    table : float
+        Step of the turntable in the main series, in radians.
+    large : float
+        Step of the turntable in a series with larger steps than the main series, in radians.
+    narrow : float
+        Half of the angle between the mirrors in the narrow arrangement, in radians.
+    wide : float
+        Half of the angle between the mirrors in the wide arrangement, in radians.
     stands : StandSpec
-        Half angle theta of each axis in the main series.
+        Half of the angle between the mirrors in the main series about each axis.
     """
 
     steps: Annotated[Whole, Field(ge=1, le=100)]
@@ -201,7 +214,7 @@ class AutocollimatorTestSpec(TitledSpec):
     Attributes
     ----------
     autocollimator : AutocollimatorSpec
-        Both autocollimators.
+        Properties of the autocollimators; both are identical.
     mirrors : MirrorsSpec
         Mirrors on the turntable.
     programme : ProgrammeSpec

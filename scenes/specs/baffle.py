@@ -131,7 +131,7 @@ class BaffleSpec(Spec):
     diameter : float | None
         Outer diameter of a tube or a ring, in metres.
     hole : float | None
-        Diameter of the hole of a ring, in metres.
+        Diameter of the round hole in a ring, in metres.
     """
 
     shape: Literal["plate", "box", "tube", "ring"]

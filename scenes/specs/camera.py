@@ -1,6 +1,6 @@
-"""Camera of a file in scenes/library/cameras: prescription and line CCDs.
+"""Specification of a camera (scenes/library/cameras): optical prescription and line CCDs.
 
-The module also has the optimisation of cameras and of monitor layouts.
+Also the specifications of the optimisation of a camera and of the search for a monitor layout.
 """
 
 from __future__ import annotations
@@ -125,7 +125,8 @@ class BeamRangesSpec(Spec):
     pupil_y : tuple[float, float] | None
         Beam centre in the entrance pupil along the line, positive toward the beam's end of the line, in metres.
     width : tuple[float, float] | None
-        Diameter of the return face, in metres. The prisms' widths exceed it by the same amount as at the start.
+        Diameter of the return face, in metres. The prisms are wider than it by the same amount as in the instrument to
+        start from.
     field : tuple[float, float] | None
         Field angle of the area CCD from the visual axis, in radians.
     prism_180_distance : tuple[float, float] | None
@@ -133,7 +134,7 @@ class BeamRangesSpec(Spec):
     prism_0_distance : tuple[float, float] | None
         Distance from the return face to the rhomboid, in metres.
     shift : tuple[float, float] | None
-        Beam displacement by the rhomboid, in metres.
+        Displacement of the beam by the rhomboid, in metres.
     spread_x : tuple[float, float] | None
         Distance of the facet from the central prism's apex along the base's X, in metres.
     spread_y : tuple[float, float] | None
@@ -218,7 +219,7 @@ class PrismChoiceSpec(Spec):
 
 
 class MonitorGoalSpec(Spec):
-    """Goals of a layout: standard deviations that remain after the spots have been read.
+    """Goals of a layout: standard deviations of the changes that remain after the spots have been measured.
 
     They hold for the worse of both cameras and for the worst of several disturbances files.
 
@@ -261,7 +262,8 @@ class MonitorLimitsSpec(Spec):
         Largest mass of all prisms, or of the mirrors in their place, without the central prism, in kg; no limit by
         default.
     spot_sigmas : float
-        Number of standard deviations of its position by which each spot stays within its area CCD.
+        Smallest distance of each spot from the edge of its area CCD, as a multiple of the standard deviation of the
+        spot's position.
     ghost_paths : int | None
         Number of paths per source for tracing ghosts of the layouts on the Pareto front. A layout whose ghosts have
         more than a thousandth of a spot's light is excluded. By default no ghosts are traced.
@@ -333,11 +335,11 @@ class MonitorDesignSpec(Spec):
     frames : int | None
         Number of frames in a measurement; by default that of the instrument to start from.
     goal : MonitorGoalSpec
-        Standard deviations to be reached.
+        Standard deviations of the monitored changes that the layout must reach.
     limits : MonitorLimitsSpec
-        Limits that must not be exceeded.
+        Limits of blocked pupil, mass, spot positions and ghosts that a layout must not exceed.
     search : MonitorSearchSpec
-        Effort of the search.
+        Effort of the search: numbers of beams, layouts, rounds and starts.
     seed : int
         Seed of all random numbers.
     """
@@ -453,7 +455,7 @@ class ImageSpec(Spec):
     Attributes
     ----------
     z : float
-        Position on the parent axis, in metres.
+        Position of the focal plane on the parent axis, in metres.
     tilt : float | None
         Rotation about the prescription's x, the direction of the line CCD, in radians; by default the plane is
         perpendicular to the axis.
@@ -501,9 +503,9 @@ class CameraSpec(TitledSpec):
     mirrors : Mapping[str, MirrorSpec]
         Name -> surface, in the order of the light: mirrors, and also faces of lenses and a separate stop.
     image : ImageSpec
-        Focal plane.
+        Position and tilt of the focal plane.
     line : LineSpec
-        Line CCD.
+        Pixels of the line CCD.
     bands : Mapping[str, BandSpec]
         Name of a spectral band -> its line CCD, for images of targets; none by default.
     spectrum : SpectrumSpec | None

@@ -124,10 +124,14 @@ class ScanSpec(Spec):
 class MountSpec(Spec):
     """Mount of the focal-plane assembly: screws with shims on the mounting surface.
 
+    X', Y' and Z' are the axes of the assembly: flight direction, line and normal; O' is the centre of its panchromatic
+    line.
+
     Attributes
     ----------
     holes : tuple[tuple[float, float, float], ...]
-        Positions of the screw holes in the assembly's frame O'-X'Y'Z', in metres.
+        Positions of the screw holes in the assembly's frame O'-X'Y'Z' (X' flight direction, Y' line, Z' normal), in
+        metres.
     tilt : float
         Angle of the mounting surface's normal from Z', about Y', in radians.
     clearance : float
@@ -155,7 +159,7 @@ class MissetSpec(Spec):
     rotate : tuple[float, float, float]
         Rotations about X', Y', Z' through the centre of the panchromatic line, in radians.
     shift : tuple[float, float, float]
-        Shifts along X', Y', Z', in metres.
+        Shifts of the assembly along X', Y', Z', in metres.
     chips : float
         Height error of each line CCD relative to the assembly, which no shim can correct, in metres.
     """
@@ -177,7 +181,7 @@ class FocusTestSpec(CameraUnderTestSpec):
     collimator : CollimatorSpec
         Collimator in front of the camera.
     edge : EdgeSpec
-        Target.
+        Slanted knife edge at the collimator's focus, the target that is imaged.
     fields : tuple[float, ...]
         Fields along the line, as fractions of half the line's length, -1 to 1.
     white : float
@@ -187,13 +191,13 @@ class FocusTestSpec(CameraUnderTestSpec):
     scan : ScanSpec
         Scan of the target through focus.
     misset : MissetSpec
-        Initial misalignment of the assembly.
+        Standard deviations of the initial misalignment of the focal-plane assembly.
     mount : MountSpec
-        Mount of the assembly.
+        Mount of the focal-plane assembly: screws with shims.
     level : float
         Standard deviation of the theodolite's reading of the line's level, in radians.
     rounds : int
-        Number of rounds of shimming.
+        Number of rounds in which the assembly is measured and then corrected by shims.
     seed : int
         Seed of all random numbers.
     """
@@ -387,7 +391,7 @@ class LevelSpec(Spec):
     Attributes
     ----------
     angle : float
-        Rotation of the line from its required direction, about Z', in radians.
+        Rotation of the line from its required direction about Z', the normal of the focal-plane assembly, in radians.
     sigma : float
         Standard deviation of this angle, in radians.
     """
@@ -446,12 +450,12 @@ class MeasuredFocusSpec(TitledSpec):
     measured : FocusFiles
         Through-focus series.
     mount : MountSpec
-        Mount of the assembly.
+        Mount of the focal-plane assembly: screws with shims.
     shims : tuple[float, ...] | None
         Present thickness of the shim at each hole, in metres; by default the `thickness` of `mount`.
     vertex_error : float
-        Standard deviation of an error common to all vertices that the shape of the through-focus curve causes, in
-        metres; the default holds for F/8 to F/10 and wavefront errors of 0.2 waves.
+        Standard deviation of the error of a best-focus position that the shape of the through-focus curve causes,
+        common to all fields, in metres; the default holds for F/8 to F/10 and wavefront errors of 0.2 waves.
     vertex_trend : float
         Standard deviation of the change of that error from the centre to the ends of the fields, in metres.
     seed : int

@@ -62,7 +62,7 @@ Moment = Annotated[float, Quantity(units.MOMENT, largest="100000 h")]
 NO_MOTION: tuple[float, float, float] = (0.0, 0.0, 0.0)
 DEFAULT_PIVOT = "origin"
 FEWEST, MOST = 2, 1000
-"""Numbers of times that a course may have."""
+"""Smallest and largest number of times that a course (time series of states) may have."""
 
 
 def _some_times(times: tuple[float, ...]) -> tuple[float, ...]:
@@ -253,7 +253,7 @@ VECTORS = {"rotate": units.ANGLE, "shift": units.LENGTH, "gradient": units.TEMPE
 """Quantities with a column for each axis; axes without a column are zero."""
 NUMBERS = {"scale": units.SCALE, "temperature": units.TEMPERATURE_DIFFERENCE}
 HEAT = {"temperature": "change", "gradient": "gradient"}
-"""Name in a head -> key under ``temperature``; other quantities are under ``motion``."""
+"""Name of a quantity in a column head -> its key below ``temperature``; other quantities are below ``motion``."""
 HEADS = "'time [min]', 'NODE shift z [um]', 'NODE rotate x [arcsec]', 'NODE scale [ppm]', 'NODE temperature [K]' or "
 HEADS += "'NODE gradient x [mK/m]'"
 
@@ -267,7 +267,7 @@ class _Column:
     Attributes
     ----------
     what : str
-        TIME, or a name of VECTORS or NUMBERS.
+        Quantity in the column: TIME, one of VECTORS, which have an axis, or one of NUMBERS, which have none.
     node : str
         Path of the node, empty for the time.
     axis : int

@@ -658,7 +658,7 @@ class ErrorBudgetSpec(Spec):
     frames : int
         Number of frames averaged in a measurement.
     trials : int
-        Number of random states for each line.
+        Number of random states for each line of the budget, which is one cause.
     all_together : int
         Number of random states with all causes at once.
     angle_errors : dict[str, dict[str, tuple[float, float]]]

@@ -93,7 +93,7 @@ def read_for(command: str, file: Path, resolve: Callable[[Path], Given]) -> Give
 
 
 def _place(kind: FileKind, file: Path) -> str:
-    """Return which command reads a file of a kind, and where its name belongs."""
+    """Return the part of a message that says which command reads a file of a kind, or at which key its name belongs."""
     reads = f"python -m {kind.command} {file} does" if kind.command else ""
     named = f"its name belongs into {kind.place}" if kind.place else ""
     return ", or ".join(filter(None, (reads, named)))

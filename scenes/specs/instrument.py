@@ -129,7 +129,7 @@ MadeOf = Annotated[str, Field(strict=True), Catalogued(lambda name: _spelt(name)
 
 
 def _spelt(name: str) -> str:
-    """Return a material's name in the spelling of the catalogue; an unknown name is returned unchanged."""
+    """Return a material's name as the catalogue spells it; an unknown name is returned unchanged."""
     try:
         return material(name).name
     except KeyError:
@@ -173,8 +173,9 @@ class Prism180Spec(Spec):
     width : float
         Width of the clear apertures across the beam, in metres; somewhat more than the return face's diameter.
     tilt : tuple[float, float]
-        Rotation about the prism's x and y and its null point, relative to faces perpendicular to the beam, in radians.
-        It leaves the beam's direction unchanged and keeps the reflections from the faces off the area CCD.
+        Rotation about the prism's x and y, relative to faces perpendicular to the beam, in radians. Its centre is the
+        pivot `apex` of the prism, about which rotations do not displace the beam. It leaves the beam's direction
+        unchanged and keeps the reflections from the faces off the area CCD.
     angle_errors : dict[str, tuple[float, float]]
         Name of a face -> its manufacturing tilt about the face's x and y, in radians. Faces: window, mirror, roof_a,
         roof_b; of the hollow kind mirror, roof_a, roof_b.
@@ -215,7 +216,8 @@ class Prism0Spec(Spec):
     width : float
         Width of the clear apertures across the beam, in metres.
     tilt : tuple[float, float]
-        Rotation about the prism's x and y and its centre, relative to faces perpendicular to the beam, in radians.
+        Rotation of the prism about its centre, about its x and y, relative to faces perpendicular to the beam, in
+        radians.
     angle_errors : dict[str, tuple[float, float]]
         Name of a face -> its manufacturing tilt about the face's x and y, in radians. Faces: entry, mirror_a, mirror_b,
         exit; of the periscope mirror_a, mirror_b.
@@ -496,7 +498,7 @@ class MonitorSpec(Spec):
     return_face : ReturnFaceSpec
         Mirror that returns the beam of each channel.
     frames : int
-        Number of frames in a measurement.
+        Number of frames averaged in a measurement.
     """
 
     wavelength: Wavelength
@@ -528,9 +530,9 @@ class InstrumentSpec(TitledSpec):
     temperature : float
         Temperature at which all parts have their nominal shape, in kelvin.
     materials : MaterialsSpec
-        Materials of the parts.
+        Materials of structures, mirrors and carriers of detectors.
     baffles : Mapping[str, BaffleSpec]
-        Name -> baffle; none by default.
+        Name -> baffle, a black part that blocks light; none by default.
     altitude : float | None
         Altitude of the orbit, in metres. It is needed to express changes of a pair's cameras as errors on the ground.
     disturbances : str | None

@@ -113,11 +113,11 @@ def _table(value: Any) -> Any:
 
 _uniform = short_for("change", str, int, float)
 PlainTemperature = Annotated[TemperatureSpec, ZERO_IS_NONE, _uniform]
-"""Temperature as a mapping with its keys, or the uniform change alone; zero is the same as none where no carrier of the
-body is heated.
+"""Temperature change as a mapping with its keys, or as the uniform change alone, `2 K`. A change of zero is the same as
+no entry if no body that carries this one is heated.
 """
 TableTemperature = Annotated[TableTemperatureSpec, ZERO_IS_NONE, _uniform, BeforeValidator(_table)]
-"""Temperature as a mapping with its keys, or the uniform change or the table's name alone."""
+"""Temperature change as a mapping with its keys, or as the uniform change or the name of a table alone."""
 
 
 class DeformationSpec(Spec):

@@ -242,7 +242,7 @@ class MeasurementSetup(ExperimentSetup[MeasurementSpec]):
 
     @classmethod
     def parts(cls, test: MeasurementSpec) -> dict[str, Any]:
-        """Read the instrument's model and the data sheet, and make the paths of frames absolute; by field."""
+        """Read instrument and data sheet, make paths of frames absolute; return field of the set-up -> content."""
         model = None if test.instrument is None else _model(test, test.instrument)
         if test.detector is not None:
             detector = load_detector(test.detector, test, ("detector",))

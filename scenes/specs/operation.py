@@ -62,8 +62,10 @@ class RequirementSpec(Spec):
     Attributes
     ----------
     quantity : str
-        Quantity as `GROUP KEY`: a camera with `d_alpha_arcsec`, `d_beta_arcsec`, `d_gamma_arcsec` or `d_f_um`;
-        `intersection_angle change_arcsec`; `ground along_m`, `across_m` or `height_m`.
+        Quantity as `GROUP KEY`. For a camera, its name with `d_alpha_arcsec`, `d_beta_arcsec` or `d_gamma_arcsec`
+        (change of the rotation about the camera's Y, about its X, about the line of sight) or `d_f_um` (change of the
+        principal distance); `intersection_angle change_arcsec`; or `ground along_m`, `ground across_m`, `ground
+        height_m` (shift of a ground point along the track, across it, in height).
     limit : str
         Largest absolute value of its change, with unit.
     probability : float
@@ -136,11 +138,11 @@ class OperationSpec(Spec):
     coefficients : float
         Relative standard deviation of the computed thermal response of each body with a temperature sensor.
     mission : float
-        Duration of the mission, to which `jump_false_alarm` of the disturbances refers.
+        Duration of the mission, in seconds, to which `jump_false_alarm` of the disturbances refers.
     window : int
         Number of readings after a jump within which it is searched for.
     horizon : float
-        Time span of a forecast.
+        Time from the last reading up to which the state is forecast, in seconds.
     requirements : tuple[RequirementSpec, ...]
         Requirements; each quantity occurs once.
     """
@@ -225,7 +227,9 @@ def resolve_operation(spec: OperationSpec) -> OperationSetup:
 VALUES: Mapping[str, tuple[Kind, Kind]] = FrozenMap(
     {"temperature": (TEMPERATURE, TEMPERATURE_DIFFERENCE), "attitude": (ANGLE, ANGLE), "focus": (LENGTH, LENGTH)}
 )
-"""Kind of reading with numbers in a table -> kind of quantity of the numbers and of their sigmas."""
+"""Kind of reading that is a number in a table -> kinds of quantity (which fix the units) of the number and of its
+sigma.
+"""
 RUNS = ("monitor", "calibration", "angle")
 """Kinds of reading that are run folders, to which a row of a table refers."""
 EVENT = "event"
@@ -269,11 +273,11 @@ class ReadingTableSpec(Spec):
     time : str
         Head of the column of times.
     time_scale : {'UTC', 'GPS', 'TAI', 'TT', 'GAL', 'QZS', 'BDT'}
-        Time scale of the clock.
+        Time scale of the times in the tables.
     epoch : str | None
-        Reading of that clock at 0, if the column has numbers instead of dates.
+        Date and time, in that time scale, at which the times are 0, if the column has numbers instead of dates.
     time_unit : str
-        Unit of those numbers.
+        Unit of the times, if the column has numbers instead of dates.
     columns : Mapping[str, ReadingColumnSpec]
         Body, star tracker or camera -> its columns, for kinds with numbers.
     name : str | None

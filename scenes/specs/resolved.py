@@ -588,8 +588,8 @@ def _of_job(resolved: ResolvedJob, file: str, name: str | None) -> CameraSetup:
     """Return a camera of a job's instrument with the job's perturbations."""
     job = resolved.job
     if job.course is not None:
-        allowed = "a job without a course; python -m twin.render follows the course"
-        raise job.error("a camera is analysed in one state, and this job has a course", ("course",), allowed=allowed)
+        problem = "a camera is analysed in one state, but this job describes a course (states over time)"
+        raise job.error(problem, ("course",), allowed="a job with a single state, or python -m twin.render")
     chosen = _chosen(tuple(resolved.instrument.cameras), file, name)
     camera = resolved.cameras[resolved.instrument.cameras[chosen].camera]
     return CameraSetup.model_construct(

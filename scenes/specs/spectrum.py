@@ -47,8 +47,10 @@ MOST_LINES = 100
 MOST_SAMPLES = 20_000
 
 _PIECES, _NODES, _LEAST_POINTS = 64, 8, 512
-"""Pieces of an even band in a black body's light; Gauss' nodes on each piece of a curve, at least, over which Planck's
-law is a polynomial to rounding; and points of all pieces together, at least: far more than any rule has."""
+"""Numbers of the fine rule that represents a whole spectrum: intervals of an evenly distributed band with the light of
+a black body; smallest number of Gauss nodes on each interval of a curve, over which Planck's law is a polynomial to
+rounding; and smallest number of nodes on all intervals together, far more than the rules for results have.
+"""
 
 
 class SpectrumSpec(Spec):
@@ -137,7 +139,7 @@ class SpectrumSpec(Spec):
 
     @property
     def lines(self) -> bool:
-        """True if the spectrum consists of lines, whose sum is exact."""
+        """True if the spectrum consists of discrete lines, for which a mean over the light is an exact sum."""
         return self.wavelengths is not None
 
     @property

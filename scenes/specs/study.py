@@ -228,11 +228,11 @@ class FactorSpec(Spec):
     uniform : tuple[str | float | int | bool, str | float | int | bool] | None
         Smallest and largest value of a uniform distribution.
     normal : NormalSpec | None
-        Normal distribution.
+        Normal distribution of the values: mean and standard deviation.
     truncated : TruncatedSpec | None
-        Truncated normal distribution.
+        Normal distribution of the values, truncated at two limits.
     table : TableSpec | None
-        Column of a CSV file.
+        Column of a CSV file with the values.
     """
 
     key: Key | None = None
@@ -489,7 +489,7 @@ class BaseSpec(Spec):
 
 
 TOTAL, NOISE = "_sigma", "_sigma_noise"
-"""Suffixes of the keys and columns of standard deviations: total, and by the noise alone."""
+"""Suffixes of the keys and columns of standard deviations: the total one, and the one due to image noise alone."""
 
 
 class ResponseSpec(Spec):
@@ -597,7 +597,7 @@ class StudyReportSpec(Spec):
     scatter : tuple[tuple[str, str], ...]
         Scatter plots: pairs of names of factors or responses, [along x, along y].
     pareto : tuple[ParetoSpec, ...]
-        Pareto fronts.
+        Pareto fronts of two responses, or of a factor and a response.
     sobol : bool
         True to estimate variance-based (Sobol) sensitivity indices.
     thresholds : Mapping[str, ThresholdSpec]
@@ -629,9 +629,9 @@ class StudySpec(TitledSpec):
     base : BaseSpec
         Job or test that is varied.
     factors : Mapping[str, FactorSpec]
-        Name -> factor.
+        Name -> factor: a number or text of the base, and the values that it takes.
     design : DesignSpec
-        Design of experiments.
+        Design of experiments: the combinations of the factors' values that are run.
     noise : {'own', 'shared'}
         Noise of the runs: `own`, independent in every run, or `shared`, that of the base job's seed in all runs.
     responses : Mapping[str, ResponseSpec]
@@ -639,7 +639,7 @@ class StudySpec(TitledSpec):
     limits : LimitsSpec
         Limits on the resources of the study.
     report : StudyReportSpec
-        Content of the report.
+        Figures, sensitivity indices and requirements in the report.
     """
 
     base: BaseSpec
@@ -700,10 +700,11 @@ _UNIT_WORDS = frozenset(UNITS) | {"m2", "mm2", "um2"}
 
 
 def unit_of(key: KeyPath) -> str:
-    """Return the unit in the name of a result's key, empty for none.
+    """Return the unit that the name of a result's key contains; empty if it contains none.
 
     Words after the unit are skipped: "um" for d_f_um, d_f_um_sigma_noise and d_f_um_true; "m/arcsec" for
-    height_m_per_arcsec, "1/mm" for nyquist_per_mm. A name below such a key has its unit: "um" for defocus_um, centre.
+    height_m_per_arcsec, "1/mm" for nyquist_per_mm. A name without a unit has that of the key above it: "um" for the key
+    path defocus_um, centre.
     """
     *above, last = [str(part) for part in key if isinstance(part, str)] or [""]
     words = last.removesuffix(NOISE).removesuffix(TOTAL).split("_")

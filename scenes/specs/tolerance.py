@@ -47,11 +47,12 @@ MEASURES: Mapping[str, Kind] = FrozenMap(
 )
 """Kind of a motion -> kind of quantity of its amounts; the other amounts are pure numbers."""
 MOST_ABBE = 0.1
-"""Upper bound of the relative limit of an Abbe number: the program tries ten times the limit, at which no Abbe number
-would be left.
+"""Upper bound of the relative tolerance limit of an Abbe number. The program also traces ten times the limit, which
+must stay below 1 for the Abbe number to remain positive.
 """
 SPECTRUM = "figure"
-"""Kind of a motion, `figure`, that without a Zernike term means a figure error of many terms."""
+"""Kind of motion `figure`: written without a Zernike term, it means a figure error of many terms with a power spectrum.
+"""
 
 
 class Varied(Spec):
@@ -454,12 +455,12 @@ class ToleranceBudgetSpec(Spec):
     disturbances : JobDisturbancesSpec | None
         Disturbances between two measurements of the monitor, as in a job; by default those of the instrument.
     tolerances : Mapping[str, ToleranceSpec]
-        Name -> tolerance.
+        Name -> tolerance of one parameter of the camera.
     compensators : Mapping[str, CompensatorSpec]
         Name -> adjustment of every camera, in this order; the adjustments minimise the mean square wavefront error over
         all fields of the merits.
     merits : Mapping[str, MeritSpec]
-        Name -> requirement.
+        Name -> requirement on the camera.
     light : {'spectrum', 'design'} | None
         Light for wavefronts and MTFs: `spectrum` of the camera, or `design` for its design wavelength alone. By default
         the spectrum for a camera with lenses that has one, else the design wavelength.

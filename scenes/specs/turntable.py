@@ -1,4 +1,4 @@
-"""Turntable test of paper 004 (section 3.3): calibration of a turntable with an unknown dividing error.
+"""Turntable test of paper 004 (Li et al. 2020, section 3.3): calibration of an unknown dividing error.
 
 Dividing error = reading - true angle. With `measured:` the comparisons come from files of a real bench.
 """
@@ -26,9 +26,11 @@ class GraduationSpec(Spec):
     Attributes
     ----------
     rms : float
-        Expected rms over the full circle, in radians.
-    first, last : int
-        First or last harmonic; the shortest wavelength of the curve is 360 deg / last.
+        Expected rms of the curve over the full circle, in radians.
+    first : int
+        Lowest harmonic of the curve; harmonic 1 has one period in the full circle.
+    last : int
+        Highest harmonic of the curve, whose period is 360 deg / last.
     slope : float
         Exponent of the spectrum: the amplitude of harmonic k falls as k^-slope.
     """
@@ -53,7 +55,7 @@ class SubdivisionSpec(Spec):
     Attributes
     ----------
     rms : float
-        Expected rms, in radians.
+        Expected rms of the interpolation error, in radians.
     lines : int
         Number of signal periods in a full circle.
     harmonics : tuple[int, ...]
@@ -83,9 +85,9 @@ class DividingErrorSpec(Spec):
     Attributes
     ----------
     axis : float
-        Wobble of the axis, first and second harmonic, in radians.
+        Expected rms of the error due to wobble of the axis, first and second harmonic, in radians.
     eccentricity : float
-        Eccentricity of the grating, first harmonic, in radians.
+        Expected rms of the error due to eccentricity of the grating, first harmonic, in radians.
     graduation : GraduationSpec
         Errors of the grating's lines.
     subdivision : SubdivisionSpec
@@ -145,8 +147,12 @@ class CalibrationPlanSpec(Spec):
 
     Attributes
     ----------
-    first, last, step : float
-        First reading, last reading or step of the readings, in radians.
+    first : float
+        First reading that is calibrated, in radians.
+    last : float
+        Last reading that is calibrated, in radians.
+    step : float
+        Step between the readings that are calibrated, in radians.
     repeats : int
         Number of repeats of each comparison.
     folds : int
@@ -205,9 +211,9 @@ class TurntableTestSpec(TitledSpec):
     dividing_error : DividingErrorSpec
         True dividing error of the simulated turntable; the analysis does not use it.
     reference : ReferenceSpec
-        Reference standard.
+        Errors of the reference standard of angles: a polygon on an indexing table, read by an autocollimator.
     calibration : CalibrationPlanSpec
-        Plan of the calibration.
+        Readings that are compared with the reference, and number of repeats.
     camera_angle : float
         Reading of the turntable at the centre of the camera's field in the distortion test, in radians.
     seed : int

@@ -63,7 +63,7 @@ class Column:
 
     @property
     def head(self) -> str:
-        """Head with an example unit, for messages."""
+        """Head of the column as messages show it, with an example of a unit: `time [s]`."""
         return self.name if self.kind is None or self.bare else f"{self.name} [{self.kind.units[0]}]"
 
 

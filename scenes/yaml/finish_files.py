@@ -1,6 +1,8 @@
 """Measured finishes: tabular BSDF data in Zemax's text format (.bsdf), and coatings from CSV files.
 
-Source  Measured
+A .bsdf file:
+
+    Source  Measured
     Symmetry  PlaneSymmetrical
     SpectralContent  Monochrome
     ScatterType  BRDF
@@ -21,13 +23,13 @@ Source  Measured
 Angles are in degrees; azimuth and radial angle are about the specular direction (`fresnel_scatter`). Empty lines and
 lines that begin with # are skipped. A list of numbers may continue on the next line. A coating file is a CSV table:
 
-wavelength [nm],angle [deg],R [percent],T [percent]
+    wavelength [nm],angle [deg],R [percent],T [percent]
     640,0,0.21,99.7
     640,30,0.25,99.6
     660,0,0.23,99.6
 
 Reflectance and transmittance may be given separately for s and p (Rs and Rp, Ts and Tp); the light is taken as
-unpolarised, so that their mean is used. Columns without a unit hold shares from 0 to 1.
+unpolarised, so that their mean is used. Columns without a unit hold fractions from 0 to 1.
 """
 
 from __future__ import annotations
@@ -101,7 +103,7 @@ class _Lines:
         return InputError(Issue(problem, self.file, self.line, (key,) if key else (), text, allowed))
 
     def next(self, key: str, allowed: str | None = None) -> list[str]:
-        """Return the cells of the next line without advancing."""
+        """Return the cells of the next line, which stays the next one."""
         if self.at >= len(self.rows):
             raise self.error("the file ends too early", key, None, allowed or f"a line that begins with {key}")
         return self.rows[self.at][1]

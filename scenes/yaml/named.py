@@ -16,7 +16,9 @@ if TYPE_CHECKING:
 
 _BEFORE = __name__.removesuffix("scenes.yaml.named")
 _OURS = ("analysis", "optics", "scenes", "twin")
-"""Packages that a wheel holds inside one package; `_BEFORE` is the prefix of their names there (docs/wheel)."""
+"""Packages of this program. An installed wheel holds them inside one package; `_BEFORE` is the prefix of their names
+there (docs/wheel).
+"""
 
 
 @dataclass(frozen=True)

@@ -126,7 +126,7 @@ def _freeze(value: Mapping[str, Value]) -> FrozenMap[str, Value]:
 
 
 Seed = Annotated[int, Field(strict=True, ge=0, le=2**63 - 1)]
-"""Seed of all random numbers."""
+"""Seed of all random numbers of a file: an integer from 0 to 2**63 - 1."""
 Reference = Annotated[str, Field(strict=True, min_length=1, max_length=1000)]
 """Path of a user's file, relative to the file that refers to it."""
 

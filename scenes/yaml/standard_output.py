@@ -81,10 +81,13 @@ def leave_stdout() -> None:
 
 
 class Terminal(Console):
-    """Terminal for results that leaves a closed pipe to ``to_stdout``."""
+    """Terminal for results that leaves the handling of a broken pipe to ``to_stdout``.
+
+    A pipe is broken when its reader, such as ``head``, ends before all results are written.
+    """
 
     def on_broken_pipe(self) -> None:
-        """Raise the exception of a closed pipe again, so that ``to_stdout`` handles it."""
+        """Raise the exception of the broken pipe again, so that ``to_stdout`` handles it."""
         raise
 
 

@@ -1,8 +1,8 @@
 """Fields of a specification that are quantities: text with a unit in YAML, SI floats in the model.
 
-class Lens(Spec):
-    focal_length: Length                                            # metres
-    tilt: Annotated[float, Quantity(ANGLE, largest="5 deg")]        # radians
+    class Lens(Spec):
+        focal_length: Length                                            # metres
+        tilt: Annotated[float, Quantity(ANGLE, largest="5 deg")]        # radians
 
 `EXAMPLES` has an example of a quantity for a key, for messages where it is missing or cannot be read: the example of
 its kind, such as 20 um for a length, would be misleading for an entrance pupil.

@@ -56,11 +56,11 @@ class Kind:
 
     @property
     def allowed(self) -> str:
-        """Description of what may be written for such a quantity, for messages."""
+        """Description of how a quantity of this kind may be written, for messages."""
         return self.asked(self.example)
 
     def asked(self, example: str) -> str:
-        """Return the description of what may be written for such a quantity, with the given example."""
+        """Return the description of how a quantity of this kind may be written, with the given example."""
         return f"{self.name} with its unit ({names_text(self.units)}), e.g. '{example}'"
 
 
@@ -159,7 +159,7 @@ _KNOWN: dict[str, tuple[Decimal, str]] = {
 With this table pint, which takes half a second to start, is rarely needed.
 """
 _ALIASES = ("µm", "μm", "µrad", "μrad", "%", "hour", "day")
-"""Further spellings of units that the patterns for editors accept."""
+"""Further spellings of units that the regular expressions in the JSON Schemas for editors accept."""
 
 
 def power_of_length(metre: int) -> Kind:
@@ -332,7 +332,7 @@ def _shortest_number(value: float, unit: str, kind: Kind, within: float) -> str 
 
 
 def _refuse_untyped(value: object, kind: Kind) -> None:
-    """Raise the problem of a value that is not text."""
+    """Raise `Problem` if a value that should be a quantity is not text with a number and a unit."""
     if isinstance(value, float) and not math.isfinite(value):
         raise Problem("not a finite number", str(value), kind.allowed)
     if isinstance(value, int | float) and not isinstance(value, bool):

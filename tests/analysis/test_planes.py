@@ -399,5 +399,5 @@ def test_bad_pairs():
     refuses(AngleError, "finite tangents", line_frame, nadir, [0.0])
     with pytest.raises(AngleError, match="finite tangents"):
         line_frame(nadir, np.where(np.arange(len(SCENE.tangents["nadir"])) == 1, np.nan, SCENE.tangents["nadir"]))
-    refuses(AngleError, "are these wrong", line_frame, nadir, 2 * SCENE.tangents["nadir"])
+    refuses(AngleError, r"\(1 is expected\); check the tangents", line_frame, nadir, 2 * SCENE.tangents["nadir"])
     refuses(AngleError, "printed plane", line_frame, fits(SCENE, "printed")[1], SCENE.tangents["nadir"])

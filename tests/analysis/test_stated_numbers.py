@@ -49,14 +49,14 @@ def test_elasticities_are_derivatives_of_sigma() -> None:
     found = {one.number: one for one in elasticities(ROWS, STATED, NOISE, GAIN)}
     for number, own in prior_numbers(STATED).items():
         step = 1e-4
-        told = posterior_sigma(ROWS, scaled(own, 1.0 + step), NOISE)
+        wider_sigma = posterior_sigma(ROWS, scaled(own, 1.0 + step), NOISE)
         # of second order is the square of the step
-        assert found[number].elasticity == pytest.approx((told / before - 1.0) / step, abs=2e-4), number
+        assert found[number].elasticity == pytest.approx((wider_sigma / before - 1.0) / step, abs=2e-4), number
         wider = scaled(own, 2.0)
-        assert found[number].told == pytest.approx(posterior_sigma(ROWS, wider, NOISE))
+        assert found[number].doubled_in_prior == pytest.approx(posterior_sigma(ROWS, wider, NOISE))
         left = wider.misfit(GAIN) + GAIN @ NOISE @ GAIN.T
         assert found[number].doubled == pytest.approx(np.sqrt(np.diag(left)))
-        assert np.all(found[number].doubled >= found[number].told * (1.0 - 1e-12))
+        assert np.all(found[number].doubled >= found[number].doubled_in_prior * (1.0 - 1e-12))
     noise = np.einsum("qd,de,qe->q", GAIN, NOISE, GAIN) / before**2
     assert sum(one.elasticity for one in found.values()) + noise == pytest.approx(np.ones(4))
 

@@ -90,7 +90,7 @@ def test_the_way_back_has_scores_of_steps_before_every_reading() -> None:
     """Against the Cholesky factor of the whole series."""
     told = toy()
     times, shifts = series(told, (0.7, -0.2, 0.0))
-    how = SeriesFilter(told, window=0, unfound=False)
+    how = SeriesFilter(told, window=0, include_undetected=False)
     score, information = np.empty((len(times), how.space.size)), np.empty((len(times), how.space.size, how.space.size))
 
     def note(number: int, carried: np.ndarray, known: np.ndarray) -> None:

@@ -261,7 +261,7 @@ def test_the_config_of_a_job_is_the_job(tmp_path) -> None:
     file.write_text(
         f"instrument: {RC}\ncourse: {{times: [0 s, 1 s], motion: {{M2: {{shift: [0 0 0 um, 0 0 1 um]}}}}}}\n", "utf-8"
     )
-    with pytest.raises(InputError, match="this job has a course"):
+    with pytest.raises(InputError, match="this job describes a course"):
         resolve_camera(file)
 
 

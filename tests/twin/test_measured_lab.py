@@ -317,7 +317,7 @@ def test_a_reading_in_a_gap_of_the_calibration_is_outside(folder: Path) -> None:
     write(folder / "comparisons.csv", [rows[0], *(row for row in rows[1:] if not 98.9 < float(row[0]) < 101.9)])
     text = (folder / "distortion.yaml").read_text()
     (folder / "distortion.yaml").write_text(text.replace("    held_out: held_out.csv\n", ""))
-    refused = r"spots.csv:\d+: reading.*outside of the calibrated readings.*without the gap"
+    refused = r"spots.csv:\d+: reading.*the turntable is not calibrated at this reading.*without the gap"
     with pytest.raises(InputError, match=refused):
         distortion_of(folder)
     code, told = run("turntable", folder / "turntable.yaml", "--out", folder / "out", "--quiet")

@@ -1,4 +1,7 @@
-"""Instrument under estimation with its prior, measurements and requirements: predictions by exact traces."""
+"""Instrument under estimation with its prior, measurements and requirements: predictions by exact traces.
+
+A reading is one measured number. A merit is an image quality or other quantity with a requirement.
+"""
 
 from __future__ import annotations
 
@@ -28,16 +31,16 @@ from twin.tolerance.tolerance_bench import ToleranceBench
 STEP = 0.05
 """Step of the central differences with respect to a parameter, in standard deviations of its prior.
 
-The relative error of a derivative is the square of this step times the relative curvature of the derivative per
-standard deviation squared.
+The relative error of a derivative is the square of this step times the derivative's relative second derivative, with
+the parameter in standard deviations.
 """
 
 _SHARE = 1e-2
-"""Step of the numerical derivatives with respect to an actuator, as a share of the actuator's range."""
+"""Step of the numerical derivatives with respect to an actuator, as a fraction of the actuator's range."""
 
 
 class AsBuiltBench(Site):
-    """Instrument whose state is estimated.
+    """Instrument whose state is estimated, with its measurements and merits.
 
     Parameters
     ----------
@@ -107,22 +110,22 @@ class AsBuiltBench(Site):
 
     @cached_property
     def candidates(self) -> tuple[MeasuredKind, ...]:
-        """Further measurements that the file names as possible."""
+        """Further measurements that could be made, as the file lists them."""
         return self._kinds(self.test.candidates, "candidates")
 
     def beams(self, fields: tuple[tuple[float, float], ...]) -> VariedBeams:
-        """Return the beams of fields, traced once for all measurements with these fields."""
+        """Return the beams at some field points, traced once for all measurements at these field points."""
         if fields not in self._beams:
             self._beams[fields] = VariedBeams(self.optics, np.array(fields))
         return self._beams[fields]
 
     @cached_property
     def optics(self) -> CameraOptics:
-        """Nominal camera, for tracing rays."""
+        """Optics of the nominal camera, with which rays are traced."""
         return CameraOptics.within(self.experiment.instrument, self.camera, self.backend)
 
     def bench(self, merits: Mapping[str, MeritSpec]) -> ToleranceBench:
-        """Return the evaluator that computes these merits for the camera."""
+        """Return the evaluator that computes the given merits for the camera."""
         budget = ToleranceBudgetSpec.model_construct(
             instrument=self.test.instrument,
             camera=self.camera,
@@ -137,9 +140,9 @@ class AsBuiltBench(Site):
     # predictions
 
     def view(self, values: np.ndarray, after: str | None, further: np.ndarray | None = None) -> View:
-        """Return the instrument's states for parameters (S, K), after the actuator move named ``after``.
+        """Return the instrument's states for parameters of S states, (S, K), after the actuator move named ``after``.
 
-        ``further`` are the amounts of one more move, SI. Array dimensions: S states, K parameters.
+        ``further`` holds the amounts of one more move, SI units; K is the number of parameters.
         """
         states: Sequence[State] = self.parameters.states(values, after, further)
         return View(values, states, lambda bodies: self.parameters.temperatures(values, bodies))
@@ -147,7 +150,7 @@ class AsBuiltBench(Site):
     def predict(self, values: np.ndarray) -> np.ndarray:
         """Return the error-free readings of all measurements, (S, D); NaN where the light of a state is lost.
 
-        Array dimensions: S states, D readings.
+        Array dimensions: S states, D readings, K parameters in ``values`` (S, K).
         """
         return self._predicted(values, self.kinds, self.afters)
 
@@ -162,9 +165,9 @@ class AsBuiltBench(Site):
     def slope(
         self, values: np.ndarray, kinds: Sequence[MeasuredKind] | None = None, afters: Sequence[str | None] = ()
     ) -> np.ndarray:
-        """Return the derivatives (D, K) of the predicted readings with respect to the parameters, at ``values``.
+        """Return the derivatives of D predicted readings with respect to K parameters at ``values``, (D, K).
 
-        They are central differences. Array dimensions: D readings, K parameters.
+        They are central differences, in the SI units of reading and parameter.
         """
         kinds, afters = (self.kinds, self.afters) if kinds is None else (kinds, afters)
         return self._by_parameters(values, lambda moved: self._predicted(moved, kinds, afters))
@@ -172,8 +175,7 @@ class AsBuiltBench(Site):
     def _by_parameters(self, values: np.ndarray, work: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
         """Return the derivatives (D, K) of a function of the parameters at ``values``, by central differences.
 
-        The function maps S sets of parameters (S, K) to readings (S, D). Array dimensions: D readings, K parameters, S
-        states.
+        The function maps S sets of K parameters (S, K) to D readings (S, D).
         """
         steps = STEP * self.parameters.prior.sigma
         outputs = work(np.concatenate([values + np.diag(steps), values - np.diag(steps)]))
@@ -183,16 +185,16 @@ class AsBuiltBench(Site):
     # the estimate
 
     def groups(self, data: Sequence[np.ndarray]) -> tuple[MeasuredGroup, ...]:
-        """Return the measurements, each with its data, errors and systematic errors, as the estimate needs them."""
+        """Return the measurements as the estimate needs them: readings, random errors and systematic errors."""
         return tuple(kind.group(values) for kind, values in zip(self.kinds, data, strict=True))
 
     def data(self) -> tuple[np.ndarray, ...]:
-        """Return the readings in the data files of all measurements, SI.
+        """Return the readings in the data files of all measurements, SI units.
 
         Raises
         ------
         InputError
-            A file is unreadable or holds something else.
+            A file is unreadable or does not contain these readings.
         """
         return tuple(kind.read() for kind in self.kinds)
 
@@ -202,7 +204,7 @@ class AsBuiltBench(Site):
         Parameters
         ----------
         data : sequence of ndarray
-            Readings of each measurement, SI.
+            Readings of each measurement, SI units.
         start : ndarray, optional
             Parameters at which the iteration starts.
 
@@ -219,9 +221,9 @@ class AsBuiltBench(Site):
     # a drawn instrument
 
     def draw(self, rng: np.random.Generator, law: str) -> np.ndarray:
-        """Draw the parameters (K,) of an instrument from the prior, or from the one under ``simulate`` in the file.
+        """Return the random parameters of an instrument, (K,) for K parameters.
 
-        Array dimensions: K parameters.
+        They are drawn from the prior, or from the distribution under ``simulate`` in the file.
 
         Parameters
         ----------
@@ -253,9 +255,7 @@ class AsBuiltBench(Site):
         return np.asarray(root @ unit)
 
     def measured(self, true: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, ...]:
-        """Return simulated readings, with their errors, of an instrument with parameters (K,).
-
-        Array dimensions: K parameters.
+        """Return simulated readings, with random errors, of an instrument with K given parameters, (K,).
 
         Raises
         ------
@@ -275,10 +275,18 @@ class AsBuiltBench(Site):
         return self.parameters.moves[-1] if self.parameters.moves else None
 
     def merit_parts(self, values: np.ndarray, after: str | None, further: np.ndarray | None = None) -> np.ndarray:
-        """Return the parts of the merits, (S, P), for parameters (S, K); NaN where the light is lost.
+        """Return the parts of the merits in S states, (S, P); NaN where the light is lost.
 
-        Array dimensions: S states, P parts of the merits (smooth quantities, such as the MTF at one field), K
-        parameters.
+        Parts are smooth quantities, such as the MTF at one field; their number is P.
+
+        Parameters
+        ----------
+        values : (S, K) ndarray
+            K parameters of each state.
+        after : str, optional
+            Name of the last move that was made; None before the first.
+        further : ndarray, optional
+            Amounts of a further move, SI units.
         """
         return nan_where_lost(
             lambda rows: self.merits.parts_of(
@@ -289,12 +297,10 @@ class AsBuiltBench(Site):
         )
 
     def merit_residuals(self, values: np.ndarray, after: str | None, further: np.ndarray | None = None) -> np.ndarray:
-        """Return residuals (S, R) of the merits, whose sum of squares the optimum actuator move minimises.
+        """Return residuals of the merits in S states, (S, R), whose sum of squares the optimum actuator move minimises.
 
-        The sum of squares is the sum over the merits of the mean square over fields or points, in units of the
-        requirement.
-
-        Array dimensions: S states, R residuals.
+        The sum of squares of the R residuals is the sum over the merits of the mean square over fields or points, in
+        units of the requirement.
 
         Raises
         ------
@@ -305,7 +311,10 @@ class AsBuiltBench(Site):
 
     @cached_property
     def actuators(self) -> Actuators:
-        """Limits, steps and errors of the next move; the limits are what earlier moves have left of each range."""
+        """Limits, steps and errors of the next move.
+
+        A limit is what earlier moves have left of the actuator's range.
+        """
         specs = tuple(self.test.actuators.values())
         moved = np.sum(self.parameters.wanted, axis=0) if self.parameters.moves else np.zeros(len(specs))
         ranges = np.array([spec.range_si for spec in specs])
@@ -319,7 +328,7 @@ class AsBuiltBench(Site):
         )
 
     def merit_slope(self, values: np.ndarray, after: str | None) -> np.ndarray:
-        """Return the derivatives (R, K) of the merits' residuals with respect to the parameters, at ``values`` (K,).
+        """Return the derivatives of the merits' residuals with respect to the parameters at ``values`` (K,), (R, K).
 
         Array dimensions: R residuals, K parameters.
         """
@@ -327,26 +336,21 @@ class AsBuiltBench(Site):
 
     @cached_property
     def actuator_steps(self) -> np.ndarray:
-        """Steps of the numerical derivatives with respect to the actuators, SI, (C,).
-
-        Array dimensions: C actuators.
-        """
+        """Steps of the numerical derivatives with respect to C actuators, (C,), SI units."""
         return _SHARE * np.array([spec.range_si or 1.0 for spec in self.test.actuators.values()])
 
 
 def nan_where_lost(
     work: Callable[[slice], np.ndarray], count: int, shape: tuple[int, ...], first: int = 0
 ) -> np.ndarray:
-    """Evaluate a function for S states, with NaN for each state whose light is lost.
-
-    Array dimensions: S states.
+    """Evaluate a function for S states of the instrument, with NaN for each state whose light is lost.
 
     Parameters
     ----------
     work : callable
         Function of a slice of the states; raises PhysicalError if the light of any of them is lost.
     count : int
-        Number of states.
+        Number S of states.
     shape : tuple of int
         Shape of the result for one state.
     first : int
@@ -363,8 +367,8 @@ def nan_where_lost(
 
 
 def selected_moves(further: np.ndarray | None, rows: slice) -> np.ndarray | None:
-    """Return the moves of selected states; a move (C,) common to all states, or None, is returned unchanged.
+    """Return the moves of C actuators in selected states; a move (C,) common to all states is returned unchanged.
 
-    Array dimensions: C actuators.
+    ``further`` is (S, C) for S states, (C,) or None.
     """
     return further if further is None or further.ndim == 1 else further[rows]

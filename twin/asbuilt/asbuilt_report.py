@@ -29,9 +29,9 @@ from twin.framework.svg import (
 from twin.tolerance.monitor_merit import merit_head, merit_unit, shown_merit
 
 _MOST_COMBINATIONS = 12
-"""Largest number of combinations of motions in the table."""
+"""Largest number of observable combinations of motions in the table."""
 _FEW = 3
-"""Largest number of candidate measurements that the verdict names."""
+"""Largest number of further measurements that the verdict recommends by name."""
 BANDS = FrozenMap({"prior": GREY, "as built": BLUE, "after the next move": GREEN})
 """Label of each band of quantiles in a figure (prior, as built, after the move) -> its colour."""
 
@@ -105,7 +105,7 @@ def _percent(share: float) -> str:
 
 
 _CERTAIN = 0.95
-"""Probability from which the verdict says that a requirement is met, and, as its complement, that it fails."""
+"""Probability from which the verdict says that a requirement is met; below its complement, that it is missed."""
 
 
 def _verdict(run: AsBuiltRun) -> str:
@@ -155,7 +155,7 @@ def _is_nothing(run: AsBuiltRun, name: str) -> bool:
 
 
 def _short(amount: str | float) -> str:
-    """Return the amount of a move as text with four digits."""
+    """Return the amount of an actuator move as text with four significant digits."""
     if isinstance(amount, str):
         number, _, unit = amount.partition(" ")
         return f"{plain(float(number), 4)} {unit}"

@@ -30,39 +30,44 @@ from twin.tolerance.monitor_merit import Merit, merit_unit, shown_merit
 LEVELS = (0.025, 0.16, 0.5, 0.84, 0.975)
 """Probabilities of the quantiles that are reported: median, 68 % and 95 % intervals."""
 WORST_FACTOR = 9.0
-"""Chi-square per degree of freedom beyond which measurements contradict each other: residuals of three sigma on
-average.
+"""Chi-square per degree of freedom above which measurements are considered to contradict each other.
+
+It corresponds to residuals of three sigma on average.
 """
 _INSTRUMENT, _POSTERIOR, _PRIOR, _MOVE, _MADE = range(5)
-"""Random streams."""
+"""Numbers of the random streams of a seed.
+
+They are for the simulated instrument, the states of the posterior, those of the prior, the choice of the next move, and
+the errors of making that move.
+"""
 ALONG = tuple((float(x), 0.0) for x in np.linspace(-1.0, 1.0, 11))
-"""Fields (x, y), as shares of the half field, at which the wavefront along the line is plotted."""
+"""Fields (x, y), as fractions of the half field, at which the wavefront along the line is plotted."""
 _DRAW = 7e4
-"""Memory in bytes of one random state drawn from the prior, one from the posterior and one after the next move."""
+"""Memory in bytes of three random states: one from the prior, one from the posterior and one after the next move."""
 
 
 @dataclass(frozen=True, eq=False)
 class MeritPrediction:
-    """Predicted distribution of a merit of the instrument.
+    """Predicted distribution of a merit of the instrument as built.
 
     Attributes
     ----------
     merit : Merit
         Merit whose distribution it is.
     designed : float
-        Value of the nominal instrument, SI.
+        Value of the nominal instrument, SI units.
     before : tuple of float
-        Quantiles ``LEVELS`` under the prior alone, SI.
+        Quantiles ``LEVELS`` under the prior alone, SI units.
     now : tuple of float
-        Quantiles ``LEVELS`` under the posterior, SI.
+        Quantiles ``LEVELS`` under the posterior, SI units.
     meets : float
         Posterior probability that it meets the requirement.
     moved : tuple of float
-        Quantiles ``LEVELS`` after the next move, SI; empty without actuators.
+        Quantiles ``LEVELS`` after the next move, SI units; empty without actuators.
     meets_moved : float
         Probability that it meets the requirement after the move; NaN without actuators.
     true : float
-        True value of a simulated instrument, SI; NaN for a real one.
+        True value of a simulated instrument, SI units; NaN for a real one.
     """
 
     merit: Merit
@@ -77,9 +82,7 @@ class MeritPrediction:
 
 @dataclass(frozen=True, eq=False)
 class AsBuiltRun:
-    """Estimated as-built state of an instrument and its consequences.
-
-    Array dimensions: F fields.
+    """Estimated as-built state of an instrument, its image quality and the recommended next move.
 
     Attributes
     ----------
@@ -88,7 +91,7 @@ class AsBuiltRun:
     bench : AsBuiltBench
         Instrument that is evaluated.
     data : tuple of ndarray
-        Readings of each measurement, SI.
+        Readings of each measurement, SI units.
     estimate : StateEstimate
         Estimated state.
     known : tuple of Combination
@@ -96,8 +99,8 @@ class AsBuiltRun:
     standings : tuple of Standing
         Predicted distributions of the merits.
     along : tuple of ndarray
-        Rms wavefront error along the line, waves: nominal (F,), and quantiles ``LEVELS`` under the prior, the posterior
-        and, with actuators, after the next move, (2 or 3, 5, F).
+        Rms wavefront error at F fields along the line, waves: nominal (F,), and quantiles ``LEVELS`` under the prior,
+        the posterior and, with actuators, after the next move, (2 or 3, 5, F).
     advice : Advice or None
         Recommended next move; None without actuators.
     true : ndarray or None
@@ -121,7 +124,7 @@ class AsBuiltRun:
 def run_asbuilt(
     setup: AsBuiltSetup, backend: Backend, seed: int | None = None, advance: Advance = silent
 ) -> AsBuiltRun:
-    """Estimate the as-built state of an instrument and its consequences.
+    """Estimate the as-built state of an instrument, predict its image quality, and recommend the next move.
 
     Parameters
     ----------
@@ -130,7 +133,7 @@ def run_asbuilt(
     backend : Backend
         Array backend of the ray trace.
     seed : int, optional
-        Seed of the random draws; the file's by default.
+        Seed of the random numbers; the file's by default.
     advance : Advance
         Callback that reports progress.
 
@@ -154,7 +157,8 @@ def run_asbuilt(
             data = bench.measured(true, rng)
         except PhysicalError as error:
             allowed = "another seed, or smaller standard deviations"
-            raise test.error(f"the drawn instrument has no light: {error}", ("simulate",), allowed=allowed) from error
+            text = f"the randomly drawn as-built instrument lets no light through: {error}"
+            raise test.error(text, ("simulate",), allowed=allowed) from error
     state = bench.estimate(data)
     require_agreement(bench, state)
     advance("state", 1, 4)
@@ -195,7 +199,7 @@ def _random(seed: int, number: int) -> np.random.Generator:
 
 
 def require_agreement(bench: AsBuiltBench, state: StateEstimate) -> None:
-    """Raise InputError for an estimate that has not converged, or for measurements that contradict each other.
+    """Raise InputError if an estimate has not converged, or if measurements contradict each other.
 
     The error is placed at the measurement that agrees least with all others.
     """
@@ -243,7 +247,10 @@ def _prediction(
 
 
 def _along(bench: AsBuiltBench, cases: Sequence[tuple[np.ndarray, np.ndarray | None]]) -> tuple[np.ndarray, np.ndarray]:
-    """Return the rms wavefront error along the line: nominal, and its quantiles over several sets of states."""
+    """Return the rms wavefront error along the line: nominal, and its quantiles over several sets of states.
+
+    ``cases`` holds for each set the parameters of its states, and the amounts of a further move or None.
+    """
     field = bench.bench({"along": MeritSpec(kind="wavefront", fields=ALONG, at_most=1.0)})
 
     def rms(values: np.ndarray, further: np.ndarray | None) -> np.ndarray:
@@ -327,7 +334,7 @@ def _measured_plain(run: AsBuiltRun) -> dict[str, Any]:
 
 
 def motions(run: AsBuiltRun) -> list[dict[str, Any]]:
-    """Return each motion of the prior with its estimate, in reporting units."""
+    """Return the motions of the prior with their estimates and sigmas, in reporting units, as plain data."""
     out = []
     factor = np.sqrt(run.estimate.variance_factor)
     for k, component in enumerate(run.bench.parameters.components):
@@ -352,9 +359,9 @@ def _known_plain(run: AsBuiltRun) -> list[dict[str, Any]]:
 
 
 def moves_plain(run: AsBuiltRun, amounts: np.ndarray) -> dict[str, Any]:
-    """Return the amounts of an actuator move (C,), SI, as actuator name -> quantity with unit, as in a file.
+    """Return actuator name -> amount of its move as a quantity with unit, in the notation of a file.
 
-    Array dimensions: C actuators.
+    ``amounts`` holds the amounts of C actuators, (C,), SI units.
     """
     kinds = [number.kind for number in run.bench.parameters.actuators]
     names = run.bench.parameters.names
@@ -378,7 +385,7 @@ def _advice_plain(run: AsBuiltRun) -> dict[str, Any] | None:
 def responses(run: AsBuiltRun) -> dict[str, Any] | None:
     """Return the ratio of each uncertain actuator's estimated travel to the commanded one, with its sigma.
 
-    None if no actuator has an uncertain response.
+    The result is None if no actuator has an uncertain response.
     """
     start = len(run.bench.parameters.components)
     names = [run.bench.parameters.names[k] for k in run.bench.parameters.gains]

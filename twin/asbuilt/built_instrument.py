@@ -1,4 +1,4 @@
-"""Files of an instrument as built: the instrument itself, and the posterior covariance as disturbances."""
+"""Files of an instrument as built: the instrument itself, and the posterior covariance as a disturbances file."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ CORRELATION = f"{POSTERIOR}_correlation"
 
 
 def built_motions(run: AsBuiltRun) -> Mapping[str, Motion]:
-    """Return the estimated motion of each body against the drawing, with all moves but without thermal effects."""
+    """Return the estimated motion of each body relative to the drawing, with all moves but without thermal effects."""
     values = run.estimate.mean.copy()
     for k, component in enumerate(run.bench.parameters.components):
         if component.kind in HEAT:
@@ -30,7 +30,7 @@ def built_motions(run: AsBuiltRun) -> Mapping[str, Motion]:
 
 
 def instrument_text(run: AsBuiltRun) -> str:
-    """Return the instrument's file, which refers to the drawing and lists the motion of each body against it."""
+    """Return the instrument's file, which refers to the drawing and lists the motion of each body relative to it."""
     test, base = run.setup.test, run.setup.base.instrument.name
     design: str | dict[str, Any] = test.instrument
     if is_path(test.instrument):
@@ -48,11 +48,9 @@ def instrument_text(run: AsBuiltRun) -> str:
 
 
 def unknown(run: AsBuiltRun) -> tuple[list[Component], np.ndarray]:
-    """Return the uncertain components of bodies' motions and their posterior covariance (C, C), SI.
+    """Return the C uncertain components of bodies' motions and their posterior covariance (C, C), SI units.
 
     Thermal components are omitted. Errors of actuator moves are added to the components of the bodies that were moved.
-
-    Array dimensions: C uncertain components.
     """
     parameters, estimate = run.bench.parameters, run.estimate
     components = [component for component in parameters.components if component.kind not in HEAT]
@@ -97,9 +95,9 @@ def unknown(run: AsBuiltRun) -> tuple[list[Component], np.ndarray]:
 
 
 def _pull(run: AsBuiltRun, actuator: int) -> np.ndarray:
-    """Return the derivatives (K,) of one actuator's total travel with respect to all estimated parameters, SI.
+    """Return the derivatives of one actuator's total travel with respect to all estimated parameters, (K,).
 
-    Array dimensions: K parameters.
+    They are in SI units; K is the number of parameters.
     """
     parameters, last = run.bench.parameters, run.bench.last
     count = len(run.estimate.mean)

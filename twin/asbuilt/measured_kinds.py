@@ -1,6 +1,7 @@
 """Kinds of measurements on an instrument: predicted readings for a state, error model and data files.
 
-A new kind is a class here, an entry of ``KINDS`` and its keys in ``scenes.specs.asbuilt.MeasurementsSpec``.
+A reading is one measured number. A new kind is a class here, an entry of ``KINDS`` and its keys in
+``scenes.specs.asbuilt.MeasurementsSpec``.
 """
 
 from __future__ import annotations
@@ -32,16 +33,16 @@ from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.tolerance.tolerance_bench import ToleranceBench
 
 UNKNOWN_FOCUS = 50e-6
-"""Standard deviation, in a simulated measurement, of a focus that the estimate leaves free, metres.
+"""Standard deviation, metres, of a simulated measurement's unknown focus, which the estimate treats as free.
 
 Results do not depend on it.
 """
 UNKNOWN_ZERO = 20.0 * ARCSEC
-"""Standard deviation, in a simulated measurement, of a zero of angles that the estimate leaves free, radians."""
+"""Standard deviation, radians, of a simulated measurement's unknown angle zero, which the estimate treats as free."""
 UNKNOWN_FRAME = 100e-6
-"""Standard deviation, in a simulated measurement, of the measuring machine's frame, metres and radians.
+"""Standard deviation, metres and radians, of the unknown frame of the measuring machine in a simulated measurement.
 
-The estimate leaves this frame free.
+The estimate treats shift and rotation of this frame as free.
 """
 _LINE_DEGREE = 7
 """Degree of the polynomial in the tangent of the field angle that fits positions along a line to 1e-10 m."""
@@ -51,12 +52,10 @@ _LINE_DEGREE = 7
 class View:
     """States of the instrument at the time of a measurement.
 
-    Array dimensions: K parameters.
-
     Attributes
     ----------
     values : (S, K) ndarray
-        Estimated parameters (motions, actuator errors) of each state, SI.
+        K estimated parameters (motions, actuator errors) of each state, SI units.
     states : sequence of State
         S states of the instrument.
     warmth : callable
@@ -69,7 +68,7 @@ class View:
 
 
 class Site(ABC):
-    """Interface to the instrument for the kinds of measurements; it does not expose the instrument's state."""
+    """Interface through which a kind of measurement uses the instrument; it does not expose the instrument's state."""
 
     test: specs.AsBuiltSpec
     experiment: MonitorExperiment
@@ -78,17 +77,15 @@ class Site(ABC):
 
     @abstractmethod
     def beams(self, fields: tuple[tuple[float, float], ...]) -> VariedBeams:
-        """Return the beams of fields, traced once for all measurements with these fields."""
+        """Return the beams at some field points, traced once for all measurements at these field points."""
 
     @abstractmethod
     def bench(self, merits: Mapping[str, MeritSpec]) -> ToleranceBench:
-        """Return the evaluator that computes these merits for the camera."""
+        """Return the evaluator that computes the given merits for the camera."""
 
 
 class MeasuredKind(ABC):
     """Measurement on an instrument; base class of all kinds.
-
-    Array dimensions: D readings.
 
     Parameters
     ----------
@@ -99,12 +96,12 @@ class MeasuredKind(ABC):
     spec : Spec
         Specification in the file.
     key : tuple of str
-        Position of the specification in the file.
+        Key path of the specification in the file.
 
     Attributes
     ----------
     labels : tuple of str
-        Labels of its readings, (D,).
+        Labels of its D readings, (D,).
     blocks : tuple of str
         Group to which each reading belongs, (D,); one gross error affects all readings of a group.
     """
@@ -122,48 +119,41 @@ class MeasuredKind(ABC):
 
     @abstractmethod
     def prepare(self) -> None:
-        """Compute once what the predictions for all states have in common."""
+        """Compute once the data that the predictions for all states have in common."""
 
     labels: tuple[str, ...]
     blocks: tuple[str, ...]
 
     @abstractmethod
     def predict(self, view: View) -> np.ndarray:
-        """Return the error-free readings, (S, D); raise PhysicalError if the light of a state is lost.
+        """Return the error-free readings, (S, D) for S states and D readings.
 
-        Array dimensions: S states, D readings.
+        PhysicalError is raised if the light of a state is lost.
         """
 
     @abstractmethod
     def covariance(self) -> np.ndarray:
-        """Return the covariance of the readings' random errors, (D, D), in squared SI units.
-
-        Array dimensions: D readings.
-        """
+        """Return the covariance of the random errors of the D readings, (D, D), in squared SI units."""
 
     def biases(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return the effect of each systematic error on the readings, (D, B), and two sets of sigmas (B,).
+        """Return the effect of each systematic error on the readings, and the standard deviations of these errors.
 
-        The first set of standard deviations is for the estimate, the second ones for simulated data.
+        A bias that the estimate treats as free has an infinite standard deviation in the estimate.
 
-        A bias that the estimate leaves free has an infinite standard deviation in the estimate.
-
-        Array dimensions: D readings, B systematic errors.
+        Returns
+        -------
+        tuple of ndarray
+            Effect of B systematic errors of unit size on D readings, (D, B); standard deviations for the estimate,
+            (B,), and for simulated data, (B,).
         """
         return np.zeros((len(self.labels), 0)), np.zeros(0), np.zeros(0)
 
     @abstractmethod
     def read(self) -> np.ndarray:
-        """Return the measured readings, (D,), SI; raise InputError if a file does not hold them.
-
-        Array dimensions: D readings.
-        """
+        """Return the D measured readings, (D,), SI units; raise InputError if a file does not contain them."""
 
     def group(self, values: np.ndarray) -> MeasuredGroup:
-        """Return the measurement with its readings (D,), errors and systematic errors, as the estimate needs it.
-
-        Array dimensions: D readings.
-        """
+        """Return the measurement as the estimate needs it, with its D readings, (D,), and their errors."""
         columns, sigmas, _ = self.biases()
         used = sigmas > 0.0
         return MeasuredGroup(
@@ -171,10 +161,7 @@ class MeasuredKind(ABC):
         )
 
     def drawn(self, true: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-        """Return readings (D,) with simulated random errors and biases added to the true ones.
-
-        Array dimensions: D readings.
-        """
+        """Return D readings, (D,), with simulated random errors and biases added to the true ones."""
         columns, _, typical = self.biases()
         noise = np.linalg.cholesky(self.covariance()) @ rng.standard_normal(len(true))
         return np.asarray(true + noise + columns @ (typical * rng.standard_normal(len(typical))))
@@ -184,17 +171,17 @@ class MeasuredKind(ABC):
         return Path(self.spec.file_at((key,), value, Path(self.site.test.source.file).parent, description))
 
     def wrong(self, text: str, key: str, allowed: str | None = None, found: str | None = None) -> InputError:
-        """Return an InputError placed at a key of the measurement in the file."""
+        """Return an InputError whose position is a key of the measurement in the file."""
         return InputError(self.spec.issue(Problem(text, found, allowed), (key,)))
 
 
 def field_text(field: tuple[float, float]) -> str:
-    """Return a field as text for tables."""
+    """Return a field point as text for tables."""
     return f"({field[0]:g}, {field[1]:g})"
 
 
 class WavefrontReadings(MeasuredKind):
-    """Zernike terms of wavefronts at fields, metres rms, orthonormal over the illuminated pupil."""
+    """Measured Zernike terms of wavefronts at field points, metres rms, orthonormal over the illuminated pupil."""
 
     kind = "wavefronts"
     shown = ("nm", 1e-9)
@@ -218,7 +205,12 @@ class WavefrontReadings(MeasuredKind):
         return np.asarray(self.spec.sigma**2 * np.eye(len(self.labels)))
 
     def biases(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return the interferometer's focus at each field, and a reference error of each term common to all fields."""
+        """Return the effects of an unknown focus at each field, and of a reference error of each Zernike term.
+
+        The focus is that of the interferometer.
+
+        The reference error is common to all fields. The effects come with their sigmas for estimate and simulation.
+        """
         fields, terms, _ = self.rows.shape
         columns, sigmas, typical = [], [], []
         free = self.spec.focus == specs.FREE
@@ -243,7 +235,7 @@ class WavefrontReadings(MeasuredKind):
 
 
 class FocusReadings(MeasuredKind):
-    """Best focus at fields, metres downstream of the line CCD."""
+    """Measured best focus at field points, metres downstream of the line CCD."""
 
     kind = "focus"
     shown = ("um", 1e-6)
@@ -287,13 +279,13 @@ class FocusReadings(MeasuredKind):
 
 
 class MtfReadings(MeasuredKind):
-    """MTF of the optics at fields, each along the line and along the track."""
+    """Measured MTF of the optics at field points, along the line and along the track."""
 
     kind = "mtf"
     shown = ("", 1.0)
 
     def prepare(self) -> None:
-        """Set up the evaluator with this MTF as its merit."""
+        """Set up the evaluator that computes this MTF for the states of the instrument."""
         spec = self.spec
         asked = MeritSpec(kind="mtf", fields=spec.fields, frequency=spec.frequency, at_least=0.0)
         self.tried = self.site.bench({self.name: asked})
@@ -316,7 +308,7 @@ class MtfReadings(MeasuredKind):
 
 
 class DistortionReadings(MeasuredKind):
-    """Image positions along the line at known angles, metres."""
+    """Measured image positions along the line for known field angles, metres."""
 
     kind = "distortion"
     shown = ("um", 1e-6)
@@ -365,7 +357,7 @@ class DistortionReadings(MeasuredKind):
         return np.diag(self.sigmas**2)
 
     def biases(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return the effect on the positions of an unknown zero of the angles, which the estimate leaves free."""
+        """Return the effect on the positions of an unknown zero of the angles, which the estimate treats as free."""
         return (self.focal * (1.0 + self.tangents**2))[:, None], np.array([np.inf]), np.array([UNKNOWN_ZERO])
 
     def read(self) -> np.ndarray:
@@ -393,7 +385,7 @@ class DistortionReadings(MeasuredKind):
 
 
 class SpotReadings(MeasuredKind):
-    """Monitor spots relative to their nominal positions, pixels."""
+    """Measured positions of monitor spots relative to their nominal positions, pixels."""
 
     kind = "spots"
     shown = ("px", 1.0)
@@ -457,16 +449,17 @@ class SpotReadings(MeasuredKind):
                     spots[row["camera"], row["channel"]] = (float(row["row_px"]), float(row["column_px"]))
                 except (KeyError, TypeError, ValueError) as error:
                     raise self.wrong(
-                        f"line {rows.line_num}: not a spot ({error!r})",
+                        f"line {rows.line_num}: {','.join(map(str, row.values()))} is not camera, channel and position"
+                        f" of a spot ({error!r})",
                         "file",
-                        "columns camera, channel, row_px, column_px",
+                        "columns camera, channel, row_px, column_px; positions are numbers",
                         str(path),
                     ) from error
         return spots
 
 
 class SightReadings(MeasuredKind):
-    """Rotations of the line of sight, radians, and change of the principal distance, metres."""
+    """Measured rotations of the line of sight, radians, and change of the principal distance, metres."""
 
     kind = "sight"
     shown = ("", 1.0)
@@ -491,12 +484,12 @@ class SightReadings(MeasuredKind):
         return np.asarray(np.diag(sigma**2) if rows is None else np.array(rows) * np.outer(sigma, sigma))
 
     def read(self) -> np.ndarray:
-        """Return the rotations and the change of principal distance in the test's file, SI."""
+        """Return the rotations (rad) and the change of principal distance (m) in the test's file."""
         return np.array([getattr(self.spec, name) for name in self.spec.measured])
 
 
 class TemperatureReadings(MeasuredKind):
-    """Temperatures of bodies above nominal, kelvin."""
+    """Measured temperatures of bodies above nominal, kelvin."""
 
     kind = "temperatures"
     shown = ("K", 1.0)
@@ -520,7 +513,7 @@ class TemperatureReadings(MeasuredKind):
 
 
 class PositionReadings(MeasuredKind):
-    """Displacements of bodies' origins in the axes of the base, metres."""
+    """Measured displacements of bodies' origins in the axes of the base, metres."""
 
     kind = "positions"
     shown = ("um", 1e-6)
@@ -544,7 +537,10 @@ class PositionReadings(MeasuredKind):
         return np.asarray((self._places(view.states) - self.nominal).reshape(len(view.states), -1))
 
     def covariance(self) -> np.ndarray:
-        """Return the covariance of the displacements: the same variance for all coordinates, without correlation."""
+        """Return the covariance of the 3 N coordinates of N bodies' displacements, (3 N, 3 N), in m^2.
+
+        All coordinates have the same variance and are uncorrelated.
+        """
         return np.asarray(self.spec.sigma**2 * np.eye(len(self.labels)))
 
     def biases(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -576,7 +572,7 @@ KINDS: Mapping[str, type[MeasuredKind]] = FrozenMap(
         )
     }
 )
-"""Class of each kind of measurement, by its key under ``measurements``."""
+"""Key under ``measurements`` in the file -> class of that kind of measurement."""
 
 
 def named_bodies(measurement: MeasuredKind) -> tuple[str, ...]:
@@ -592,7 +588,7 @@ def named_bodies(measurement: MeasuredKind) -> tuple[str, ...]:
 
 
 def read_json(measurement: MeasuredKind, path: Path) -> Any:
-    """Return the contents of a JSON file; raise InputError if it is not one."""
+    """Return the contents of a JSON file; raise InputError if it is not a JSON file."""
     try:
         return json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:

@@ -1,4 +1,4 @@
-"""Next move of an instrument: expected merits under the posterior, and the benefit of further measurements."""
+"""Next actuator move of an instrument: expected merits under the posterior, and the benefit of more measurements."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from analysis.instrument_state.state_estimate import NextMove, StateEstimate, be
 from twin.asbuilt.asbuilt_bench import AsBuiltBench, nan_where_lost, selected_moves
 
 MOST_ROUNDS = 3
-"""Largest number of times that the optimum move is computed, linearised about the state after the last one."""
+"""Largest number of iterations of the optimum move, each linearised about the state that the last one leads to."""
 
 
 @dataclass(frozen=True, eq=False)
 class Advice:
-    """Recommended next move and its expected benefit.
+    """Recommended next move of the actuators and its expected benefit.
 
     Attributes
     ----------
@@ -42,14 +42,14 @@ class Advice:
 def optimal_move(bench: AsBuiltBench, mean: np.ndarray, after: str | None) -> NextMove:
     """Return the actuator move with the smallest expected merit, linearised about the state to which it leads.
 
-    Array dimensions: K parameters.
+    The merit is the sum of squares of all merits in units of their requirements.
 
     Parameters
     ----------
     bench : AsBuiltBench
         Instrument under estimation, with its actuators and merits.
     mean : (K,) ndarray
-        Estimated parameters.
+        K estimated parameters.
     after : str, optional
         Name of the last move that was made.
 
@@ -75,10 +75,10 @@ def optimal_move(bench: AsBuiltBench, mean: np.ndarray, after: str | None) -> Ne
 def _about(
     bench: AsBuiltBench, mean: np.ndarray, after: str | None, amounts: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the merits' residuals (R,) after a move, and their derivatives with respect to the actuators.
+    """Return the merits' residuals after a move, (R,), and their derivatives with respect to C actuators, (R, C).
 
-    Squares of the residuals sum to the merits in units of their requirements; the derivatives are (R, C), per SI unit
-    of travel. Array dimensions: R residuals, C actuators.
+    The squares of the R residuals sum to the merits in units of their requirements; the derivatives are per SI unit of
+    travel.
     """
     count = len(amounts)
     steps = np.diag(bench.actuator_steps)
@@ -90,8 +90,6 @@ def _about(
 def advice(bench: AsBuiltBench, estimate: StateEstimate, draws: np.ndarray, rng: np.random.Generator) -> Advice:
     """Return the next move, its effect over the posterior, and the expected benefit of measurements before it.
 
-    Array dimensions: S states, K parameters.
-
     Parameters
     ----------
     bench : AsBuiltBench
@@ -99,7 +97,7 @@ def advice(bench: AsBuiltBench, estimate: StateEstimate, draws: np.ndarray, rng:
     estimate : StateEstimate
         Estimated state.
     draws : (S, K) ndarray
-        States drawn from the posterior.
+        K parameters of S random states drawn from the posterior.
     rng : Generator
         Random generator of the errors of the move.
 
@@ -129,9 +127,11 @@ def advice(bench: AsBuiltBench, estimate: StateEstimate, draws: np.ndarray, rng:
 def expected(
     bench: AsBuiltBench, values: np.ndarray, after: str | None, further: np.ndarray | None = None
 ) -> np.ndarray:
-    """Return the merit of each state (S,): the sum over all merits of their squares relative to the requirements.
+    """Return the total merit of each of S states, (S,).
 
-    NaN where the light is lost. Array dimensions: S states.
+    It is the sum of squares of all merits in units of their requirements.
+
+    It is NaN where the light is lost.
     """
     return nan_where_lost(
         lambda rows: np.sum(bench.merit_residuals(values[rows], after, selected_moves(further, rows)) ** 2, axis=1),

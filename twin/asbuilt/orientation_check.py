@@ -1,4 +1,8 @@
-"""Command ``camtwin asbuilt check``: orientation and sign of measured wavefronts, tested against the data."""
+"""Command ``camtwin asbuilt check``: orientation and sign of measured wavefronts, tested against the data.
+
+A wavefront map may be mirrored, rotated or inverted in sign; the check finds which of sixteen orientations agree with
+the instrument's other data.
+"""
 
 from __future__ import annotations
 
@@ -22,9 +26,9 @@ from twin.framework.record import Quantity, Record
 from twin.framework.report import Report, Section, answer
 
 FREE_FOCUS = 100.0 * UNKNOWN_FOCUS
-"""Standard deviation, metres, that stands for a focus without prior knowledge."""
+"""Standard deviation, metres, so large that a focus with it counts as unknown before the measurement."""
 ANOTHER, NONE = 3, 4
-"""Exit codes: another reading than the stated one explains the data; none does."""
+"""Exit codes if another orientation of the maps than the specified one explains the data, and if none does."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,7 +128,10 @@ def run_check(
 def _lit(
     bench: AsBuiltBench, values: np.ndarray, kinds: Sequence[MeasuredKind], afters: Sequence[str | None]
 ) -> list[np.ndarray]:
-    """Return the error-free readings of each measurement in a state; raise InputError if the light is lost."""
+    """Return the error-free readings of each measurement in a state; raise InputError if the light is lost.
+
+    The state is given by the estimated parameters, ``values``.
+    """
     out = []
     for kind, after in zip(kinds, afters, strict=True):
         try:

@@ -1,8 +1,8 @@
 """Parameters of an as-built estimate: the motions of the prior, and response and errors of the actuators.
 
 A parameter vector holds the components of the prior (motions and temperatures of bodies), then one gain error for each
-actuator whose response is uncertain (travel over commanded amount, minus 1), then one error for each actuator of each
-move. The state at a time is the sum of the components and of all moves until then.
+actuator whose response is uncertain (travel divided by commanded amount, minus 1), then one error for each actuator of
+each move. The state at a time is the sum of the components and of all moves until then.
 """
 
 from __future__ import annotations
@@ -40,21 +40,21 @@ class Parameters:
     numbers : tuple of VariedParameter
         Effect of one SI unit of each component.
     actuators : tuple of VariedParameter
-        Effect of one SI unit of each actuator, C.
+        Effect of one SI unit of each of the C actuators.
     names : tuple of str
         Names of the actuators.
     gains : tuple of int
-        Indices of the actuators whose response (travel over commanded amount) is uncertain.
+        Indices of the actuators whose response (travel divided by commanded amount) is uncertain.
     gain_sigmas : ndarray
         Standard deviations of their responses, relative.
     moves : tuple of str
         Names of the moves.
     wanted : (J, C) ndarray
-        Commanded amount of each move, SI.
+        Commanded amount of each move, SI units.
     errors : tuple of tuple
         Indices (move, actuator) of each error of a move.
     error_sigmas : ndarray
-        Standard deviations of these errors, SI.
+        Standard deviations of these errors, SI units.
     """
 
     stated: DisturbancePrior
@@ -73,7 +73,7 @@ class Parameters:
     def of(
         cls, test: AsBuiltSpec, stated: DisturbancePrior, instrument: Instrument, thermal: ThermalModel
     ) -> Parameters:
-        """Return the parameters of a test.
+        """Return the parameters to be estimated in a test.
 
         Raises
         ------
@@ -123,7 +123,7 @@ class Parameters:
 
     @property
     def prior(self) -> StatePrior:
-        """Prior mean and covariance of all parameters."""
+        """Prior mean and covariance of all estimated parameters."""
         count, rest = len(self.components), np.concatenate([self.gain_sigmas, self.error_sigmas])
         covariance = np.zeros((count + len(rest), count + len(rest)))
         covariance[:count, :count] = self.stated.covariance
@@ -131,14 +131,12 @@ class Parameters:
         return StatePrior.of(self.labels, covariance)
 
     def moved(self, values: np.ndarray, after: str | None) -> np.ndarray:
-        """Return the total travel (S, C) of the actuators for parameters (S, K), SI.
-
-        Array dimensions: S states, K parameters, C actuators.
+        """Return the total travel of C actuators in S states, (S, C), SI units.
 
         Parameters
         ----------
         values : (S, K) ndarray
-            Parameters.
+            K parameters of each state.
         after : str, optional
             Name of the last move that was made; None before the first.
         """
@@ -154,28 +152,23 @@ class Parameters:
         return out
 
     def gain(self, values: np.ndarray) -> np.ndarray:
-        """Return the ratio of each actuator's travel to the commanded amount, (S, C); 1 where it is not uncertain.
-
-        Array dimensions: S states, C actuators.
-        """
+        """Return the ratio of travel to commanded amount for C actuators in S states, (S, C); 1 where it is certain."""
         out = np.ones((len(values), len(self.names)))
         start = len(self.components)
         out[:, list(self.gains)] += values[:, start : start + len(self.gains)]
         return out
 
     def states(self, values: np.ndarray, after: str | None, further: np.ndarray | None = None) -> list[State]:
-        """Return the states of the instrument.
-
-        Array dimensions: S states, K parameters, C actuators.
+        """Return the states of the instrument for S sets of parameters, after the moves made until then.
 
         Parameters
         ----------
         values : (S, K) ndarray
-            Parameters.
+            K parameters of each state.
         after : str, optional
             Name of the last move that was made; None before the first.
         further : (C,) or (S, C) ndarray, optional
-            Commanded amounts of a further move, SI.
+            Commanded amounts of a further move of C actuators, SI units.
         """
         moved = self.moved(values, after)
         if further is not None:
@@ -184,12 +177,9 @@ class Parameters:
         return states_of((*self.numbers, *self.actuators), amounts)
 
     def temperatures(self, values: np.ndarray, bodies: Sequence[str]) -> np.ndarray:
-        """Return the temperatures of the named bodies above nominal, one row per state, kelvin.
+        """Return the temperatures of the named bodies above nominal, (S, bodies) for S states, kelvin.
 
-        The array has the shape (S, bodies). A body without its own temperature has that of the nearest body that
-        carries it.
-
-        Array dimensions: S states.
+        A body without its own temperature has that of the nearest body that carries it.
         """
         out = np.zeros((len(values), len(bodies)))
         heated = {component.body for component in self.components if component.kind == "temperature"}

@@ -1,4 +1,4 @@
-"""Zernike coefficients of measured wavefronts from files, brought to the program's orientation."""
+"""Zernike coefficients of measured wavefronts from files, converted to the program's orientation."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from scenes.yaml.errors import InputError
 from twin.camera.varied_beams import VariedBeams
 
 TABLES = (".csv", ".tsv")
-"""Suffixes of tables of coefficients; all other files are maps."""
+"""Suffixes of the files that are tables of Zernike coefficients; all other files are wavefront maps."""
 
 
 class WavefrontMeasurement(Protocol):
-    """Measurement that refers to files of wavefronts.
+    """Interface of a measurement that refers to files of wavefronts.
 
     Attributes
     ----------
@@ -37,7 +37,7 @@ class WavefrontMeasurement(Protocol):
         """Return the path of a file given under a key; raise InputError if it does not exist."""
 
     def wrong(self, text: str, key: str, allowed: str | None = None, found: str | None = None) -> InputError:
-        """Return an InputError placed at a key of the measurement in the file."""
+        """Return an InputError whose position is a key of the measurement in the file."""
 
 
 def stated_orientation(measurement: WavefrontMeasurement) -> Orientation:
@@ -63,7 +63,7 @@ def read_coefficients(measurement: WavefrontMeasurement, orientation: Orientatio
     Raises
     ------
     InputError
-        A file holds no wavefront, or has other fields or terms, or too small an illuminated area.
+        A file holds no wavefront, or has other fields or terms than specified, or too small an illuminated area.
     """
     recorded = stated_orientation(measurement) if orientation is None else orientation
     spec, terms = measurement.spec, tuple(measurement.spec.numbers)
@@ -115,7 +115,7 @@ def _of_map(measurement: WavefrontMeasurement, number: int, name: str, orientati
 
 
 def _less(measured: WavefrontMap, reference: WavefrontMap, measurement: WavefrontMeasurement) -> WavefrontMap:
-    """Return a wavefront map minus the error map of the reference surface."""
+    """Return a measured wavefront map minus the error map of the interferometer's reference surface."""
     if measured.values.shape != reference.values.shape:
         shapes = f"{reference.values.shape} points, the maps {measured.values.shape}"
         raise measurement.wrong(

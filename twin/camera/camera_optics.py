@@ -43,16 +43,19 @@ from twin.camera.cut_wavefront import RAYS_ACCURACY, WORST_LIGHT, fit_by_rays, f
 from twin.targets.target_path import LineRays, TargetPath
 
 RINGS = 12
-"""Rings of the quadrature over the stop, which is exact for squares of wavefronts up to order 23."""
+"""Number of rings of the quadrature over the stop.
+
+Mean squares of wavefront errors that are polynomials of degree 23 or less are exact with it.
+"""
 
 MAP_POINTS = 65
-"""Points of a wavefront map on each axis."""
+"""Number of points of a wavefront map along each axis of the stop."""
 
 MTF_POINTS = 65
 """Default number of frequencies of an MTF."""
 
 SPOT_RINGS = 8
-"""Rings of a spot diagram's rays about the chief ray; each ring has six more rays than the one inside it."""
+"""Number of rings of rays about the chief ray in a spot diagram; each ring has six more rays than the one inside it."""
 
 
 MAX_RAYS = 500_000
@@ -130,7 +133,7 @@ class CameraOptics:
         return cls(path, FrozenMap(state or {}), built=bool(instrument.as_built))
 
     def in_state(self, state: State) -> Self:
-        """Return the camera in another state."""
+        """Return the analysis of the same camera in another state (motions of its bodies and effects of heat)."""
         return replace(self, state=FrozenMap(state))
 
     def at(self, wavelength: float) -> Self:
@@ -153,12 +156,12 @@ class CameraOptics:
 
     @property
     def model(self) -> CameraModel:
-        """Quantities derived from the prescription."""
+        """Quantities that the prescription implies, such as poses of surfaces and directions of fields."""
         return self.path.model
 
     @property
     def assembly(self) -> Assembly:
-        """Assembly that holds the camera."""
+        """Assembly of bodies and optical elements that contains the camera, for ray tracing."""
         return self.path.assembly
 
     @cached_property
@@ -378,12 +381,10 @@ class CameraOptics:
         return np.concatenate([self.beams(part).errors(plane) for part in parts])
 
     def pupils(self, fields: Sequence[Field] | np.ndarray) -> tuple[PupilFunction, ...]:
-        """Compute the exit pupils of F fields, (F, 2), with axes along the line and along the track.
+        """Compute the exit pupils of F fields, (F, 2), with image axes along the line and along the track.
 
-        Each is seen from the image of its field.
-
-        The pupils are centred on the design wavelength's chief rays, whatever the wavelength of the light, so that they
-        include lateral colour.
+        Each is the pupil as seen from the image of its field. The pupils are centred on the design wavelength's chief
+        rays, whatever the wavelength of the light, so that they include lateral colour.
 
         Raises
         ------
@@ -514,9 +515,9 @@ class CameraOptics:
         return self.mtfs([field], frequency)[0]
 
     def _path(self, rays: LineRays) -> np.ndarray:
-        """Return optical paths to the reference spheres minus the chief rays', for F fields and N rays, (F, N).
+        """Return optical paths to the reference spheres minus those of the chief rays, metres, (F, N).
 
-        The unit is metres.
+        There are F fields with N rays each.
         """
         radius = float(self.model.first_order.exit_pupil_distance[0])
         path = path_to_sphere(rays.position, rays.direction, rays.path, rays.position[:, :1], radius)

@@ -27,7 +27,7 @@ def degrees_text(run: CameraRun, field: Field) -> str:
 
 
 def _grid(height: float) -> tuple[Figure, np.ndarray]:
-    """Return a figure with three by three panels."""
+    """Return a figure with three by three panels, one for each of nine fields."""
     figure = new_figure(height, {"w_pad": 0.05, "h_pad": 0.06})
     return figure, np.ravel(figure.subplots(3, 3))
 
@@ -64,7 +64,7 @@ def spot_figure(run: CameraRun) -> Figure:
 
 
 def zernike_figure(run: CameraRun) -> Figure:
-    """Draw the Zernike terms in the middle of the field and at the worst field."""
+    """Draw the Zernike coefficients of the wavefront in the middle of the field and at the worst field."""
     figure = new_figure(3.6)
     axes = figure.subplots()
     middle = run.waves[GRID.index((0.0, 0.0))]
@@ -178,12 +178,12 @@ def axial_figure(run: CameraRun) -> Figure:
 
 
 def _mark(wavelengths: np.ndarray) -> str:
-    """Return the marker of points on curves over few wavelengths; empty for many wavelengths."""
+    """Return the marker for points on curves over the given wavelengths; empty (no marker) if there are many."""
     return "o" if len(wavelengths) < 12 else ""
 
 
 def _over_light(axes: Axes, run: CameraRun, title: str) -> None:
-    """Label axes that show a quantity by wavelength."""
+    """Complete axes that show a quantity over wavelength: zero line, reference wavelength, title and axis label."""
     assert run.colours is not None
     axes.axhline(0.0, color=LIGHT, lw=0.8, zorder=0)
     axes.axvline(1e9 * run.colours.reference, color=GREY, lw=0.8, ls=":")
@@ -307,7 +307,7 @@ def _lines(axes: Axes, run: CameraRun) -> None:
 
 
 def _round_factor(value: float) -> float:
-    """Return the largest number 1, 2 or 5 times a power of ten that does not exceed a value."""
+    """Return the largest 1, 2 or 5 times a power of ten that does not exceed a value, to magnify distortion by it."""
     size = 10.0 ** np.floor(np.log10(value))
     return float(size * max(step for step in (1.0, 2.0, 5.0) if step * size <= value * (1.0 + 1e-9)))
 

@@ -22,11 +22,11 @@ from twin.framework.report import Report, Section, answer
 from twin.framework.svg import look, to_svg
 
 _TABLE_TERMS = 15
-"""Zernike terms in the table of fields; the others are in optics.json and optics.nc."""
+"""Number of Zernike terms in the report's table of fields; all terms are in optics.json and optics.nc."""
 
 
 def camera_report(run: CameraRun) -> Report:
-    """Build the report of a camera analysis."""
+    """Build the report of a camera analysis: verdict, first-order data, layout, image quality over the field."""
     texts = refocus_text(run), built_text(run), perturbed_text(run)
     verdict_text, more = answer(*verdict(run), "see the wavefronts and the layout")
     sections = [
@@ -55,13 +55,13 @@ def _new_name(run: CameraRun) -> str:
 
 
 def _figure(name: str, title: str, caption: str, draw: Callable[..., Figure], *drawn: Any) -> SvgFigure:
-    """Draw a figure as SVG."""
+    """Return a figure of the report as SVG; the function ``draw`` draws it from the arguments ``drawn``."""
     with look(name):
         return SvgFigure(name, title, caption, to_svg(draw(*drawn)))
 
 
 def _first_order_text(run: CameraRun) -> str:
-    """Summarise the first-order data and the obscuration."""
+    """Return a sentence on focal length, F-number and other first-order data, and on the obscuration."""
     n, d = FIRST_ORDER(run.first_order), run.distortion
     blocked = ", ".join(f"{body} {100 * share:.1f}%" for body, share in n["obscuration"].items())
     unmodelled = unmodelled_obscuration(run.optics.model, run.first_order.obscuration)
@@ -75,7 +75,7 @@ def _first_order_text(run: CameraRun) -> str:
 
 
 def _facts(run: CameraRun) -> tuple[tuple[str, str], ...]:
-    """Return the facts about the camera for the head of the report, as pairs of label and text."""
+    """Return the head of the report as pairs of label and text: camera, description, mirrors, wavelength, fields."""
     spec = run.camera
     facts = [("Camera", spec.name)]
     if spec.description:
@@ -92,7 +92,7 @@ def _facts(run: CameraRun) -> tuple[tuple[str, str], ...]:
 
 
 def first_order_table(run: CameraRun) -> Table:
-    """Return the table of first-order data, the first of the report."""
+    """Return the report's first table: focal length, F-number, pupils, apertures and other first-order data."""
     n = FIRST_ORDER(run.first_order)
     state = "as perturbed" if run.perturbed else "as built" if run.optics.built else "as designed"
 
@@ -141,7 +141,10 @@ def first_order_table(run: CameraRun) -> Table:
 
 
 def _before(distance: float | None) -> str:
-    """Describe a distance as before or behind."""
+    """Format a signed distance, metres, as "0.5 m before", "0.5 m behind" or "infinitely far from".
+
+    A positive distance is before; None and distances beyond 10 km are infinite.
+    """
     if distance is None or abs(distance) > 1e4:
         return "infinitely far from"
     return f"{abs(distance):.4g} m {'before' if distance > 0.0 else 'behind'}"
@@ -180,7 +183,7 @@ def _refocus(run: CameraRun) -> Section:
 
 
 def _wavefronts(run: CameraRun) -> Section:
-    """Return the section on wavefront errors."""
+    """Return the report's section on wavefront errors over the field."""
     heads = ["", *(plots.degrees_text(run, w.field) for w in run.waves)]
     rows: list[list[Cell]] = [
         ["rms", *(w.rms for w in run.waves)],
@@ -213,7 +216,7 @@ def _wavefronts(run: CameraRun) -> Section:
 
 
 def _spots(run: CameraRun) -> Section:
-    """Return the section on spots."""
+    """Return the report's section with spot diagrams over the field."""
     rows: list[list[Cell]] = [
         [plots.degrees_text(run, s.field), 1e6 * s.rms, *(1e6 * s.rms_along), 1e6 * s.farthest, s.rms / s.airy]
         for s in run.spots
@@ -227,7 +230,7 @@ def _spots(run: CameraRun) -> Section:
 
 
 def _mtf(run: CameraRun) -> Section:
-    """Return the section on the MTF."""
+    """Return the report's section on the MTF over the field."""
     if not run.mtfs:
         return Section("MTF", (f"No MTF: {run.without_mtf}.",))
     rows: list[list[Cell]] = []
@@ -368,7 +371,7 @@ def _field(run: CameraRun) -> Section:
 
 
 def _bodies(run: CameraRun) -> Section:
-    """Return the section on bodies of the instrument that block the beam."""
+    """Return the report's section on bodies of the instrument that block part of the camera's beam."""
     assert run.quality is not None
     rows: list[list[Cell]] = [
         [body, *(100.0 * float(v) for v in share[0])] for body, share in run.quality.bodies.items()

@@ -25,12 +25,15 @@ They are all terms to the seventh radial order, and the spherical term of the ei
 """
 
 ROUNDING = 1e-6
-"""Tolerance by which fractions of light and Strehl ratios may leave 0 to 1: the accuracy of quadratures over pieces of
-shadows.
+"""Tolerance by which fractions of light and Strehl ratios may lie outside 0 to 1.
+
+It is the accuracy of quadratures over the polygons that represent shadows.
 """
 
 MTF_ROUNDING = 1e-3
-"""Tolerance by which an MTF may leave 0 to 1 or exceed that of the perfect wavefront: the accuracy of its quadrature.
+"""Tolerance by which an MTF may lie outside 0 to 1 or exceed that of the perfect wavefront.
+
+It is the accuracy of its quadrature.
 """
 
 MAX_RMS_WAVES = 1e6
@@ -47,7 +50,7 @@ class Wavefront:
     field : Field
         Field of the beam.
     wavelength : float
-        Wavelength, metres, the unit of waves.
+        Wavelength, metres; errors "in waves" are in this unit.
     x, y : (n,) ndarray
         Coordinates of the map's n columns and n rows on the stop, in units of its radius; x runs along the line, y
         along the track.
@@ -66,7 +69,7 @@ class Wavefront:
     peak_to_valley : float
         Peak-to-valley wavefront error over the map and the edge, waves.
     residual : float
-        Rms that the Zernike terms leave, waves.
+        Rms of the wavefront error minus the fitted Zernike terms, waves.
     strehl : float
         Strehl ratio, from the mean phasor over the stop.
     vignetted : float
@@ -123,7 +126,10 @@ class Wavefront:
         return {zernike.name(j): float(c) for j, c in enumerate(self.coefficients, start=1)}
 
     def to_xarray(self) -> xr.Dataset:
-        """Return ``wavefront`` over pupil coordinates and ``zernike`` over Noll's index, with units and names."""
+        """Return a data set of the wavefront map over pupil coordinates and of the Zernike terms over Noll index.
+
+        The variables are ``wavefront`` and ``zernike``, with units and descriptive names as attributes.
+        """
         import xarray as xr
 
         index = np.arange(1, len(self.coefficients) + 1)
@@ -187,7 +193,7 @@ class Spot:
     position: tuple[float, float]
 
     def to_xarray(self) -> xr.Dataset:
-        """Return the rays relative to the chief ray, metres."""
+        """Return a data set of the rays' positions on the line CCD relative to the chief ray, metres."""
         import xarray as xr
 
         names = {"along_line": self.rays[:, 0], "along_track": self.rays[:, 1]}
@@ -220,8 +226,8 @@ class Mtf:
     error : float
         Largest change of the values if more wavelengths are taken; 0 for spectral lines.
     accuracy : float
-        For a pupil vignetted by edges: largest change of the values by a third of the lines through it; their error is
-        a tenth of that. 0 for a free pupil.
+        For a pupil vignetted by edges: largest change of the values if only a third of the integration lines across the
+        pupil are used; the error of the values is about a tenth of it. 0 for a pupil without vignetting.
     """
 
     field: Field
@@ -248,7 +254,7 @@ class Mtf:
         return np.array([np.interp(frequency, self.frequency, row) for row in self.values])
 
     def to_xarray(self) -> xr.Dataset:
-        """Return ``mtf`` and ``limit`` over direction and frequency."""
+        """Return a data set of the MTF (``mtf``) and its diffraction limit (``limit``) over direction and frequency."""
         import xarray as xr
 
         return xr.Dataset(

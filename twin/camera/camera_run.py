@@ -45,19 +45,19 @@ MAX_WAVES_FOR_MTF = 10.0
 """Wavefront error beyond which no MTF is computed, waves rms: it would take minutes and be nearly zero."""
 
 GRID: tuple[Field, ...] = tuple((x, y) for y in (1.0, 0.0, -1.0) for x in (-1.0, 0.0, 1.0))
-"""Fields of wavefront maps and spot diagrams, row by row."""
+"""Fields of wavefront maps and spot diagrams, row by row, as fractions of the half fields along line and track."""
 
 MTF_FIELDS: tuple[Field, ...] = ((0.0, 0.0), (0.7, 0.0), (1.0, 0.0), (1.0, 1.0), (1.0, -1.0))
-"""Fields at which MTF curves and the image quality through focus are computed."""
+"""Fields, in fractions of the half fields along line and track, of MTF curves and of image quality through focus."""
 
 ERROR_GRID = (25, 9)
-"""Number of fields along the line and along the track of the map of wavefront errors."""
+"""Number of fields along the line and along the track at which the map of rms wavefront errors is computed."""
 
 MAP_POINTS = 129
-"""Points of a wavefront map on each axis."""
+"""Number of points of a wavefront map along each axis of the stop."""
 
 QUALITY_FIELDS = (-1.0, 0.0, 1.0)
-"""Fractions of half the line at which obscuration by bodies of an instrument is computed."""
+"""Fields along the line, in fractions of half the line, at which obscuration by bodies of an instrument is computed."""
 
 
 @shows("errors_before [waves]", "errors_after [waves]", "tilt")
@@ -68,9 +68,9 @@ class Refocus:
     Attributes
     ----------
     before, after : FocalPlane
-        Plane of the file and the best one.
+        Focal plane in the camera's file, and the best one.
     errors_before, errors_after : ndarray
-        Rms wavefront error at ``FIELDS``, waves.
+        Rms wavefront error at the F fields over which the focus is optimised (``FIELDS``), (F,), waves.
     tilt : bool
         True if the plane was tilted as well.
     """
@@ -192,7 +192,10 @@ class CameraRun:
 
 
 def aberration_name(index: int) -> str:
-    """Return the name of the aberration of a Zernike term, such as coma, without its orientation."""
+    """Return the name of the aberration of a Zernike term, such as coma, without its orientation.
+
+    ``index`` is the Noll index.
+    """
     words = zernike.name(index).split()
     return " ".join(words if zernike.noll_to_nm(index)[1] == 0 else words[: -1 if words[-1] in ("x", "y") else -2])
 
@@ -214,7 +217,7 @@ def run_camera(
     backend : Backend
         Array backend of the trace.
     seed : int
-        Not used; nothing is drawn.
+        Not used, since the analysis has no random numbers; present as for all commands.
     advance : Advance
         Called with the progress.
     refocus : bool
@@ -374,7 +377,7 @@ def perturbed_text(run: CameraRun) -> str:
 
 
 _LONG = re.compile(r"-?\d+\.\d{3,}(e-?\d+)?")
-"""Pattern of numbers with more digits than a sentence should have."""
+"""Pattern of numbers with three or more decimals, which are rounded in sentences."""
 _OF_THE_DRAWING = "First-order data refer to this state; layout and obscuration to the nominal camera."
 
 
@@ -488,7 +491,7 @@ def _field_numbers(run: CameraRun) -> list[dict[str, Any]]:
 
 
 def _cut_numbers(wave: Wavefront) -> dict[str, Any]:
-    """Return the numbers that only a vignetted beam has, for optics.json; empty for a whole one."""
+    """Return the numbers in optics.json that only the wavefront of a vignetted beam has; empty for any other."""
     if not wave.is_vignetted:
         return {}
     return {

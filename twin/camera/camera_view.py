@@ -26,14 +26,14 @@ from twin.camera.camera_results import Field, Mtf, Spot, Wavefront
 from twin.framework.svg import BLUE, DIVERGING, GREY, INK, LIGHT, VERMILION, look, plain_axes, to_svg
 
 LINE, TRACK = BLUE, VERMILION
-"""Colours of the direction along the line, and along the track."""
+"""Plot colours of quantities along the line and along the track."""
 
 WAVES = DIVERGING
 """Colour map of wavefront errors; points without light are white."""
 
 
 def field_text(field: tuple[float, float]) -> str:
-    """Format a field for a title."""
+    """Format a field (fractions of the half fields along line and track) for a plot's title."""
     along, across = field
     return f"({along:+.2g}, {across:+.2g})".replace("+0)", "0)").replace("(+0,", "(0,").replace("-", "\N{MINUS SIGN}")
 
@@ -106,7 +106,7 @@ def draw_mtf(axes: Axes, mtf: Mtf, label: bool = True) -> None:
 
 
 class Plottable:
-    """Mixin for results that a notebook shows as their text and their figure."""
+    """Base class of results that a notebook shows as text and figure."""
 
     def plot(self) -> Figure:
         """Return the figure of the result."""
@@ -125,7 +125,7 @@ SIZE = (4.6, 4.0)
 
 @dataclass(frozen=True, eq=False, repr=False)
 class WavefrontView(Wavefront, Plottable):
-    """Wavefront error with a plot."""
+    """Wavefront error at one field, with a method that plots its map."""
 
     def plot(self) -> Figure:
         """Plot the map over the stop, waves."""
@@ -142,7 +142,7 @@ class WavefrontView(Wavefront, Plottable):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class SpotView(Spot, Plottable):
-    """Spot with a plot."""
+    """Spot diagram at one field, with a method that plots it."""
 
     def plot(self) -> Figure:
         """Plot the rays and the Airy disk."""
@@ -158,10 +158,10 @@ class SpotView(Spot, Plottable):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class MtfView(Mtf, Plottable):
-    """MTF with a plot."""
+    """MTF at one field, with a method that plots its curves."""
 
     def plot(self) -> Figure:
-        """Plot both directions, the diffraction limit and the Nyquist frequency."""
+        """Plot the MTF along line and track, the diffraction limit and the Nyquist frequency."""
         with look("mtf"):
             figure = Figure(figsize=SIZE, layout="constrained")
             axes = figure.subplots()

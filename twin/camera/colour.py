@@ -34,13 +34,16 @@ FIRST_RULE = 5
 """Number of wavelengths of the first quadrature over the spectrum, which is refined if the MTF changes."""
 
 CURVE_POINTS = 21
-"""Number of wavelengths of curves over the spectrum, odd."""
+"""Number of wavelengths, odd, at which lateral and axial colour are computed over a band."""
 
 FOCUS_RINGS = 6
-"""Rings of the quadrature over the stop by which a focus is found."""
+"""Number of rings of the quadrature over the stop with which the best focus of a wavelength is found."""
 
 WINDOW, PSF_POINTS = 24.0, 129
-"""Side of a point image's window at least, in the longest wavelength times the F-number, and its points along it."""
+"""Smallest side of the window of a point image, in units of the longest wavelength times the F-number.
+
+The second is the number of samples along a side of the window.
+"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -291,7 +294,7 @@ def spectral_psfs(
 
 
 def _sampled(pupil: PupilFunction, wavelength: float, half: float) -> PupilField:
-    """Sample a pupil as finely as its image up to ``half`` metres from the middle needs, without its shadows."""
+    """Sample a pupil, without shadows, densely enough for its image up to ``half`` metres from the middle."""
     aperture = 0.5 * float(np.max(pupil.cutoff(np.eye(2), 1.0)))
     nothing = np.zeros(1, complex)
     right, left, _ = pupil.edge.corners(nothing)
@@ -309,7 +312,9 @@ def _sampled(pupil: PupilFunction, wavelength: float, half: float) -> PupilField
 
 
 def evaluate_colours(optics: CameraOptics, spectrum: SpectrumSpec, fields: tuple[Field, ...], sharp: bool) -> Colours:
-    """Compute the polychromatic results of a camera, without MTF if it is not ``sharp``.
+    """Compute the polychromatic results of a camera.
+
+    ``sharp`` is False for a camera with wavefront errors so large that no MTF and no point images are computed.
 
     Raises
     ------
@@ -334,7 +339,7 @@ def evaluate_colours(optics: CameraOptics, spectrum: SpectrumSpec, fields: tuple
 
 @dataclass(frozen=True, eq=False)
 class _AtField:
-    """Polychromatic results at one of the fields."""
+    """View of the polychromatic results that gives the numbers of one field, for optics.json."""
 
     colours: Colours
     number: int

@@ -1,4 +1,4 @@
-"""Statistics of the wavefront of a beam over the light that edges and bodies leave of it."""
+"""Statistics of the wavefront of a vignetted beam over the part of the stop that edges and bodies do not block."""
 
 from __future__ import annotations
 
@@ -19,8 +19,9 @@ from optics.waves.pupil_terms import products, smooth_terms
 from twin.targets.target_path import LineRays, TargetPath
 
 WORST_LIGHT = 5e-3
-"""Largest difference between the fraction of light by shadows of edges and by traced rays; 10 000 rays count it to
-1e-3.
+"""Largest accepted difference between the fractions of light computed from shadows of edges and from traced rays.
+
+10 000 rays give that fraction to 1e-3.
 """
 
 RAYS_ACCURACY = 2e-3
@@ -34,10 +35,14 @@ _SHADOW_NODES = 6
 """Quadrature nodes along each side of a shadow's box."""
 
 _ASTRAY, _DARK_DEGREE = 2.0, 12
-"""Departure of shadowed rays, in ranges of the wavefront, beyond which a polynomial replaces them, and its degree."""
+"""Treatment of rays in the shadow that depart far from the wavefront.
+
+The first is the largest accepted departure from the mean wavefront, in units of the peak-to-valley of its illuminated
+part. Beyond it, the wavefront in the shadow is replaced by a smooth polynomial, of which the second is the degree.
+"""
 
 _FINER_RINGS, _FINER_NODES = 4, 2
-"""Additional rings and nodes of the finer quadrature, which checks the results."""
+"""Additional rings, and additional nodes per side of a shadow, of a finer quadrature that checks the results."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,9 +56,10 @@ class VignettedFit:
     light : float
         Fraction of the stop's light that passes.
     hole : float
-        Radius of the central hole, as in ``Wavefront``.
+        Radius of the central hole of an annular pupil, in units of the stop's radius; 0 for a whole pupil, NaN for any
+        other.
     accuracy : float
-        Accuracy, as in ``Wavefront``.
+        Change of the rms, relative to it, or of the Strehl ratio with a finer quadrature, whichever is larger.
     """
 
     fit: PartFit
@@ -135,9 +141,10 @@ def fit_illuminated(
 
 
 def _tamed(stop: IlluminatedStop, pieces: np.ndarray, rings: int, wave: np.ndarray) -> np.ndarray:
-    """Return the wavefront at N nodes, (N,), with a smooth continuation where rays in the shadow depart far from it.
+    """Return the wavefront at N nodes, (N,), smoothly continued where rays in the shadow depart far from it.
 
-    Such rays pass outside the rims of lenses; the quadrature subtracts their contribution again.
+    Such rays pass outside the rims of lenses. Their contribution to a quadrature cancels, as the whole disk is
+    integrated and the shadow is subtracted.
     """
     points = np.stack([stop.x[0], stop.y[0]], axis=-1)
     free = ~covered(pieces, points, SMALLEST)[0]

@@ -15,16 +15,16 @@ from twin.camera.camera_optics import CameraOptics, rim
 from twin.camera.camera_results import Field
 
 LINE_POINTS = 41
-"""Number of points along the line at which distortion is computed, as many as in the truth of the main job."""
+"""Number of points along the line CCD at which distortion is computed, as in the results of the main job."""
 
 GRID = (11, 5)
 """Number of fields along the line and along the track of distortion maps."""
 
 FOCUS_STEPS = 41
-"""Number of positions through focus, odd."""
+"""Number of positions of the detector through focus, odd."""
 
 FOCUS_DEPTHS = 3.0
-"""Range through focus to either side, in depths of focus 2 lambda F^2."""
+"""Largest defocus, to either side, in units of the depth of focus 2 lambda F^2."""
 
 
 @shows("distance [m]", "rms [um]", "largest [um]", "line_distance [m]", "line_largest [um]")
@@ -54,7 +54,7 @@ class Distortion:
     line_distance : float
         Principal distance of the line, sum(L tan W) / sum(tan^2 W), metres.
     line_point : tuple of float
-        Principal point of the line when it is fitted, and the principal distance of that fit, metres.
+        Principal point of the line and principal distance, metres, when both are fitted to L(tan W).
     residual : (M,) ndarray
         Distortion L - f tan W with ``line_distance``, metres.
     residual_with_point : (M,) ndarray
@@ -183,7 +183,7 @@ class FieldCurves:
 def field_curves(optics: CameraOptics, sharp: bool, count: int = 21) -> FieldCurves:
     """Compute focus, error, illumination and MTF at ``count`` fields along the line.
 
-    The MTF is omitted if the camera is not ``sharp``.
+    ``sharp`` is False for a camera with wavefront errors so large that the MTF is not computed.
     """
     share = np.linspace(-1.0, 1.0, count)
     fields = np.stack([share, np.zeros(count)], axis=-1)
@@ -243,7 +243,10 @@ class ThroughFocus:
 
 
 def through_focus(optics: CameraOptics, fields: tuple[Field, ...], sharp: bool) -> ThroughFocus:
-    """Compute the image quality while the detector moves through focus."""
+    """Compute the image quality at F fields while the detector moves through focus.
+
+    ``sharp`` is False for a camera with wavefront errors so large that the MTF is not computed.
+    """
     spec = optics.model.spec
     f_number = optics.spot().airy / (1.22 * spec.wavelength)
     beams = optics.beams(fields, 6)
@@ -260,7 +263,11 @@ def through_focus(optics: CameraOptics, fields: tuple[Field, ...], sharp: bool) 
 
 
 def _mtf_through_focus(optics: CameraOptics, fields: tuple[Field, ...], defocus: np.ndarray, sharp: bool) -> np.ndarray:
-    """Return the MTF at Nyquist, (F, 2, Z), at F fields, in two directions, for Z defoci; NaN if not sharp."""
+    """Return the MTF at the Nyquist frequency through focus, (F, 2, Z).
+
+    It is for F fields, the directions along line and track, and Z positions of the detector; NaN if not ``sharp``
+    (wavefront errors too large for an MTF).
+    """
     mtf = np.full((len(fields), 2, len(defocus)), np.nan)
     if sharp:
         wavelength = np.array([optics.model.spec.wavelength])

@@ -37,7 +37,7 @@ from twin.camera.camera_optics import CameraOptics, rim
 from twin.framework.record import Quantity, Record
 
 EARLIER = 6.0
-"""Distance before the launch point of the light within which obstacles are searched, metres."""
+"""Distance by which rays are extended backward from the light's launch point to find obstacles there, metres."""
 
 _FIELDS = tuple((x, y) for x in (-1.0, 0.0, 1.0) for y in (-1.0, 0.0, 1.0))
 _RAYS = 4000
@@ -111,7 +111,7 @@ def obstacles(model: CameraModel) -> dict[str, Aperture]:
 
 
 def _body(model: CameraModel, name: str, edge: Aperture) -> Aperture:
-    """Return the outline of a surface with the outer edge and hole of its file, else ``edge``."""
+    """Return the outline of a camera's surface: outer edge and hole of its file, or ``edge`` if the file gives none."""
     edges = model.edges.get(name, ())
     outlines = [
         edge_spec.shape
@@ -179,7 +179,11 @@ def obscuration(model: CameraModel, backend: Backend) -> ObscurationData:
 
 
 LEAST_SHARE = 0.005
-"""Fraction of a beam from which an obscuration that no edge models is reported: outlines of bodies include margins."""
+"""Smallest fraction of a beam blocked by the camera's parts that is reported if the camera's file models no
+obscuration.
+
+Outlines of parts include margins, so that smaller fractions mean little.
+"""
 
 
 def unmodelled_obscuration(model: CameraModel, obscured: ObscurationData) -> str:
@@ -200,7 +204,10 @@ def unmodelled_obscuration(model: CameraModel, obscured: ObscurationData) -> str
 
 
 _SLIVER = 0.01
-"""Largest fraction of a mirror's light within its hole: light along the rim of a shadow that moves with the field."""
+"""Largest fraction of a mirror's light that may fall into a central hole assumed to be there.
+
+Some light along the rim of a shadow does, as the shadow moves with the field.
+"""
 
 
 def _holes(
@@ -211,7 +218,10 @@ def _holes(
     through: Mapping[str, list[np.ndarray]],
     illuminated: np.ndarray,
 ) -> dict[str, float]:
-    """Return the radii of central holes of mirrors that the light needs, metres."""
+    """Return the radii of central holes, metres, without which mirrors would block the light that crosses their middle.
+
+    Only mirrors count whose file specifies no hole and whose middle reflects no light.
+    """
     out = {}
     for body in model.mirrors:
         if model.spec.mirrors[body].light is not None or not np.any(blocked.get(body, False)):
@@ -319,7 +329,7 @@ class FirstOrderData:
 
 
 def _near(value: float) -> float | None:
-    """Return a length, metres, or None for an infinite one."""
+    """Return a length in metres, or None if it is infinite (beyond 1e9 m)."""
     return value if abs(value) < _INFINITE else None
 
 

@@ -44,19 +44,26 @@ def layout_figure(model: CameraModel, backend: Backend) -> Figure:
 
 
 def _fields(axis: int) -> list[tuple[float, float]]:
-    """Return three fields in the plane of a view."""
+    """Return both ends and the middle of the field along ``axis`` as three fields, in fractions of the half fields.
+
+    Axis 0 is along the line, axis 1 along the track.
+    """
     return [(s, 0.0) if axis == 0 else (0.0, s) for s in (-1.0, 0.0, 1.0)]
 
 
 def _rays(model: CameraModel, backend: Backend, axis: int) -> np.ndarray:
-    """Trace chief, lower and upper marginal ray of three fields to K surfaces, (1 + K, 3, 3, 3), metres."""
+    """Trace chief, lower and upper marginal ray of three fields to K surfaces, (1 + K, 3, 3, 3), metres.
+
+    The axes are launch point and surfaces, fields, rays and coordinates x, y, z. The plane of the rays is along
+    ``axis``: 0 for the line, 1 for the track.
+    """
     stop = np.zeros((3, 2))
     stop[1:, axis] = -INSIDE, INSIDE
     return ray_paths(model, backend, _fields(axis), stop).points
 
 
 def _extent(model: CameraModel, backend: Backend, axis: int) -> tuple[float, float, float, float]:
-    """Return the smallest and largest z and transverse coordinate of a view, with a margin, metres."""
+    """Return the limits of a drawing: smallest and largest z and transverse coordinate, with a margin, metres."""
     rays = _rays(model, backend, axis)
     points = rays[1:]
     z = points[..., 2]
@@ -110,7 +117,7 @@ def _view(axes: Axes, model: CameraModel, backend: Backend, axis: int, first: fl
 
 
 def _label(axes: Axes, model: CameraModel, name: str, drawn: np.ndarray, axis: int) -> None:
-    """Write the name of a surface beside it."""
+    """Write the name of a surface beside its drawing."""
     text = "focal plane" if name == IMAGE else f"{name}, stop" if name == model.spec.stop else name
     # beyond the end that is farther from the axis; in the top view all ends are alike, and neighbours alternate
     turn = name == IMAGE or model.mirrors.index(name) == 0

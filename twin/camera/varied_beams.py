@@ -35,19 +35,21 @@ AIM_TOLERANCE = 1e-8
 waves.
 """
 GRIDS = ((5, 8), (7, 10), (10, 14))
-"""Rings of the stop's quadrature and degree of the polynomials for the wavefront, the coarsest first."""
+"""Pairs of the number of quadrature rings of the stop and the degree of the wavefront's polynomials, the coarsest
+first.
+"""
 RESIDUAL = 1e-3
-"""Largest rms of a wavefront that its polynomials may leave, waves."""
+"""Largest accepted rms of a wavefront minus the polynomials fitted to it, waves."""
 
 
 class VignettedBeamError(UnphysicalError):
-    """Beams are vignetted by a surface that is neither the stop nor has edges."""
+    """Error: a beam is vignetted by a surface that is neither the stop nor has edges in its file."""
 
     allowed = "fields whose light is not vignetted"
 
 
 class RoughWavefrontError(UnphysicalError):
-    """Polynomials cannot represent the wavefronts."""
+    """Error: wavefronts are too irregular to be represented by polynomials over the pupil."""
 
     allowed = "a sharper camera, or fields where it is sharp"
 
@@ -80,37 +82,37 @@ class VariedBeams:
 
     Parameters
     ----------
-    optics
+    optics : CameraOptics
         Camera in its nominal state.
-    fields
-        Fractions of the half field, (F, 2).
-    colours
-        Wavelengths that are traced, metres, (K,); by default that of the design.
-    shares
-        Weights of the wavelengths, which sum to 1, (K,); by default equal.
-    planes
-        Compute eikonals as well.
+    fields : (F, 2) ndarray
+        Positions in the field, as fractions of the half fields along the line and along the track.
+    colours : (K,) ndarray, optional
+        Wavelengths that are traced, metres; by default that of the design.
+    shares : (K,) ndarray, optional
+        Weights of the wavelengths, which sum to 1; by default equal.
+    planes : bool
+        True to compute optical paths to plane waves (eikonals) as well, for transfer functions.
 
     Attributes
     ----------
-    directions
-        Directions of the light in the world frame, (F, 3).
-    start
-        Starting points of the nominal camera's chief rays in the world frame, metres, (F, 3).
-    nodes
+    directions : (F, 3) ndarray
+        Directions of the light in the world frame.
+    start : (F, 3) ndarray
+        Starting points of the nominal camera's chief rays in the world frame, metres.
+    nodes : PupilNodes
         Quadrature nodes of the stop.
-    degree
-        Degree of the polynomials in the pupil that represent wavefronts.
-    solve
-        Matrix from values at the N nodes to T polynomial coefficients, (T, N).
-    designed
-        Light of the nominal camera, of one state.
-    cosines
-        Direction cosines (row, column) of its rays at the line CCD, (K, F, N, 2).
-    residual
-        Rms that the polynomials leave of its wavefronts, waves.
-    pieces
-        Polygons on the stop's unit disk where its beams are shadowed, (F, P, V, 2): P polygons of V corners per field.
+    degree : int
+        Degree of the polynomials over the pupil that represent wavefronts.
+    solve : (T, N) ndarray
+        Matrix from values at the N nodes to T polynomial coefficients.
+    designed : BeamLight
+        Light of the nominal camera, as of one state.
+    cosines : (K, F, N, 2) ndarray
+        Direction cosines (along rows, along columns) of the nominal camera's rays at the line CCD.
+    residual : float
+        Rms of the nominal wavefronts minus the polynomials fitted to them, waves.
+    pieces : (F, P, V, 2) ndarray
+        Parts of the stop's unit disk that are shadowed in the nominal beams: P polygons of V corners per field.
 
     Raises
     ------
@@ -142,7 +144,7 @@ class VariedBeams:
 
     @one_blas_thread()
     def _prepare(self) -> None:
-        """Trace the nominal camera with the coarsest grid whose polynomials represent its wavefronts."""
+        """Trace the nominal camera with the coarsest of ``GRIDS`` whose polynomials represent its wavefronts."""
         self.directions = self.optics.directions(self.fields)
         for rings, degree in GRIDS:
             self.nodes, self.degree = quadrature.disk(rings), degree
@@ -168,7 +170,7 @@ class VariedBeams:
         self.pieces = self.optics.path.shadows_on_stop({}, self.directions)[0]
 
     def _aim_nominal(self) -> None:
-        """Aim the rays of the nominal camera, from which all others are aimed."""
+        """Aim the rays of the nominal camera at the points of the stop; rays of other states start from these."""
         path = self.optics.path
         self.start = np.asarray(
             path.assembly.nominal_pose(f"{path.root}/{path.model.mirrors[0]}").translation
@@ -240,7 +242,7 @@ class VariedBeams:
         return np.repeat(np.arange(count * len(self._glass)), len(self.fields))
 
     def _fan_for(self, count: int) -> RayFan:
-        """Return the ray fan of all beams of ``count`` states."""
+        """Return the rays of all beams of ``count`` states with the two parameters by which each can be aimed."""
         times = count * len(self._glass)
 
         def tiled(array: np.ndarray) -> np.ndarray:
@@ -261,7 +263,7 @@ class VariedBeams:
         return np.asarray(np.moveaxis(longer, 1, 2).reshape(len(paths), len(self.fields), -1))
 
     def _light(self, traced: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray], aimed: np.ndarray) -> BeamLight:
-        """Return the light at the line CCD from traced rays."""
+        """Return the light at the line CCD (optical paths, chief rays) from traced rays, as ``BeamLight``."""
         position, direction, path, _ = traced
         paths = self._to_sphere(position, direction, path, self.radius)
         eikonals = self._to_sphere(position, direction, path, np.inf) if self._planes else paths

@@ -19,7 +19,7 @@ from twin.framework.command import Result, finished, run_command
 from twin.framework.procedure import Session
 
 DIFFERENT = 1
-"""Exit code if results differ, as that of diff."""
+"""Exit code if results differ; it is that of the program diff."""
 
 app = cli.program()
 

@@ -21,9 +21,9 @@ from twin.framework.run_folder import Manifest, finished_manifest
 from twin.framework.svg import BLUE, GREY, look, new_figure, plain_axes, signed_map, to_png, to_svg
 
 MOST_BARS = 30
-"""Largest number of changes in the figure, the most significant ones."""
+"""Largest number of changes in the bar chart, which shows the most significant ones."""
 _MOST_IMAGES = 8
-"""Largest number of images shown."""
+"""Largest number of differing images that the report shows."""
 
 
 def compare_report(comparison: Comparison) -> Report:
@@ -55,13 +55,13 @@ def compare_report(comparison: Comparison) -> Report:
 
 
 def _row(name: str, diff: Differences) -> list[Cell]:
-    """Return a run's row in the summary: numbers of differing inputs, results and images."""
+    """Return a run's row in the summary table: its name and the numbers of inputs, results and images that differ."""
     far = max((abs(one.in_sigma) for one in diff.numbers if one.in_sigma is not None), default=None)
     return [name, len(diff.inputs), len(diff.numbers), len(diff.arrays), diff.compared, far]
 
 
 def _warnings(comparison: Comparison) -> tuple[str, ...]:
-    """Return warnings of other versions and of other warnings of the runs, which make a comparison doubtful."""
+    """Return warnings that make a comparison doubtful: runs with different program versions or other warnings."""
     first = comparison.runs[0]
     out = []
     for name, run in zip(comparison.names[1:], comparison.runs[1:], strict=True):
@@ -80,7 +80,10 @@ def _warnings(comparison: Comparison) -> tuple[str, ...]:
 
 
 def _artefacts(reference: Run, run: Run, diff: Differences, names: tuple[str, str], k: int) -> tuple[Artefact, ...]:
-    """Return the tables and figures of one run against the reference."""
+    """Return the tables and figures of the differences between one run and the reference.
+
+    ``names`` are those of the two run folders, and ``k`` is the run's number, from which file names follow.
+    """
     out: list[Artefact] = []
     if diff.inputs:
         rows: list[list[Cell]] = [[_text(value) for value in one.values()] for one in diff.inputs]
@@ -110,7 +113,7 @@ def _artefacts(reference: Run, run: Run, diff: Differences, names: tuple[str, st
 
 
 def _text(value: Leaf) -> str:
-    """Return a value of an input as text."""
+    """Return the value of an input key as text for a table."""
     return "\N{EM DASH}" if value is None else str(value)
 
 
@@ -126,7 +129,7 @@ def _shape(array: ArrayDifference) -> str:
 
 
 def _changes(diff: Differences, names: tuple[str, str], k: int) -> SvgFigure | None:
-    """Return the figure of the most significant changes; None if no number has a sigma."""
+    """Return a bar chart of the most significant changes of results, in sigmas; None if no number has a sigma."""
     with_sigma = [one for one in diff.numbers if one.in_sigma is not None]
     chosen = sorted(with_sigma, key=lambda one: -abs(one.in_sigma or 0.0))[:MOST_BARS]
     if not chosen:
@@ -171,7 +174,11 @@ def _pictures(reference: Run, run: Run, diff: Differences, names: tuple[str, str
 
 
 def _views(first: np.ndarray, second: np.ndarray) -> list[tuple[str, np.ndarray, np.ndarray]]:
-    """Return mean images over the frames; for further axes (state, channel) each differing index by itself."""
+    """Return images of both runs to be shown side by side, with a title for each pair.
+
+    Arrays of at most three axes are averaged over the first (frames). For arrays with further axes, such as state and
+    channel, there is a pair for each index at which they differ.
+    """
     if first.ndim <= 3:
         axes = tuple(range(first.ndim - 2))
         return [("", first.mean(axis=axes), second.mean(axis=axes))]
@@ -214,7 +221,7 @@ class Differences:
     numbers : tuple[NumberDifference, ...]
         Results that differ by more than the tolerance.
     arrays : tuple[ArrayDifference, ...]
-        Images that differ by more than the tolerance of their peak.
+        Images and other arrays that differ by more than the tolerance, relative to the array's largest value.
     compared : int
         Number of result values and arrays that both runs have.
     """
@@ -232,7 +239,10 @@ class Differences:
 
 @dataclass(frozen=True, eq=False)
 class Run:
-    """Run folder with its manifest, and the keys and values of its config.yaml."""
+    """Run folder with the keys and values of its config.yaml and its manifest.
+
+    The manifest lists the run's files and how they were made.
+    """
 
     folder: Path
     manifest: Manifest
@@ -266,7 +276,7 @@ def differences(reference: Run, other: Run, rtol: float, sigmas: float | None) -
     other : Run
         The second run.
     rtol : float
-        Relative tolerance: of the larger of two numbers, and for arrays of the peak.
+        Tolerance relative to the larger of two numbers, and for arrays to the largest absolute value.
     sigmas : float | None
         Where a number has a sigma in both runs, differences within this multiple of it do not count; the sigmas and the
         recorded frames, whose random noise differs, are then ignored. None compares all to ``rtol``.
@@ -316,7 +326,10 @@ def _same_input(here: Leaf, there: Leaf) -> bool:
 
 
 def _same_number(one: NumberDifference, rtol: float, sigmas: float | None) -> bool:
-    """Return whether two results are equal within the tolerances."""
+    """Return whether two results are equal within a relative tolerance or within ``sigmas`` times their sigma.
+
+    With ``sigmas``, standard deviations themselves always count as equal.
+    """
     if sigmas is not None and is_sigma(one.key):
         return True
     if one.difference is None:  # if both are None, one file lacks the key
@@ -327,7 +340,7 @@ def _same_number(one: NumberDifference, rtol: float, sigmas: float | None) -> bo
 
 
 def _same_array(one: ArrayDifference, rtol: float) -> bool:
-    """Return whether two arrays are equal within the tolerance."""
+    """Return whether two arrays differ by at most ``rtol`` times the largest absolute value of the reference."""
     return one.finite and (one.largest or 0.0) <= rtol * (one.peak or 0.0)
 
 
@@ -403,9 +416,9 @@ def numbers(comparison: Comparison) -> Mapping[str, Any]:
 
 
 def _plain(one: NumberDifference | ArrayDifference, without: str, *derived: str) -> dict[str, Any]:
-    """Return the fields of a difference but one, and numbers derived from them, as plain data for JSON.
+    """Return the fields of a difference, except ``without``, and its properties ``derived``, as plain data for JSON.
 
-    None for numbers that are not finite.
+    Numbers that are not finite become None.
     """
     values = {key: value for key, value in vars(one).items() if key not in without.split()}
     more = {key: getattr(one, key) for key in derived}
@@ -413,7 +426,7 @@ def _plain(one: NumberDifference | ArrayDifference, without: str, *derived: str)
 
 
 def verdict(comparison: Comparison) -> list[str]:
-    """Return a sentence for each run against the first, and one for its most significant change."""
+    """Return the verdict: a sentence for each run compared with the first, and one on its largest change in sigmas."""
     parts = []
     for name, diff in zip(comparison.names[1:], comparison.diffs, strict=True):
         inputs = f"{len(diff.inputs)} input{'s' * (len(diff.inputs) != 1)}" if diff.inputs else "no input"

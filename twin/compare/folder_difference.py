@@ -39,13 +39,16 @@ EXCLUDED_KEYS = frozenset(
 )
 """Keys of results that describe how the run was done, instead of its results."""
 STATEMENTS = frozenset(("verdict", "warnings"))
-"""Keys of sentences at the top of a result that follow from its numbers."""
+"""Keys of a result whose values are sentences (verdict, warnings) that follow from its numbers."""
 ENTRY_NAMES = ("name", "motion", "label", "field", "path", "time_s")
-"""Keys that distinguish the entries of a list; the first one that does is used."""
+"""Keys whose values identify an entry of a list, such as its name.
+
+The first key is used that all entries have with different values.
+"""
 NOISE = "noise"
-"""Name of the sigma from image noise, which more frames reduce."""
+"""Source of a sigma that is due to the images' noise alone, which more frames reduce."""
 _ARRAY_LENGTH = 12
-"""Length above which a list of numbers is compared as an array."""
+"""Number of entries above which a list of numbers is compared as an array and not number by number."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,8 +89,8 @@ class NumberDifference:
         Standard deviation of the difference of two independent measurements, from both files' sigmas; None if the files
         hold none.
     sigma_of : str
-        ``noise`` if sigma is that of the images' noise alone, ``stated`` if it is the total sigma in the files; empty
-        without.
+        ``noise`` if sigma is due to the images' noise alone, ``stated`` if it is the total sigma that the files give;
+        empty without a sigma.
     scale : float
         Largest number of the same kind in both files.
     """
@@ -138,7 +141,7 @@ class ArrayDifference:
     reference, other : Leaf
         Values of this element.
     depth : int
-        Bytes of an element of an unsigned array; 0 for other types.
+        Bytes per element of an array of unsigned integers, such as an image; 0 for other types.
     """
 
     file: str
@@ -156,7 +159,7 @@ class ArrayDifference:
 
     @property
     def finite(self) -> bool:
-        """True if the element that differs most is finite in both arrays."""
+        """True if the element that differs most has finite values in both arrays."""
         return self.largest is not None and math.isfinite(float(self.other or 0) - float(self.reference or 0))
 
 
@@ -175,7 +178,7 @@ class FileDifference:
     statements : tuple[NumberDifference, ...]
         Differing sentences that follow from the numbers.
     common_numbers, common_arrays : int
-        Number of values in both files; 0 and 1 for files of equal bytes that are not JSON.
+        Number of values and of arrays that both files have; 0 and 1 for files of equal bytes that are not JSON.
     drawn : bool
         Whether the file is a picture.
     """
@@ -315,7 +318,7 @@ def _same(here: Any, there: Any) -> bool:
 
 
 def is_sigma(key: str) -> bool:
-    """Return whether a key holds the standard deviation, or the residual after correction, of another number."""
+    """Return True if a key is that of a standard deviation, or of a residual after correction, of another number."""
     last = key.rpartition(".")[2]
     return last == "sigma" or last.endswith(("_sigma", "_sigma_noise")) or last.startswith(("sigma_", "left_"))
 
@@ -323,9 +326,9 @@ def is_sigma(key: str) -> bool:
 def sigma_of(reference: Mapping[str, Leaf], other: Mapping[str, Leaf], key: str) -> tuple[float | None, str]:
     """Return the sigma of the difference of two numbers, and its source.
 
-    For a number with the key ``x`` the source is ``noise`` if both runs hold ``x_sigma_noise`` beside it, otherwise
-    ``stated``, from ``x_sigma`` or ``sigma``. An estimator's error from the motions is the same in runs of the same
-    motions, and does not scatter between them.
+    For a number with the key ``x`` the source is ``noise`` if both runs have ``x_sigma_noise`` beside it, otherwise
+    ``stated``, the total sigma from ``x_sigma`` or ``sigma``. Noise is preferred because an estimator's systematic
+    error, due to the bodies' motions, is equal in two runs with the same motions.
 
     Parameters
     ----------
@@ -345,9 +348,10 @@ def sigma_of(reference: Mapping[str, Leaf], other: Mapping[str, Leaf], key: str)
 
 
 def _quantity_kind(key: str) -> str:
-    """Return the name that all numbers of one kind share, such as all values of a table's column.
+    """Return the name that all numbers of one kind share, by which their common scale is found.
 
-    It is a table's column, or the last part of a key that is an identifier, such as ``zernike_waves`` of Zernike terms.
+    It is a table's column, or the last part of a key that is an identifier, such as ``zernike_waves`` for the Zernike
+    terms of a list.
     """
     if key.startswith("row "):
         return key.partition(", ")[2]
@@ -356,11 +360,11 @@ def _quantity_kind(key: str) -> str:
 
 
 _PLACE = re.compile(r"\[(?:\[[^\]]*\]|[^\[\]])*\]")
-"""Pattern of an index in a key after a list's name: the number of an entry, or its distinguishing name."""
+"""Pattern of an index in a key after a list's name: an entry's number in brackets, or the name that identifies it."""
 
 
 def _scales(*contents: Mapping[str, Leaf]) -> dict[str, float]:
-    """Return the largest absolute number of each kind; a number far smaller is zero within rounding."""
+    """Return kind of number -> largest absolute value in all contents, relative to which rounding is judged."""
     out: dict[str, float] = {}
     for numbers in contents:
         for key, value in numbers.items():
@@ -529,7 +533,10 @@ _IDENTIFIER = re.compile(r"""(\bid="|url\(#|href="#)[^")]*""")
 
 
 def _text(content: bytes, drawn: bool = False) -> Content:
-    """Return the words and numbers of a text; the bytes of anything else."""
+    """Return a text file's content: its numbers as an array, and its words with "#" instead of each number.
+
+    Of a file that is not text, the bytes are the array.
+    """
     try:
         text = content.decode("utf-8")
     except UnicodeDecodeError:
@@ -564,4 +571,4 @@ READERS: dict[str, Callable[[bytes], Content]] = {
     "glb": _scene,
     "journal": lambda content: Content({}, {}, {}),  # journal of a study, whose numbers are in study.nc
 }
-"""Suffix of a file -> function that reads it."""
+"""Suffix of a file name -> function that reads the numbers, texts and arrays of such a file."""

@@ -1,4 +1,7 @@
-"""State of a run folder against its manifest, and differences of machine and program between two runs."""
+"""State of a run folder: which files differ from its manifest; and differences of machine and program between two runs.
+
+The manifest is the file of a run folder that lists its files with checksums, its inputs and how it was made.
+"""
 
 from __future__ import annotations
 
@@ -17,7 +20,7 @@ from twin.framework.run_folder import Manifest
 
 @dataclass(frozen=True)
 class FolderState:
-    """State of a run folder against its manifest.
+    """State of a run folder compared with its manifest, which lists the run's files with checksums.
 
     Attributes
     ----------
@@ -52,17 +55,17 @@ class FolderState:
 
     @property
     def sealed(self) -> bool:
-        """True if the manifest has a checksum of itself."""
+        """True if the manifest contains a checksum of itself, so that changes to it are detected."""
         return self.manifest.digest is not None
 
     @property
     def is_study(self) -> bool:
-        """True if the folder is that of a study's runs, a part of which can be repeated."""
+        """True if the folder is that of a study (many runs of one job), of which a part can be repeated."""
         return self.manifest.program == "twin.study" and not self.manifest.gradient
 
 
 def folder_state(folder: Path) -> FolderState:
-    """Check every file of a run folder.
+    """Compare every file of a run folder, and every input file, with the checksums in the run's manifest.
 
     Raises
     ------
@@ -91,7 +94,7 @@ def folder_state(folder: Path) -> FolderState:
 
 
 def _as_read(place: Path, known: str) -> str:
-    """Return ``gone`` or ``changed`` for an input; empty if it is as the run read it."""
+    """Return ``gone`` or ``changed`` for an input file by its checksum ``known``; empty if it is as the run read it."""
     if not place.is_file():
         return "gone"
     try:
@@ -128,7 +131,7 @@ def _manifest(folder: Path) -> Manifest:
 
 @dataclass(frozen=True)
 class Elsewhere:
-    """Differences between where a run was made and where it was repeated.
+    """Differences of program and machine between a run and its repetition.
 
     Attributes
     ----------
@@ -146,14 +149,14 @@ class Elsewhere:
 
 
 def elsewhere(manifest: Manifest, here: Provenance | None, now: Mapping[str, str]) -> Elsewhere:
-    """Compare where a run was made with where it was repeated.
+    """Compare the program and machine of a run with those of its repetition.
 
     Parameters
     ----------
     manifest : Manifest
         Manifest of the run.
     here : Provenance | None
-        Provenance of the repetition.
+        Record of program and machine of the repetition.
     now : Mapping[str, str]
         Versions of the packages of the repetition.
     """
@@ -179,7 +182,10 @@ def _changes(then: Mapping[str, str], now: Mapping[str, str]) -> list[str]:
 
 
 def _machine(where: Provenance) -> dict[str, str]:
-    """Return the properties that change rounding, except the kernels; the number of threads does not."""
+    """Return the properties of a machine that change rounding, except the linear algebra's kernels.
+
+    The number of threads does not change rounding.
+    """
     settings = [f"{key}={value}" for key, value in where.settings.items() if not key.endswith("THREADS")]
     return {
         "processor": where.processor,
@@ -190,5 +196,5 @@ def _machine(where: Provenance) -> dict[str, str]:
 
 
 def _kernels(where: Provenance) -> dict[str, str]:
-    """Return library of linear algebra -> processor for which its kernels are made."""
+    """Return name of each linear-algebra library -> processor type for which the kernels that it used are made."""
     return {f"{one.name} {one.version}": one.kernels for one in where.blas}

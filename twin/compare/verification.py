@@ -1,6 +1,7 @@
 """Repetition of a run from its folder, and the verdict on the folder and the run.
 
-A whole run is repeated by its command in a process of its own; of a study one block is computed in this process.
+A whole run is repeated by its command in a process of its own. Of a study (many runs of one job) one block of runs is
+repeated in this process.
 """
 
 from __future__ import annotations
@@ -33,22 +34,22 @@ from twin.study.runs.plan import Plan
 from twin.study.study_files import make_dataset, summary
 
 EQUAL, UNEQUAL, NOT_REPEATED = 0, 1, 2
-"""Exit codes."""
+"""Exit codes of the command: the repeated run agrees, it differs, or the run could not be repeated."""
 CONFIG = "config.yaml"
 MOST_PRINTED = 5
-"""Largest number of quantities printed for a file."""
+"""Largest number of differing quantities that are printed for a file."""
 MOST_LISTED = 20
-"""Largest number of quantities of a file in the JSON, those that differ most."""
+"""Largest number of differing quantities of a file in the JSON output; those that differ most are listed."""
 SAME, ROUNDED, DIFFERENT, EXCLUDED = "same", "rounding", "different", "excluded"
 REDRAWN = "redrawn"
-"""State of a picture whose numbers differ by rounding only, so that its lines have slightly different corners."""
+"""State of a picture drawn from numbers that differ by rounding only, so that its lines are slightly displaced."""
 GONE, NEW = "only in the run", "only in the repeated run"
 EXCLUDED_FILES: Mapping[str, str] = {
     "html": "a page that states when and where it was made; its numbers are those of the other files",
     "md": "a page that states how long it took; its numbers are those of the other files",
     blocks.BLOCKS: "runs in the order of their computation; their numbers are those of study.nc",
 }
-"""Suffixes or names of files that are not compared, and the reason."""
+"""Suffix or name of files that are not compared -> the reason."""
 
 RELATIVE = 1e-9
 """Largest difference that counts as rounding, relative to the largest number of its kind or to an array's peak.
@@ -63,9 +64,9 @@ Its linear algebra rounds otherwise. Fits with a condition number of 1e8 and mor
 Zernike terms by 4e-8). No number here is known to a millionth.
 """
 SIGMA_SHARE = 1e-3
-"""Largest difference that counts as rounding, as a share of the number's standard deviation.
+"""Largest difference of a number, relative to its standard deviation, that counts as rounding.
 
-The last digit that a file holds is a millionth of that standard deviation.
+Files give numbers to a millionth of their standard deviation.
 """
 RELATIVE_OF_SIGMAS = 1e-6
 """Largest relative difference of standard deviations that counts as rounding.
@@ -73,14 +74,18 @@ RELATIVE_OF_SIGMAS = 1e-6
 They are computed from matrices with a condition number of 1e4 and more.
 """
 PIXEL_SHARE, GREY_LEVELS = 1e-4, 2
-"""Share of the pixels, and grey levels, by which recorded frames may differ on another processor.
+"""Largest fraction of pixels that may differ between frames of two processors, and largest difference in DN.
 
-These pixels have an expectation at the boundary between two numbers of photons.
+Where the expected photons of a pixel lie, within rounding, at a value where the random number of photons changes by
+one, the frames differ.
 """
 PICTURE_LEVELS = 4
-"""Largest difference of drawn pictures, in grey levels of 255: edges are drawn by partly covered pixels."""
+"""Largest difference of rendered figures that counts as rounding, in grey levels of 255.
+
+Partly covered pixels along drawn edges may differ by so much.
+"""
 RELATIVE_OF_GEOMETRY = 1e-6
-"""Largest difference, relative to the peak, of geometry in single precision."""
+"""Largest difference of 3-D geometry in single precision that counts as rounding, relative to its largest value."""
 
 
 @dataclass(frozen=True)
@@ -119,7 +124,8 @@ class FileState:
     file : str
         Path in the folder.
     state : str
-        SAME, ROUNDED or another of the states above.
+        ``SAME``, ``ROUNDED`` (equal within rounding), ``DIFFERENT``, ``EXCLUDED`` (not compared), ``REDRAWN``, ``GONE``
+        (only in the run) or ``NEW`` (only in the repeated run).
     quantities : tuple[Quantity, ...]
         Quantities that differ, the largest difference first, at most `MOST_LISTED`.
     count : int
@@ -191,7 +197,10 @@ def file_state_of(compared: FileDifference, elsewhere: bool = False) -> FileStat
 
 
 def _number(one: NumberDifference, elsewhere: bool) -> Quantity:
-    """Return the difference of a number, and whether it is rounding."""
+    """Return the difference of a number or text in two files, with the decision whether it is rounding.
+
+    ``elsewhere`` is True if the run was repeated on a different processor.
+    """
     off = None if one.difference is None else abs(one.difference)
     if off is None or not math.isfinite(off):
         return Quantity(one.key, _short(one.reference), _short(one.other))
@@ -204,7 +213,10 @@ def _number(one: NumberDifference, elsewhere: bool) -> Quantity:
 
 
 def _array(one: ArrayDifference, drawn: bool, elsewhere: bool) -> Quantity:
-    """Return the largest difference of an array, and whether it is rounding."""
+    """Return the largest difference of an array in two files, with the decision whether it is rounding.
+
+    ``drawn`` is True for a picture, ``elsewhere`` if the run was repeated on a different processor.
+    """
     name = one.name or "pixels"
     if one.share is None:
         shapes = (one.shape, one.other_shape)
@@ -234,7 +246,7 @@ def _short(value: Any) -> Leaf:
 
 
 class CannotRepeat(Exception):
-    """A run that cannot be repeated; the message gives the reason."""
+    """Error: a run cannot be repeated; the message gives the reason."""
 
 
 @dataclass(frozen=True)
@@ -246,11 +258,11 @@ class Repetition:
     files : tuple[FileState, ...]
         Every compared file of the folder.
     elsewhere : Elsewhere
-        Differences to where the run was made.
+        Differences of program and machine from those of the run.
     seconds : float
         Duration of the repetition, in seconds.
     what : str
-        Repeated part, if it is not the whole run.
+        Description of the repeated part if it is not the whole run; otherwise empty.
     """
 
     files: tuple[FileState, ...]
@@ -266,7 +278,7 @@ class Repetition:
 
 
 def obstacle(state: FolderState) -> str:
-    """Return why a run cannot be repeated from its folder; empty if it can."""
+    """Return the reason why a run cannot be repeated from its folder; empty if it can be."""
     manifest = state.manifest
     if not manifest.again:
         return "it holds measurements that a test exported beside its run (--export); verify the run folder of the test"
@@ -346,7 +358,7 @@ def repeat(state: FolderState, place: Path, quiet: bool) -> Repetition:
 
 
 def redrawn(files: Sequence[FileState]) -> Iterator[FileState]:
-    """Yield the files with pictures marked as redrawn if all numbers are equal within rounding.
+    """Yield the files of one run, with state REDRAWN for pictures that differ while all numbers agree to rounding.
 
     Parameters
     ----------
@@ -360,7 +372,7 @@ def redrawn(files: Sequence[FileState]) -> Iterator[FileState]:
 
 @recomputed()
 def repeat_block(state: FolderState) -> Repetition:
-    """Repeat the middle block of a study, and compare all blocks with the study's data set.
+    """Repeat the middle block of runs of a study, and compare all blocks with the study's data set.
 
     Parameters
     ----------
@@ -394,7 +406,7 @@ def repeat_block(state: FolderState) -> Repetition:
 
 
 def _responses(result: BlockResult, plan: Plan) -> difference.Content:
-    """Return the responses of a block of a study, run by run, as numbers to compare."""
+    """Return the results (responses) of each run in a block of a study, as numbers to compare."""
     arrays = {
         f"{response}{ending}": getattr(result, part)[:, r]
         for r, response in enumerate(plan.setup.study.responses)
@@ -405,7 +417,7 @@ def _responses(result: BlockResult, plan: Plan) -> difference.Content:
 
 
 def _data_states(folder: Path, plan: Plan, whole: BlockResult) -> Iterable[FileState]:
-    """Compare study.nc and study.json with the content of the blocks."""
+    """Compare a study's data set and summary, study.nc and study.json, with the results of its blocks."""
     name = "study.nc"
     try:
         stored_arrays = difference.content_of(folder / name, name).arrays
@@ -442,7 +454,7 @@ class Verification:
 
     @property
     def code(self) -> int:
-        """Exit code of the command."""
+        """Exit code of the command: 0 without a difference, 1 with a changed file or result, 2 if not repeatable."""
         if not self.state.whole or (self.repetition is not None and self.repetition.state == DIFFERENT):
             return UNEQUAL
         return NOT_REPEATED if self.obstacle else EQUAL
@@ -496,7 +508,7 @@ class Verification:
         return out
 
     def numbers(self) -> dict[str, Any]:
-        """Return the verification as plain data, for ``--json``."""
+        """Return the verification as plain data, for the command's option ``--json``."""
         state, repetition = self.state, self.repetition
         manifest = state.manifest
         return {
@@ -533,7 +545,7 @@ class Verification:
         }
 
     def lines(self) -> list[str]:
-        """Return the details of the verification, line by line."""
+        """Return details of the verification as lines of text: changed inputs, differing files and their quantities."""
         state, out = self.state, []
         out += [f"read by the run and changed since: {name}" for name in state.inputs_changed]
         out += [f"read by the run and missing now: {name}" for name in state.inputs_gone]
@@ -550,7 +562,7 @@ class Verification:
 
 
 def _largest(files: Sequence[FileState]) -> str:
-    """Return the largest differences of numbers, relative and in sigma, in words."""
+    """Return a text with the largest differences of numbers, relative to their size and in sigmas."""
     numbers = [quantity for file in files if not file.drawn for quantity in file.quantities]
     relative = max((one.relative or 0.0 for one in numbers), default=0.0)
     in_sigma = max((one.in_sigma or 0.0 for one in numbers), default=0.0)

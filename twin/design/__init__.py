@@ -1,1 +1,1 @@
-"""Optimisation of a camera's prescription, and search for the layout of a monitor."""
+"""Optimisation of a camera's optical prescription, and search for the layout of a monitor."""

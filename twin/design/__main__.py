@@ -22,14 +22,14 @@ from twin.framework.command import add_tests, run_test
 
 
 def _meant(args: Sequence[str]) -> str:
-    """Return the subcommand for the file among the arguments."""
+    """Return the subcommand (``camera`` or ``monitor``) that the file among the arguments requires."""
     return "monitor" if any(_is_layout(word) for word in args if not word.startswith("-")) else "camera"
 
 
 def _is_layout(word: str) -> bool:
-    """Return True if an argument is the path of a search for a monitor's layout.
+    """Return True if an argument is the path of a file that specifies a search for a monitor's layout.
 
-    Errors in a file are left to its command.
+    A file with errors counts too if it is of this kind; its command reports the errors.
     """
     try:
         kind = kind_of(read_yaml(word).data)

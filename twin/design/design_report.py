@@ -1,4 +1,4 @@
-"""Report of an optimised camera: numbers before and after, layout, wavefront error over the field, new file."""
+"""Report of an optimised camera: numbers before and after, layout, wavefront error over the field, and its new file."""
 
 from __future__ import annotations
 
@@ -105,7 +105,7 @@ def design_report(run: DesignRun) -> Report:
 
 
 def _start_row(number: int, attempt: Attempt) -> list[str | float]:
-    """Return a row of the table of starts: one start of the optimisation and the design at which it ended."""
+    """Return a table row for one start of the optimisation and the design at which it ended."""
     design = attempt.design
     kind = "random" if attempt.drawn else "the camera"
     start_text = "at once" if attempt.steps == 1 else f"in {attempt.steps} steps"
@@ -166,10 +166,7 @@ def _layout(axes: Axes, design: Design, prescription: Prescription) -> None:
 
 
 def _edges(hits: np.ndarray) -> tuple[int, int]:
-    """Return the indices of the rays (N, 2) of a beam with the smallest and the largest y.
-
-    Array dimensions: N rays.
-    """
+    """Return the indices of the rays of a beam with the smallest and the largest y, from N hits (x, y), (N, 2)."""
     return int(np.argmin(hits[:, 0])), int(np.argmax(hits[:, 0]))
 
 

@@ -1,4 +1,4 @@
-"""Optimisation of a camera's prescription with exact Jacobians from several starts, and its result file."""
+"""Optimisation of a camera's optical prescription from several starts with exact Jacobians, and its result file."""
 
 from __future__ import annotations
 
@@ -37,16 +37,19 @@ line CCD. Made by python -m twin.design from {start}: least squares of the wavef
 
 
 LEAST_BENEFIT = 0.01
-"""Smallest relief for which a constraint is named in the verdict.
+"""Smallest benefit of easing a constraint for which the verdict names it.
 
-The relief is the decrease of the wavefront error per millimetre by which the constraint is eased, relative to the
+The benefit is the decrease of the wavefront error per millimetre by which the constraint is eased, relative to the
 error.
 """
 
 _KEYS = {"envelope": ("envelope",), "clearance": ("clearance",), "anamorphism": ("anamorphism",)}
-"""Keys of the constraints that can be eased; the principal distance cannot, since the variables hold it exactly."""
+"""Constraint that can be eased -> its keys in the design's file.
+
+The principal distance is not among them, since the variables hold it exactly.
+"""
 _REMEDIES = {"envelope": "a larger envelope", "clearance": "a smaller clearance", "anamorphism": "more anamorphism"}
-"""Advice for each constraint that can be eased."""
+"""Constraint that can be eased -> advice for the report."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,14 +75,25 @@ class DesignRun:
 
     @property
     def best(self) -> Design:
-        """Best design of all starts, with the prescription before and after."""
+        """Design of smallest wavefront error among all starts, with the prescription before and after."""
         return self.searched.best
 
 
 def run_design(
     setup: camera_design.CameraDesignSetup, backend: Backend, seed: int = 0, advance: Advance = silent
 ) -> DesignRun:
-    """Optimise the camera; the seed is that of the random starts.
+    """Optimise the prescription of the camera from several starts.
+
+    Parameters
+    ----------
+    setup : CameraDesignSetup
+        Specification of the design.
+    backend : Backend
+        Array backend of the ray trace.
+    seed : int
+        Seed of the random starts.
+    advance : Advance
+        Callback that reports progress.
 
     Raises
     ------
@@ -138,12 +152,12 @@ def run_design(
 
 
 def _known(of: Callable[[Design], Any]) -> Callable[[Attempt], Any]:
-    """Return a function that gives a number of the design reached from a start; None if no design was reached."""
+    """Return a function that takes a number from the design reached from a start; None if none was reached."""
     return lambda attempt: None if attempt.design is None else of(attempt.design)
 
 
 def _pair(of: Callable[[Evaluation], Any]) -> Callable[[DesignRun], Any]:
-    """Return a function that gives a number of the camera before and after the optimisation."""
+    """Return a function that takes a number of the camera before and after the optimisation, as a pair."""
     return lambda run: {"before": of(run.best.before), "after": of(run.best.after)}
 
 
@@ -248,7 +262,7 @@ def verdict(run: DesignRun) -> str:
 
 
 def _held_text(held: tuple[ActiveConstraint, ...], start: str, across: float) -> str:
-    """Return in words the constraints that cost most, at most three, each with its cost in wavefront error.
+    """Return a text on the constraints that cost most, at most three, each with its cost in wavefront error.
 
     Parameters
     ----------

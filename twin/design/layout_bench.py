@@ -1,9 +1,10 @@
 """Evaluation of single beams and whole layouts of a monitor: they are built, checked and traced.
 
-A beam is first evaluated alone, four times in a pair as in every layout. The Fisher information of its spots on the
-motions of the bodies that all beams share adds up over the beams of a layout (the motions of a beam's own prisms act as
-noise of its spots), so that thousands of combinations are compared without a trace. The best ones are then built as a
-whole, which includes facets in one block and adjacent prisms.
+A layout consists of monitor beams, each with its prisms at a position in the pupil. A beam is first evaluated alone,
+four times in a pair of cameras as in every layout. The Fisher information of its spots on the motions of the bodies
+that all beams share adds up over the beams of a layout (the motions of a beam's own prisms act as noise of its spots),
+so that thousands of combinations are compared without a trace. The best ones are then built as a whole, which includes
+facets in one block and adjacent prisms.
 """
 
 from __future__ import annotations
@@ -32,11 +33,11 @@ from twin.monitor.information import Information, ground_of, information_of, qua
 from twin.sensors.area_detector import EmvaDetector
 
 _AROUND = 24
-"""Number of rays traced along the edge of a beam."""
+"""Number of rays traced along the edge of a monitor beam."""
 EDGE_PX = 10.0
-"""Distance that the fit of a spot needs between its centre and the edge of its area CCD, pixels."""
+"""Smallest distance between the centre of a spot and the edge of its area CCD that the fit needs, pixels."""
 FULLEST = 0.9
-"""Largest share of a pixel's full-well capacity that its expected light may fill.
+"""Largest fraction of a pixel's full-well capacity that its expected light may fill.
 
 The rest is for shot noise and for pixels of higher response, five standard deviations of both even with a few thousand
 electrons.
@@ -45,9 +46,9 @@ electrons.
 
 @dataclass(frozen=True, eq=False)
 class Seen:
-    """Observation model of the spots of one beam under one prior on disturbances; D = 8 coordinates, K cameras.
+    """Linear observation model of the spots of one beam under one prior on disturbances.
 
-    Array dimensions: M independent motions.
+    Array dimensions: D = 8 spot coordinates, K cameras, M independent motions.
 
     Attributes
     ----------
@@ -66,7 +67,7 @@ class Seen:
 
 @dataclass(frozen=True, eq=False)
 class BeamFacts:
-    """Properties of a beam that was evaluated alone.
+    """Properties of a monitor beam that was evaluated alone.
 
     Array dimensions: P corners, N segments, K cameras.
 
@@ -85,8 +86,8 @@ class BeamFacts:
     bodies : tuple of ndarray
         Corners (P, 3) of its prisms in the base frame, metres.
     facets : (channels, 4) ndarray
-        For each channel the tilt of its facet along the base's X and Y (tangents) and its position relative to the
-        apex, metres.
+        For each channel the tilt of its facet (tangents) along the base's X and Y, and the facet's position (X, Y)
+        relative to the apex, metres.
     light : (N, K, 2, 3) ndarray
         Segments of the rays of its beams in front of the cameras, metres.
     """
@@ -102,9 +103,9 @@ class BeamFacts:
 
     @cached_property
     def planes(self) -> list[np.ndarray]:
-        """Planes of the faces of each of its prisms, (F, 4) each: normal n and offset d of n x + d = 0.
+        """Planes of the faces of each of its prisms, (F, 4) for F faces: normal n and offset d of n x + d = 0.
 
-        n is a unit vector that points outwards in the base frame, d is in metres. Array dimensions: F faces.
+        n is a unit vector that points outwards in the base frame, x a point in that frame and d is in metres.
         """
         return [ConvexHull(corners).equations for corners in self.bodies]
 
@@ -113,8 +114,6 @@ class BeamFacts:
 class LayoutFacts:
     """Properties of a layout that was built as a whole.
 
-    Array dimensions: C spots.
-
     Attributes
     ----------
     beams : Layout
@@ -122,15 +121,17 @@ class LayoutFacts:
     refused : str
         Reason why it is not feasible, empty if it is; the other attributes are then empty.
     sigmas : dict
-        Disturbances -> quantity -> posterior standard deviation, SI.
+        Disturbances -> quantity -> posterior standard deviation, SI units.
     before : dict
-        Disturbances -> quantity -> prior standard deviation, without any measurement, SI.
+        Disturbances -> quantity -> prior standard deviation, without any measurement, SI units.
     shares : dict
-        Disturbances -> goal -> cause -> part of the posterior variance due to the cause, SI.
+        Disturbances -> quantity of a goal -> cause -> contribution of the cause to the posterior variance, SI units
+        squared.
     shares_before : dict
-        Disturbances -> quantity -> prior standard deviation, without any measurement, SI.
+        Disturbances -> quantity of a goal -> cause -> contribution of the cause to the prior variance, without any
+        measurement, SI units squared.
     pupil_share : float
-        Share of the imaging pupil that its prisms block.
+        Fraction of the imaging pupil that its prisms block.
     mass : float
         Mass of its prisms, kg.
     glass_path : float
@@ -138,7 +139,7 @@ class LayoutFacts:
     spot_sigma : float
         Largest prior standard deviation of a spot position, pixels.
     brightest : (C,) ndarray
-        Filling of every spot's brightest pixel, as a share of its capacity.
+        Signal of the brightest pixel of each of C spots, as a fraction of its full-well capacity.
     """
 
     beams: monitor_layout.Layout
@@ -175,21 +176,21 @@ class LayoutBench:
 
     @cached_property
     def imaging(self) -> monitor_layout.ImagingBeams:
-        """Imaging beams of the cameras, common to all layouts."""
+        """Imaging beams of the cameras, which all layouts have in common."""
         return monitor_layout.ImagingBeams.of(self.start, self.backend)
 
     @property
     def imaging_shape(self) -> tuple[int, int, int]:
-        """Shape (cameras, 3, rays) of the boolean array that ``BeamFacts.taken`` packs."""
+        """Shape (cameras, 3, rays) of the boolean array that is stored bitwise in ``BeamFacts.taken``."""
         return len(self.setup.instrument.cameras), 3, monitor_layout.RAYS
 
     @cached_property
     def rows(self) -> dict[str, np.ndarray]:
-        """Linear map (matrix rows) from the cameras' parameters to each quantity, common to all layouts."""
+        """Quantity -> its coefficients on the parameters of all cameras, the same for all layouts."""
         return quantity_rows(self.start, ground_of(self.start))
 
     def detector(self, name: str = monitor_layout.AS_STARTED) -> EmvaDetector:
-        """Return the detector of the area CCD that a beam names."""
+        """Return the detector model of the area CCD named in a beam."""
         sheet = self.setup.detectors.get(name, self.setup.detector)
         return EmvaDetector.from_sheet(sheet, self.setup.instrument.autocollimator.area_ccd.exposure)
 
@@ -239,7 +240,7 @@ class LayoutBench:
             return LayoutFacts(beams, refused=_reason(error))
 
     def judged(self, beams: monitor_layout.Layout, instrument: Instrument, limited: bool = True) -> LayoutFacts:
-        """Return the properties (accuracy, obstruction, mass) of a layout that is built as an instrument.
+        """Return the properties (accuracy, obstruction, mass) of a layout that is already built as an instrument.
 
         Parameters
         ----------
@@ -282,7 +283,7 @@ class LayoutBench:
     def information(
         self, instrument: Instrument, beam: monitor_layout.Beam, alike: bool = False, single: bool = True
     ) -> dict[str, Information]:
-        """Return what an instrument's spots tell about the cameras' parameters, by the name of the disturbances.
+        """Return disturbances -> Fisher information of an instrument's spots on the cameras' parameters.
 
         Parameters
         ----------
@@ -291,7 +292,7 @@ class LayoutBench:
         beam : Beam
             One of its beams, which names the area CCD.
         alike, single : bool
-            True to assume the same noise for spots of one camera and one beam width; True for images in single
+            True to assume the same noise for spots of one camera with the same beam width; True for images in single
             precision.
         """
         stated = self.setup.disturbances
@@ -333,7 +334,7 @@ def _reason(error: Exception) -> str:
 
 
 def is_own(body: str) -> bool:
-    """Return True if a body belongs to one channel, by its path: prisms, boards, facets."""
+    """Return True if the path of a body shows that it belongs to one channel: a prism, board or facet."""
     last = body.rpartition("/")[2]
     return any(part.partition("_")[0] in SIDES for part in body.split("/")) or any(
         last.endswith(f"_{side}") for side in SIDES
@@ -353,11 +354,9 @@ def _seen(information: Information) -> Seen:
 
 
 def _light(instrument: Instrument, backend: Backend) -> np.ndarray:
-    """Return segments (N, K, 2, 3), metres, of the edge rays of all outgoing beams, in front of the cameras.
+    """Return segments of the edge rays of all outgoing beams in front of the cameras, (N, K, 2, 3), metres.
 
-    Segments inside glass are omitted.
-
-    Array dimensions: N segments, K cameras.
+    Segments inside glass are omitted. Array dimensions: N segments, K cameras; each segment has two end points.
     """
     angle = 2.0 * np.pi * np.arange(_AROUND) / _AROUND
     edge = 0.999 * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
@@ -380,7 +379,7 @@ def _facets(instrument: Instrument) -> np.ndarray:
 
 
 def touching(one: BeamFacts, other: BeamFacts) -> bool:
-    """Return True if two beams are incompatible.
+    """Return True if two beams cannot be in the same layout.
 
     Their prisms overlap or block the other's light, or a facet extends over the edge of the other's.
 
@@ -407,9 +406,9 @@ def touching(one: BeamFacts, other: BeamFacts) -> bool:
 
 
 def combined(facts: Sequence[BeamFacts], name: str) -> np.ndarray:
-    """Return the posterior covariance of the cameras' parameters from several beams together, (4 K, 4 K), rad and m.
+    """Return the posterior covariance of the parameters of K cameras from several beams together, (4 K, 4 K).
 
-    Array dimensions: K cameras.
+    The parameters are in rad and m.
 
     Parameters
     ----------

@@ -5,8 +5,8 @@ are equal, and is not differentiable. So each step is a linear programme over al
 (box) about the layout and within the ranges of its parameters (Fletcher and Sainz de la Maza, Math. Programming 43,
 235, 1989); the box grows if the layout that is then built achieves the predicted improvement, and shrinks if not.
 Collisions of bodies are checked for every layout that is built. Where there are some, parameters on which no goal
-depends, mostly positions of prisms, are drawn again a few times to make room for the step; if that fails, the
-parameters are changed one by one, and changes that improve the layout are kept.
+depends, mostly positions of prisms, are replaced a few times by random values to make room for the step; if that fails,
+the parameters are changed one by one, and changes that improve the layout are kept.
 
 Gradients: positions of prisms and facets are themselves found by tracing, so there is no closed formula from a pupil
 offset to a sigma. The derivative of sigma with respect to A, the matrix of the traced derivatives of the spots with
@@ -47,21 +47,24 @@ LEAST_BENEFIT = 1e-3
 It is the change of the ratio of a sigma to its goal over the parameter's whole range, relative to the largest ratio.
 """
 ROOM, ROOM_STEP = 8, 0.06
-"""Number of draws of the idle parameters to make room for a step, and their rms change relative to the ranges."""
+"""Number of random changes of idle parameters that are tried to make a step feasible, and their rms size.
+
+The size is relative to the ranges of the parameters.
+"""
 _KEPT = 0.2  # share of the predicted improvement above which the box grows
 _ORDER = 2  # order of the differences: accurate to 1 %, which suffices for a step
 
 Ask = Callable[[str, Sequence[Any]], list[Any]]
-"""Function that evaluates items: from the name of a part of the search and the items to their results."""
+"""Function that evaluates items: from the name of a stage of the search and the items to their results."""
 
 
 def ratios(sigmas: Mapping[str, Mapping[str, float]], bench: LayoutBench) -> dict[tuple[str, str], float]:
-    """Return the ratio of each quantity's standard deviation to its goal, by disturbances and quantity.
+    """Return (disturbances, quantity) -> ratio of the quantity's standard deviation to its goal.
 
     Parameters
     ----------
     sigmas : dict
-        Disturbances -> quantity -> sigma, SI.
+        Disturbances -> quantity -> sigma, SI units.
     bench : LayoutBench
         Evaluator of the layouts of the design.
     """
@@ -86,13 +89,13 @@ def refined(
     ask : Ask
         Function that evaluates derivatives and layouts.
     part : str
-        Part of the search, for the progress.
+        Stage of the search, for the progress display.
     facts : LayoutFacts
         Feasible layout at the start.
     steps : int
         Largest number of steps, each with new gradients.
     rng : Generator
-        Random generator for making room.
+        Random generator for the parameters that are varied at random to avoid collisions.
 
     Returns
     -------
@@ -142,10 +145,7 @@ def _largest(facts: LayoutFacts, bench: LayoutBench) -> float:
 
 
 def _slopes_of(bench: LayoutBench, facts: LayoutFacts, slope: Slope) -> np.ndarray:
-    """Return the linearised change of every ratio of sigma to goal over a parameter's whole range, (Q,).
-
-    Array dimensions: Q ratios of sigma to goal.
-    """
+    """Return the linearised change of Q ratios of sigma to goal over a parameter's whole range, (Q,)."""
     low, high = ranges(bench.setup)[slope.number.name]
     out, goal = [], bench.setup.test.goal.wanted
     for name, key in ratios(facts.sigmas, bench):
@@ -195,7 +195,7 @@ def _moved(bench: LayoutBench, beams: Layout, numbers: Sequence[LayoutNumber], c
 def _with_room(
     bench: LayoutBench, ask: Ask, part: str, beams: Layout, idle: Sequence[LayoutNumber], rng: np.random.Generator
 ) -> LayoutFacts:
-    """Return the best feasible layout after the parameters on which no goal depends are drawn again.
+    """Return the best feasible layout after random changes of the parameters on which no goal depends.
 
     If none is feasible, it is one with the reason of refusal.
     """
@@ -207,7 +207,7 @@ def _with_room(
 def _one_by_one(
     bench: LayoutBench, ask: Ask, part: str, facts: LayoutFacts, slopes: Sequence[Slope], change: np.ndarray
 ) -> LayoutFacts:
-    """Return the layout improved by single changes of a step, tried in turn, the most promising first."""
+    """Return a layout improved by the single parameter changes of a step, tried in turn, the most promising first."""
     worst = int(np.argmax(list(ratios(facts.sigmas, bench).values())))
     gain = [abs(_slopes_of(bench, facts, slope)[worst] * c) for slope, c in zip(slopes, change, strict=True)]
     for k in np.argsort(gain)[::-1]:
@@ -227,14 +227,17 @@ The traced derivatives of the spots are smooth over the whole range, and rays ar
 ORDER = 6
 """Default order of the central differences (error proportional to the step to this power)."""
 _WEIGHTS = {2: {1: 1.0 / 2.0}, 4: {1: 8.0 / 12.0, 2: -1.0 / 12.0}, 6: {1: 45.0 / 60.0, 2: -9.0 / 60.0, 3: 1.0 / 60.0}}
-"""Order -> number of steps -> weight of a central difference (Fornberg, Math. Comp. 51, 699, 1988)."""
-_JUMP = {4: {1: 4.0 / 3.0, 2: -1.0 / 3.0}, 6: {1: 1.5, 2: -0.6, 3: 0.1}}
-"""Order -> number of steps k -> weight of the second difference f(k h) + f(-k h) - 2 f(0), to detect jumps of f.
+"""Order -> number k of steps -> weight of the difference f(k h) - f(-k h) in a central difference with step h.
 
-f is a function of a layout parameter and h the step. The weighted sum tends to zero for a smooth f, extrapolated by
-even powers. Of a jump J anywhere within the steps it keeps a part that, divided by h, bounds the effect of J on the
-central difference. For order 6 the part and the effect are J and 0.62 J for a jump at the first step, J/2 and 0.13 J at
-the second, J/10 and 0.02 J at the third.
+The weights are those of Fornberg, Math. Comp. 51, 699, 1988.
+"""
+_JUMP = {4: {1: 4.0 / 3.0, 2: -1.0 / 3.0}, 6: {1: 1.5, 2: -0.6, 3: 0.1}}
+"""Order -> number k of steps -> weight of the second difference f(k h) + f(-k h) - 2 f(0), to detect jumps of f.
+
+f is a function of a layout parameter and h the step. The weighted sum is extrapolated by even powers of h and tends to
+zero for a smooth f. If f has a jump J anywhere within the steps, the sum keeps a part of J that, divided by h, is an
+upper limit for the effect of J on the central difference. For order 6 the part and the effect (times h) are J and 0.62
+J for a jump within the first step, J/2 and 0.13 J within the second, J/10 and 0.02 J within the third.
 """
 
 
@@ -260,14 +263,14 @@ class LayoutNumber:
     order: int = ORDER
 
     def moved(self, bench: LayoutBench, by: float) -> Layout:
-        """Return the layout with this parameter changed.
+        """Return the layout with this parameter changed by an amount.
 
         Parameters
         ----------
         bench : LayoutBench
             Evaluator of the layouts of the design.
         by : float
-            Change, SI.
+            Change, SI units.
         """
         beam = self.beams[self.beam]
         value = number_of(bench.setup, beam, self.name) + by
@@ -285,11 +288,11 @@ class Slope:
     refused : str
         Reason why they cannot be computed, empty if they can; the other attributes are then empty.
     values : dict
-        Disturbances -> quantity -> d(sigma)/d(parameter), SI.
+        Disturbances -> quantity -> d(sigma)/d(parameter), SI units.
     errors : dict
         Numerical error of each derivative, in the same form; empty for differences of second order.
     brightest : (C,) ndarray
-        Derivatives of the filling of the brightest pixel of each of C spots, per SI unit.
+        Derivatives, per SI unit, of the signal of the brightest pixel of each of C spots as a fraction of its capacity.
     """
 
     number: LayoutNumber
@@ -300,7 +303,7 @@ class Slope:
 
 
 def numbers_of(bench: LayoutBench, beams: Layout, order: int = ORDER) -> tuple[LayoutNumber, ...]:
-    """Return all parameters of a layout that may vary.
+    """Return all continuous parameters of a layout that may vary.
 
     Parameters
     ----------
@@ -309,7 +312,7 @@ def numbers_of(bench: LayoutBench, beams: Layout, order: int = ORDER) -> tuple[L
     beams : Layout
         Layout of the monitor (its beams).
     order : int
-        Order of the differences.
+        Order of the central differences by which they are differentiated.
     """
     names = [name for name, (low, high) in ranges(bench.setup).items() if high > low]
     return tuple(LayoutNumber(beams, k, name, order) for k in range(len(beams)) for name in names)
@@ -317,12 +320,12 @@ def numbers_of(bench: LayoutBench, beams: Layout, order: int = ORDER) -> tuple[L
 
 @lru_cache(maxsize=2)
 def _known_here(bench: LayoutBench, beams: Layout) -> dict[str, Information]:
-    """Return the information of a layout's spots, cached for the layout whose parameters are differentiated."""
+    """Return the Fisher information of a layout's spots, cached for the layout that is differentiated."""
     return known_of(bench, beams)
 
 
 def known_of(bench: LayoutBench, beams: Layout) -> dict[str, Information]:
-    """Return what a layout's spots tell about the cameras, by disturbances, without a check for collisions.
+    """Return disturbances -> Fisher information of a layout's spots about the cameras; collisions are not checked.
 
     Parameters
     ----------
@@ -384,7 +387,7 @@ def slope_of(bench: LayoutBench, number: LayoutNumber) -> Slope:
 
 @dataclass(eq=False)
 class _Sum:
-    """Weighted sum of a layout's spot derivatives, noise covariances and fillings of the brightest pixels."""
+    """Weighted sum of spot derivatives, noise covariances and brightest-pixel signals of several layouts."""
 
     spots: np.ndarray
     noise: np.ndarray

@@ -3,8 +3,8 @@
 Random beams are evaluated alone; their combinations are compared without a trace; the best are built as a whole; their
 beams are varied and combined again; the best layout is refined by gradients.
 
-All random numbers are drawn here in a fixed order, and results are used in the order of the requests. So the same seed
-gives the same result for any number of workers and after any interruption.
+All random numbers are generated in this file in a fixed order, and results are used in the order of the requests. So
+the same seed gives the same result for any number of workers and after any interruption.
 """
 
 from __future__ import annotations
@@ -30,17 +30,20 @@ from twin.framework.journal import Journal
 from twin.framework.procedure import Advance
 
 FIRST_STEP = 0.15
-"""Size of the first change of a beam, relative to the range of each parameter."""
+"""Size of the random changes of a beam in the first round, relative to the range of each parameter."""
 _BATCHES = 4  # batches of layouts that are built until one is feasible
 KEPT = 2
 """Number of layouts whose beams are varied in the next round, for each number of beams."""
 ALIKE = 0.02
-"""Relative difference of merits (largest ratio of sigma to goal) below which two searches have the same optimum."""
+"""Relative difference of merits up to which two searches are considered to have reached the same optimum.
+
+The merit of a layout is its largest ratio of a standard deviation to its goal.
+"""
 
 
 @dataclass(frozen=True, eq=False)
 class Candidate:
-    """Combination of beams that were evaluated alone.
+    """Combination of monitor beams, each evaluated alone, that may become a layout.
 
     Attributes
     ----------
@@ -56,7 +59,7 @@ class Candidate:
 
 @dataclass(frozen=True, eq=False)
 class End:
-    """Result of one search from one start.
+    """Result of one search for a layout from one start.
 
     Attributes
     ----------
@@ -71,7 +74,7 @@ class End:
     tried : int
         Number of beams evaluated alone.
     standing : int
-        Number of beams evaluated alone that are feasible.
+        Number of these beams that are feasible.
     compared : int
         Number of combinations whose merit was computed.
     built : int
@@ -142,12 +145,12 @@ class Found:
 
 
 def merit(sigmas: Mapping[str, Mapping[str, float]], bench: LayoutBench) -> float:
-    """Return the largest ratio of a standard deviation to its goal; 1 or less reaches all goals.
+    """Return the merit of a layout: its largest ratio of a standard deviation to its goal (1 reaches all goals).
 
     Parameters
     ----------
     sigmas : dict
-        Disturbances -> quantity -> sigma, SI.
+        Disturbances -> quantity -> sigma, SI units.
     bench : LayoutBench
         Evaluator of the layouts of the design.
     """
@@ -155,7 +158,7 @@ def merit(sigmas: Mapping[str, Mapping[str, float]], bench: LayoutBench) -> floa
 
 
 def optima(found: Found, bench: LayoutBench) -> list[list[End]]:
-    """Return the searches grouped by their merits, the best group first.
+    """Return the searches in groups that reached the same optimum, the best group first.
 
     The merits of a group lie within ``ALIKE`` of its best.
 
@@ -184,12 +187,12 @@ Item = Beam | tuple[Beam, ...] | LayoutNumber
 
 
 def journal_of(file: Path | None, config: str) -> Journal:
-    """Return the journal of a search.
+    """Return the journal of a search, the file that holds its finished evaluations.
 
     Parameters
     ----------
     file : Path or None
-        File of the journal, None to keep nothing.
+        File of the journal, None to store nothing.
     config : str
         Text that identifies the search.
     """
@@ -242,7 +245,7 @@ class Workers:
         Parameters
         ----------
         part : str
-            Part of the search, for the progress.
+            Stage of the search, for the progress display.
         items : sequence of Item
             Beams, layouts, or parameters of layouts.
 
@@ -262,7 +265,7 @@ class Workers:
         return [known[name] for name in names]
 
     def _results(self, items: Mapping[str, Item]) -> Iterator[dict[str, Any]]:
-        """Yield results of items by their names, as they finish."""
+        """Yield name -> result for a few items at a time, as they are finished."""
         if self._pool is None:
             for name, item in items.items():
                 yield {name: _answer(self.bench, item)}
@@ -296,9 +299,9 @@ class Search:
     workers : int
         Number of further processes, 0 for none.
     seed : int
-        Seed of all random draws.
+        Seed of all random numbers.
     journal : Path or None
-        File that keeps finished evaluations, None for none.
+        File that stores finished evaluations, None for none.
     advance : Advance
         Callback that reports progress.
     """
@@ -330,9 +333,9 @@ def _promise(candidate: Candidate) -> tuple[float, tuple[int, ...]]:
 
 
 def spread(level: Sequence[Candidate], width: int) -> list[Candidate]:
-    """Select ``width`` of the ranked candidates: half of them the best, the others evenly spaced over the rest.
+    """Return ``width`` of the ranked candidates: half of them the best, the others evenly spaced over the rest.
 
-    The best are often similar and compatible with the same few other beams.
+    The best ones alone would not do, because they are often similar and compatible with the same few other beams.
 
     Parameters
     ----------
@@ -347,7 +350,7 @@ def spread(level: Sequence[Candidate], width: int) -> list[Candidate]:
 
 
 class _OneSearch:
-    """Search from one set of beams.
+    """Search for layouts from one set of beams.
 
     Parameters
     ----------
@@ -356,7 +359,7 @@ class _OneSearch:
     ask : Ask
         Function that evaluates beams, layouts and derivatives.
     rng : Generator
-        Random generator of all draws.
+        Random generator of the search.
     name : str
         Name of the start; empty for the instrument from which the design starts.
     """
@@ -371,7 +374,7 @@ class _OneSearch:
         self.refused: Counter[str] = Counter()
 
     def run(self, beams: Sequence[Beam]) -> End:
-        """Search from these beams, supplemented by random ones to the number that the design specifies."""
+        """Search for layouts from these beams, plus as many random ones as the design's number of beams requires."""
         spec = self.setup.test.search
         first = [*dict.fromkeys(beams)]
         while len(first) < spec.beams:
@@ -414,7 +417,7 @@ class _OneSearch:
         return sorted(feasible, key=lambda layout: merit(layout.sigmas, self.bench))
 
     def _with_other_ccds(self) -> list[Beam]:
-        """Return the beams of the best layout with each other area CCD of the file.
+        """Return the beams of the best layout with each other area CCD that the design's file lists.
 
         All beams of a layout have the same area CCD, so that they can only change it together.
         """
@@ -447,7 +450,7 @@ class _OneSearch:
                 break
 
     def _chosen(self, count: int) -> list[Candidate]:
-        """Return the most promising layouts not built yet, in turn for each number of beams."""
+        """Return the most promising layouts not built yet, alternating between the numbers of beams."""
         by_size = [
             [candidate for candidate in level if candidate.beams not in self.built][:count]
             for level in reversed(self._ranked())
@@ -456,11 +459,11 @@ class _OneSearch:
         return turns[:count]
 
     def _ranked(self) -> list[list[Candidate]]:
-        """Return layouts of one beam, of two, and so on, the most promising first.
+        """Return layouts of one beam, of two, and so on, in each case the most promising first.
 
         The best of each number of beams are extended by every further beam. Layouts are compared before their
         feasibility is checked, which is done for the most promising ones alone; so a pair whose beams complement each
-        other is found though neither is good alone.
+        other is found although neither is good alone.
         """
         spec, size = self.setup.test, len(self.pool)
         level = sorted((self._candidate((k,)) for k in range(size)), key=_promise)
@@ -504,13 +507,13 @@ class _OneSearch:
     def _alike(self, beams: Sequence[int]) -> bool:
         """Return True if all beams have the same kinds of reflectors and the same area CCD.
 
-        The channels of an instrument are traced together, which needs the same kinds of reflectors.
+        The channels of an instrument are traced together, which requires equal kinds of reflectors.
         """
         selected = [self.pool[k].beam for k in beams]
         return len({(kinds_of(self.setup, beam), beam.area_ccd) for beam in selected}) == 1
 
     def _within(self, beams: Sequence[int]) -> bool:
-        """Return True if beams together satisfy the limits of mass and obstructed pupil share."""
+        """Return True if beams together satisfy the limits of mass and of the obstructed fraction of the pupil."""
         limits, facts = self.setup.test.limits, [self.pool[k] for k in beams]
         if limits.mass is not None and sum(beam.mass for beam in facts) > limits.mass:
             return False
@@ -533,7 +536,7 @@ class _OneSearch:
         return True
 
     def _parents(self) -> list[Beam]:
-        """Return the beams of the best feasible layouts of each number of beams.
+        """Return the beams of the best feasible layouts of each number of beams, to be varied in the next round.
 
         A pair may have to change before it is better than a single beam.
         """

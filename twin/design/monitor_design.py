@@ -1,4 +1,7 @@
-"""Search for a monitor's layout: the run, its results, and the best trade-offs of accuracy, pupil and mass."""
+"""Search for a monitor's layout: the run, its results, and the best trade-offs of accuracy, pupil and mass.
+
+A layout's merit is its largest ratio of a standard deviation to its goal.
+"""
 
 from __future__ import annotations
 
@@ -23,16 +26,16 @@ from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.path_tracing.stray_light import GHOSTS, Ghost, ghosts, stray_light
 
 MOST_POINTS = 6
-"""Largest number of layouts that are drawn and written."""
+"""Largest number of Pareto-optimal layouts that are drawn and written as instruments."""
 UNITS = {"angle": ("arcsec", ARCSEC), "d_f": ("um", 1e-6), "height": ("m", 1.0)}
-"""Unit in which each goal is reported, and the size of that unit in SI."""
+"""Goal -> unit in which it is reported, and the size of that unit in SI."""
 _ASIDE = "other tilts of the prisms in the instrument that it starts from, or other fields"
-"""Advice in the error about a start with ghost images on a spot."""
+"""Advice in the error that the starting instrument has ghost images on a spot."""
 GOAL_NAMES = {"angle": "intersection angle", "d_f": "principal distance", "height": "height on the ground"}
-"""Name of each goal in reports."""
+"""Goal -> its name in reports."""
 REMARK = """Made by python -m twin.design monitor from {start}. Posterior standard deviations:
 {sigmas}."""
-"""Comment at the top of an instrument's file."""
+"""Comment at the top of the file of an instrument that the search has found."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,7 +70,7 @@ class MonitorDesignRun:
     results : Found
         Results of the search.
     points : tuple of Point
-        Layouts on the front of merit, pupil share and mass, the best first.
+        Layouts on the Pareto front of merit, obstructed fraction of the pupil and mass, the best merit first.
     """
 
     setup: monitor_layout.MonitorDesignSetup
@@ -76,7 +79,7 @@ class MonitorDesignRun:
     points: tuple[Point, ...]
 
     def worst(self, facts: LayoutFacts, goal: str) -> float:
-        """Return the worst sigma of a goal's quantity over cameras and disturbances, SI."""
+        """Return the largest sigma of a goal's quantity over cameras and disturbances, SI units."""
         return max(sigmas[key] for sigmas in facts.sigmas.values() for key in self.bench.goals_of(goal))
 
     def merit(self, facts: LayoutFacts) -> float:
@@ -92,7 +95,7 @@ def run_monitor_design(
     workers: int = 0,
     journal: Path | None = None,
 ) -> MonitorDesignRun:
-    """Search for layouts.
+    """Search for layouts of a monitor and return the best ones.
 
     Parameters
     ----------
@@ -101,13 +104,13 @@ def run_monitor_design(
     backend : Backend
         Array backend of the ray trace.
     seed : int
-        Seed of all random draws.
+        Seed of all random numbers.
     advance : Advance
         Callback that reports progress.
     workers : int
         Number of further processes, 0 for this one alone; the result is the same.
     journal : Path, optional
-        File that keeps finished evaluations, from which a search can be resumed; None for none.
+        File that stores finished evaluations, from which a search can be resumed; None for none.
 
     Raises
     ------
@@ -143,7 +146,7 @@ def run_monitor_design(
 
 
 def _check_start(setup: monitor_layout.MonitorDesignSetup, backend: Backend, seed: int, advance: Advance) -> None:
-    """Raise InputError if the starting instrument has ghost images on a spot, if the file asks to trace them.
+    """Raise InputError if the file requests tracing ghosts and the starting instrument has one on a spot.
 
     All layouts have the prism tilts of the start.
 
@@ -163,7 +166,7 @@ def _check_start(setup: monitor_layout.MonitorDesignSetup, backend: Backend, see
 def _ghosts(
     setup: monitor_layout.MonitorDesignSetup, facts: LayoutFacts, backend: Backend, seed: int, advance: Advance
 ) -> tuple[Ghost, ...]:
-    """Return a layout's ghosts; none if they are not to be traced."""
+    """Return the ghost images on a layout's spots; none unless the file requests tracing them."""
     detector = setup.detectors.get(facts.beams[0].area_ccd, setup.detector)
     return _traced_ghosts(setup, monitor_layout.layout_spec(setup, facts.beams), detector, backend, seed, advance)
 
@@ -197,7 +200,7 @@ def _texts(facts: LayoutFacts, bench: LayoutBench) -> dict[str, str]:
 
 
 def _front(layouts: tuple[LayoutFacts, ...], bench: LayoutBench) -> list[LayoutFacts]:
-    """Return the layouts not dominated in merit, obstructed pupil share and mass, the best merit first.
+    """Return the Pareto-optimal layouts in merit, obstructed fraction of the pupil and mass, the best merit first.
 
     There are at most ``MOST_POINTS``.
     """
@@ -241,7 +244,10 @@ def verdict(run: MonitorDesignRun) -> tuple[str, ...]:
 
 
 def _limiting(run: MonitorDesignRun, facts: LayoutFacts) -> tuple[str, float]:
-    """Return the largest cause of the variance of the goal that is farthest from being reached, and its share."""
+    """Return the largest cause of variance for the goal that is farthest from being reached, and its fraction.
+
+    The fraction is that of the variance of the goal's quantity.
+    """
     wanted = run.setup.test.goal.wanted
     cases = [
         (sigmas[key] / wanted[goal], name, key)
@@ -302,7 +308,7 @@ BEAM: Record[monitor_layout.Beam] = Record(
 
 @dataclass(frozen=True, eq=False)
 class _Part:
-    """Layout, or end of a search, with the run that holds the goals."""
+    """Layout, or result of one search, together with the run that holds the goals."""
 
     run: MonitorDesignRun
     of: Any

@@ -1,4 +1,4 @@
-"""Report of a search for a monitor's layout: front, limiting causes, drawings and the instruments' files."""
+"""Report of a search for a monitor's layout: Pareto front, limiting causes, drawings and the instruments' files."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ from twin.pictures.light_paths import trace_light_paths
 from twin.sensors.area_detector import coarse_warnings
 
 _MOST_CAUSES = 6
-"""Largest number of causes in a panel."""
+"""Largest number of causes in one panel of the bar chart."""
 
 
 def monitor_design_report(run: MonitorDesignRun) -> Report:
-    """Return the report: layouts on the front, causes that limit them, drawings and the instruments' files."""
+    """Return the report: Pareto-optimal layouts, causes that limit them, drawings and the instruments' files."""
     setup, results = run.setup, run.results
     start, test = setup.instrument.name, setup.test
     rows = [_row(run, start, results.start), *(_row(run, point.name, point.facts) for point in run.points)]
@@ -78,11 +78,11 @@ _FRONT = (
     "pupil that its prisms block and against their mass. Named layouts are on the front: no other is better in all "
     "three."
 )
-"""Caption of the figure of accuracy against obstructed pupil share and mass."""
+"""Caption of the figure of accuracy against obstructed pupil fraction and mass."""
 _CAUSES = "Standard deviations by cause: without measurement, with the start and with the best layout."
-"""Caption of the figure of the causes."""
+"""Caption of the figure of the contributions of causes to the standard deviations."""
 _PUPILS = "Seen along the light into the first camera; X points toward the central prism. Filled: left; open: right."
-"""Caption of the figure of the pupils."""
+"""Caption of the figure of the beams' positions in the pupil."""
 
 
 def _row(run: MonitorDesignRun, name: str, facts: LayoutFacts) -> list[str | int | float]:
@@ -166,7 +166,10 @@ def _named(run: MonitorDesignRun) -> list[tuple[str, LayoutFacts]]:
 
 
 def _causes_of(run: MonitorDesignRun, facts: LayoutFacts, name: str, goal: str, measured: bool) -> dict[str, float]:
-    """Return a goal's standard deviations by cause, in the goal's unit, for the camera in which it is worse."""
+    """Return cause -> its contribution to the standard deviation of a goal's quantity, in the goal's unit.
+
+    It is given for the camera in which the quantity is less accurate.
+    """
     key = max(run.bench.goals_of(goal), key=lambda quantity: facts.sigmas[name][quantity])
     shares = (facts.shares if measured else facts.shares_before)[name][key]
     return {cause: sqrt(max(share, 0.0)) / UNITS[goal][1] for cause, share in shares.items()}
@@ -193,7 +196,7 @@ def _cause_table(run: MonitorDesignRun, name: str) -> Table:
 
 
 def _front_figure(run: MonitorDesignRun) -> Figure:
-    """Plot the largest ratio of sigma to goal of all layouts against obstructed pupil share and against mass."""
+    """Plot the largest ratio of sigma to goal of all layouts against obstructed pupil fraction and against mass."""
     figure = new_figure(3.6)
     left, right = figure.subplots(1, 2, sharey=True)
     costs = (("share of the imaging pupil [%]", lambda f: 100.0 * f.pupil_share), ("prisms [kg]", lambda f: f.mass))
@@ -225,7 +228,10 @@ def _front_figure(run: MonitorDesignRun) -> Figure:
 
 
 def _cause_figure(run: MonitorDesignRun) -> Figure:
-    """Plot standard deviations by cause: without measurement, with the start, with the best; one panel per goal."""
+    """Plot the contributions of causes to the standard deviations, one panel per goal.
+
+    They are shown without measurement, with the starting layout, and with the best layout.
+    """
     goals = tuple(run.setup.test.goal.wanted)
     figure = new_figure(3.4)
     panels = figure.subplots(1, len(goals), squeeze=False)[0]
@@ -263,7 +269,7 @@ def _cause_bars(axes: Axes, run: MonitorDesignRun, goal: str) -> None:
 
 
 def _pupil_figure(run: MonitorDesignRun) -> Figure:
-    """Plot the positions in the entrance pupil of the beams of the start and of each layout."""
+    """Plot the positions of the beams in the entrance pupil, for the starting layout and each new one."""
     shown = _named(run)[:4]
     figure = new_figure(3.0)
     radius = 0.5e3 * next(iter(run.setup.cameras.values())).entrance_pupil

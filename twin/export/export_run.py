@@ -207,7 +207,17 @@ def expected_fits(data: xr.Dataset, cards: Sequence[Card]) -> bytes:
 
 
 def _times(name: str, counted: str, times: Sequence[float]) -> Any:
-    """Return a FITS table of the times of frames or image planes, in seconds."""
+    """Return a FITS table of times in seconds, one for each frame or image plane of a cube.
+
+    Parameters
+    ----------
+    name : str
+        Name of the table.
+    counted : str
+        Name of its first column, which counts the frames or planes.
+    times : sequence of float
+        The times, in seconds.
+    """
     from astropy.io import fits
 
     columns = [

@@ -26,7 +26,7 @@ from twin.framework.owned_files import MANIFEST
 
 POINTS = "artefacts/points.csv"
 NUMBERS = "numbers"
-"""Name of the table of every number of the run."""
+"""Name of the exported table that lists every number of the run's JSON files."""
 _HEADS = ("schema", "reference_frames")
 _OTHER_FILES = (MANIFEST,)
 _HEAD = re.compile(r"(?P<name>.*?)\s*\[(?P<unit>[^\[\]]+)\]")
@@ -117,7 +117,7 @@ DESCRIPTIONS: Mapping[str, tuple[str, str]] = FrozenMap(
 their names.
 """
 TITLES: Mapping[str, str] = FrozenMap({POINTS: "Points measured in the images", "study.csv": "Every run of the study"})
-"""File of a table that the run stores -> title; others are named by their file."""
+"""File of a table that the run stores as CSV -> title of the exported table; other tables are titled by their file."""
 _POINT_HEIGHT = ("m", "height of the ground point above the ellipsoid of WGS 84")
 _SIGMAS = {
     "_sigma": "standard deviation of {}, from noise and the disturbance prior",
@@ -276,7 +276,7 @@ def _column(name: str, values: Sequence[Any], named: Mapping[str, str] = FrozenM
 
 
 def _kept(name: str, file: str, text: str, named: Mapping[str, str]) -> DataTable | None:
-    """Return the table of a CSV file of the run; None for one without rows."""
+    """Return the table that a run stored as a CSV file, with units and descriptions; None if it has no rows."""
     heads, *rows = list(csv.reader(io.StringIO(text))) or [[]]
     if not rows:
         return None

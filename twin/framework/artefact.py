@@ -32,7 +32,7 @@ def unit_for_reports(unit: str) -> str:
 
 
 def _typeset(text: str) -> str:
-    """Replace hyphens by minus signs."""
+    """Replace the hyphens of a formatted number by typographic minus signs."""
     return text.replace("-", MINUS)
 
 
@@ -141,7 +141,7 @@ def residual(value: float, sigma: float) -> float | None:
 
 
 def tick_text(value: float) -> str:
-    """Format an axis tick as a whole number with its sign."""
+    """Format a number at an axis tick as a whole number with a typographic sign."""
     return _typeset(f"{value:+,.0f}").replace(",", "\N{NARROW NO-BREAK SPACE}") if value else "0"
 
 
@@ -232,8 +232,8 @@ class Artefact:
     kind : str
         Extension of the file: ``svg``, ``png``, ``csv``, ``json``.
     within : str | None
-        Path of the file in the run folder that contains the artefact; None for a file of its own, empty if only the
-        page shows it.
+        Path, in the run folder, of another file that already contains the artefact; None if it is written to a file of
+        its own, empty if it is shown in the page only.
     full : Table | None
         Table with all digits that a reader can download from the page.
     """
@@ -246,7 +246,7 @@ class Artefact:
     full: Table | None = field(default=None, kw_only=True)
 
     def __post_init__(self) -> None:
-        """Raise ValueError if the name cannot be a file name."""
+        """Raise ValueError if the name has characters that the name of an artefact's file must not have."""
         if not _NAME.fullmatch(self.name):
             raise ValueError(f"artefact name {self.name!r}: only small letters, digits, - and _ can be used")
         self.content()
@@ -267,7 +267,7 @@ class Artefact:
         return self.caption
 
     def content(self) -> bytes:
-        """Return the content of the file."""
+        """Return the content of the artefact's file, as bytes."""
         raise NotImplementedError
 
 
@@ -348,7 +348,7 @@ class Table(Artefact):
         return self
 
     def shown(self) -> list[list[Cell]]:
-        """Return the rows as the report shows them."""
+        """Return the rows as the report shows them: numbers as text with the decimals of their columns."""
         places = [*self.decimals, *[None] * (len(self.heads) - len(self.decimals))]
         return [
             [
@@ -421,19 +421,19 @@ class Text(Artefact):
     points: Sequence[str] = ()
 
     def content(self) -> bytes:
-        """Return the paragraph and its points as text."""
+        """Return the paragraph and its list of points as UTF-8 text."""
         return "\n".join([self.caption, *self.points, ""]).encode()
 
 
 @dataclass(frozen=True, eq=False)
 class Piece(Artefact):
-    """Part of a report's page given as HTML, which this program made, with all user texts in it escaped."""
+    """Part of a report's page in HTML that this program has generated, with all texts of the user in it escaped."""
 
     kind: ClassVar[str] = "html"
     markup: Markup
 
     def content(self) -> bytes:
-        """Return the HTML as bytes."""
+        """Return the HTML of this part as UTF-8 bytes."""
         return self.markup.encode()
 
 

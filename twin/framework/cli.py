@@ -26,7 +26,7 @@ from scenes.yaml.standard_output import BAD_INPUT, FAILURE, code_of, print_error
 
 DOUBTFUL, INTERRUPTED = 3, 128 + signal.SIGINT
 NO_NAME = (errno.ENAMETOOLONG, errno.ELOOP)
-"""Error numbers of paths that no file can have."""
+"""Error numbers that the operating system returns for paths that no file can have, such as too long ones."""
 LARGEST_SEED = 2**63 - 1
 BACKEND_HELP = f"Backend of the ray trace: {' or '.join(NAMES)}."
 OUT_HELP = "Run folder to make. Default: runs/NAME-001, -002, ... (the first free one), with the NAME of the file."
@@ -85,7 +85,7 @@ class Options:
 
     @property
     def silent(self) -> bool:
-        """True if no progress is shown."""
+        """True if the user asked for no output but the result (--quiet or --json), so that no progress is shown."""
         return self.as_json or self.quiet
 
 
@@ -115,7 +115,7 @@ def unnamed(meant: Callable[[Sequence[str]], str]) -> type[TyperGroup]:
             return list(super().parse_args(ctx, self.whole(args)))
 
         def whole(self, args: list[str]) -> list[str]:
-            """Return the arguments with the subcommand before them."""
+            """Return the command-line arguments with the omitted subcommand put before them."""
             named = not args or args[0] in self.commands or args[0] == "--help"
             return args if named else [meant(args), *args]
 
@@ -180,7 +180,7 @@ def end_strictly(errors: Console, numbers: Any) -> None:
 
 
 class InputErrorText(Exception):
-    """Invalid input that does not come from a file."""
+    """Error of an invalid input that is not in a file, such as an option; the message names it."""
 
 
 class Incomplete(Exception):
@@ -363,7 +363,7 @@ class WorkProgress:
 
 
 def time_text(seconds: float | None) -> str:
-    """Format a duration given in seconds, in a suitable unit."""
+    """Format a duration given in seconds as text: ``45 s``, ``3 min`` or ``2.5 h``."""
     if seconds is None:
         return "an unknown time"
     if seconds < 120.0:
@@ -384,12 +384,12 @@ def progress_columns(width: int) -> tuple[progress.ProgressColumn, ...]:
 
 
 def result_table(title: str | None = None) -> Table:
-    """Return an empty table for a result in the terminal."""
+    """Return an empty table, in the style of all commands, in which a result is printed in the terminal."""
     return Table(title=title, box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False)
 
 
 def print_whole(console: Console, table: Table) -> None:
-    """Print a table with all its digits, in lines that wrap rather than numbers that are cut."""
+    """Print a table at its full width, so that no number is cut off; the terminal wraps longer lines."""
     console.width = max(console.width, console.measure(table, options=console.options.update(width=1000)).maximum)
     console.print(table)
 

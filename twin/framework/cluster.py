@@ -38,11 +38,11 @@ RETRIES = 2
 SCHEMES = ("tcp://", "tls://", "ws://", "wss://")
 ENCRYPTED = ("tls://", "wss://")
 SCRATCH = "twin-study"
-"""Prefix of the names of the folders that workers write into."""
+"""Prefix of the names of the temporary folders in which worker processes write files."""
 
 
 AHEAD = 4
-"""Tasks submitted per worker: one runs, the others wait."""
+"""Number of tasks submitted per worker: one is being computed, the others wait, so that no worker is idle."""
 
 
 class ClusterError(cli.Incomplete):

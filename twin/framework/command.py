@@ -221,7 +221,7 @@ def _add_unusable(app: typer.Typer, command: str, error: EntryPointError) -> Non
 
 
 def _test(name: str, file: cli.File, options: cli.Options) -> None:
-    """Run a test with the shared options."""
+    """Run a test (an entry of `PROCEDURES`) with the options that all tests share."""
     run_test(name, file, options)
 
 
@@ -329,6 +329,6 @@ def print_report(report: Report, console: Console) -> None:
 
 
 def print_warnings(console: Console, warnings: Sequence[str]) -> None:
-    """Print warnings about the numbers."""
+    """Print the warnings about a result in the terminal, one line each."""
     for warning in warnings:
         console.print(f"warning: {warning}", style="yellow", markup=False, soft_wrap=True)

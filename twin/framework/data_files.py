@@ -136,7 +136,7 @@ def _grid_file(data: GridData) -> bytes:
 
 
 def _axes(dims: str | tuple[str, ...]) -> tuple[str, ...]:
-    """Return the axes of a variable as a tuple."""
+    """Return the names of a variable's axes as a tuple, also if a single name is given."""
     return (dims,) if isinstance(dims, str) else dims
 
 
@@ -215,7 +215,7 @@ SPOT_STRETCH = 30.0
 """Steepness of the asinh grey scale (dimensionless) that shows faint diffraction rings beside a spot's core."""
 
 ENLARGE = 4
-"""Magnification of small pictures."""
+"""Integer factor by which small pictures of frames are magnified in PNG files."""
 LARGEST_ENLARGED = 600
 """Number of rows or columns from which a picture is not magnified."""
 
@@ -284,7 +284,7 @@ class FrameFacts:
     georeference: Georeference | None = None
 
     def page(self, k: int) -> dict[str, Any]:
-        """Return what is known about frame number ``k`` (camera, pitch, exposure, time) as plain data."""
+        """Return the known facts about frame number ``k`` (camera, pitch, exposure, time) as plain data."""
         known = {
             "camera": self.camera or None,
             "frame": k + 1,
@@ -298,7 +298,7 @@ class FrameFacts:
 
 _MODEL, _EXPOSURE_TIME = 272, 33434
 _RATIONAL = 10**6
-"""Denominator of exposure times in TIFF tags."""
+"""Denominator of the fractions of a second as which TIFF tags hold exposure times: a resolution of 1 us."""
 
 
 def tiff(frames: np.ndarray, facts: FrameFacts) -> bytes | memoryview:

@@ -27,7 +27,9 @@ apart.
 AT_ONCE = 8
 """Number of files written through at once: the disk's journal takes many in one step."""
 _EXCHANGE, _HERE = 2, -100
-"""RENAME_EXCHANGE and AT_FDCWD of renameat2(2)."""
+"""Constants of the Linux system call renameat2: RENAME_EXCHANGE, exchange two names, and AT_FDCWD, the working
+directory.
+"""
 _NO_EXCHANGE = (errno.EINVAL, errno.ENOSYS, errno.EOPNOTSUPP)
 _NOT_FOR_FOLDERS = (errno.EINVAL, errno.EOPNOTSUPP, errno.EBADF)
 """Error numbers of file systems that have no fsync of a folder, for instance those of a network."""
@@ -205,7 +207,7 @@ def ending_signals() -> tuple[signal.Signals, ...]:
 
 @contextmanager
 def _handled(asked: Iterable[int], handler: Callable[[int, object], None]) -> Iterator[None]:
-    """Install a signal handler inside the block."""
+    """Install a handler for some signals inside the ``with`` block, and restore the former handlers afterwards."""
     before = {number: signal.signal(number, handler) for number in asked}
     try:
         yield

@@ -139,7 +139,7 @@ class FileBuffer(io.BufferedRandom):
 
     @property
     def name(self) -> str:
-        """Empty text, since the file has no name."""
+        """Empty name, which libraries ask for: the file has none."""
         return ""
 
     def fileno(self) -> int:

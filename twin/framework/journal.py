@@ -85,7 +85,7 @@ class Journal:
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Close the file."""
+        """Close the journal's file."""
         self._close()
 
     def _close(self) -> None:
@@ -105,7 +105,7 @@ class Journal:
         self.known.update(pieces)
 
     def _write(self, file: Path, lines: Sequence[Any]) -> None:
-        """Append lines and write them through to the disk."""
+        """Append lines to the journal and write them through to the disk."""
         if self._out is None:
             durable.make_folders(file.parent)
             self._out = file.open("xb")
@@ -117,7 +117,7 @@ class Journal:
             self._begun = True
 
     def _head(self) -> dict[str, Any]:
-        """Return the first line: what the results depend on."""
+        """Return the content of the first line: a description of the work and the versions of the program."""
         return {"about": self._about, "versions": provenance.versions(), "sources": provenance.sources()}
 
     def _check(self, head: Any) -> None:

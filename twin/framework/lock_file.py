@@ -148,7 +148,9 @@ class Differences:
 
 
 def differences(project: str, folder: Path = FOLDER) -> Differences:
-    """Compare the installed packages with the lock files; packages of --live and --test may be missing.
+    """Compare the installed packages with the lock files.
+
+    Packages that setup.sh installs only with its options --live and --test may be missing.
 
     Parameters
     ----------

@@ -165,13 +165,13 @@ class Owner(Protocol):
     """Interface of the source of a number: a part of a file (`Spec`), or the options of a command."""
 
     def error(self, problem: str, key: KeyPath, *, found: object, allowed: str) -> Exception:
-        """Return an error about the number, for the caller to raise."""
+        """Return an error that names the number and its allowed values, for the caller to raise."""
         ...
 
 
 @dataclass(frozen=True)
 class Lowered:
-    """Number, in a file or an option, that can be lowered to reduce the memory of a job.
+    """Number, in a file or an option, that the user can lower to reduce the memory of a job.
 
     Attributes
     ----------
@@ -182,7 +182,7 @@ class Lowered:
     number : int
         Present value.
     unit : str
-        Unit of the number, in words.
+        Unit of the number, in words, such as frames or runs.
     bytes : callable
         Function of the number that returns the memory of the job, in bytes.
     least : int

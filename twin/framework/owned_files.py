@@ -106,7 +106,7 @@ _NAME = re.compile(rf"\.(?P<name>.+)\.(?P<token>[0-9a-f]{{8}})\.(?:{PARTIAL}|{OL
 
 
 def _beside(target: Path, token: str) -> dict[str, Path]:
-    """Return the hidden names beside a target, by their ending."""
+    """Return the hidden temporary paths beside a target folder, by their ending (PARTIAL, OLD or LOCK)."""
     return {ending: target.with_name(f".{target.name}.{token}.{ending}") for ending in (PARTIAL, OLD, LOCK)}
 
 

@@ -31,7 +31,7 @@ from twin.framework.report import Report, further_sections
 FIGURES = "*{stroke-linejoin: round; stroke-linecap: butt}"
 """Style sheet that Matplotlib writes into every figure."""
 NOTHING: Mapping[str, str] = {"default-src": "'none'", "base-uri": "'none'", "form-action": "'none'"}
-"""Directives that forbid everything."""
+"""Directives of a Content-Security-Policy that forbid a page to load or run anything."""
 
 
 def checksum(text: str) -> str:
@@ -143,7 +143,7 @@ class RunFacts:
 
     @property
     def words(self) -> tuple[str, ...]:
-        """Words of the command that repeats the run in its folder."""
+        """Words of the command line that repeats the run from inside its folder."""
         if self.again:
             return self.again
         seed = () if self.seed is None else ("--seed", str(self.seed))

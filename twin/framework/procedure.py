@@ -21,7 +21,7 @@ Advance = Callable[[str, int, int], None]
 
 
 WRITE = "write the run folder"
-"""Name of the last part of a command's work."""
+"""Name, in the progress display, of the last part of a command's work: writing the run folder."""
 
 
 def silent(part: str, done: int, total: int) -> None:

@@ -90,11 +90,12 @@ BEFORE = __name__.removesuffix("twin.framework.provenance")
 """
 SOURCES = ("analysis", "optics", "scenes", "twin")
 NOT_IN_RUNS = ("twin/validation/",)
-"""Folders that no run of a study needs."""
+"""Folders of source files on which the results of no run depend, so that they are not part of the checksum of sources.
+"""
 
 
 ENDINGS = (".css", ".csv", ".html", ".j2", ".js", ".json", ".py", ".svg", ".tdm", ".txt", ".yaml", ".zmx")
-"""Extensions of the packages' own files in a wheel."""
+"""File extensions of the packages' own files, which a wheel contains."""
 
 
 def _program_files(endings: tuple[str, ...]) -> dict[str, str]:

@@ -1,8 +1,9 @@
 """Declared results: the name, unit, meaning and format of a number are defined once.
 
 A `Record` lists the quantities of one kind of result. The JSON files of a run folder, tables of reports, data tables
-for other programs and the reference are all made from this list. Sources are in SI units. The ending of a key names the
-unit in files, and the record converts to it: a length with the key ``sigma_um`` is 1e6 times the metres of its source.
+for other programs and the reference are all made from this list. The source of a record is the object (a fit, a
+camera's changes) from which its numbers are taken; they are in SI units. The ending of a key names the unit in files,
+and the record converts to it: a length with the key ``sigma_um`` is written as 1e6 times its value in metres.
 """
 
 from __future__ import annotations
@@ -81,8 +82,9 @@ class Quantity(Generic[S]):
     key : str
         Name in files; the ending names the unit.
     of : callable
-        Function of the source that returns the value in SI units. With ``record``: the source of that record, a list or
-        mapping of sources, or a mapping of such mappings. None if there is no value.
+        Function of the source, the object of which the record lists numbers, that returns the value in SI units. With
+        ``record``: the source of that record, a list or mapping of sources, or a mapping of such mappings. None if
+        there is no value.
     meaning : str
         Description for the reference and for columns of other programs.
     head : str
@@ -120,7 +122,7 @@ class Quantity(Generic[S]):
 
     @property
     def unit(self) -> str:
-        """Unit as the program writes it; empty for none."""
+        """Unit in files as the program writes it, from the ending of the key; empty for a number without unit."""
         square = self.key.removesuffix("2") if self.key.endswith("m2") else ""
         return f"{unit_of((square,))}2" if square else unit_of((self.key,))
 
@@ -135,7 +137,7 @@ class Quantity(Generic[S]):
         return in_unit(value, self.shown)
 
     def value(self, source: S) -> Any:
-        """Return the value in the unit of files, not yet as plain data."""
+        """Return the value of a source in the unit of files, not yet converted to plain data."""
         value = self.of(source)
         if self.record is None or value is None:
             return in_unit(value, self.unit) if self.converted else value
@@ -190,11 +192,11 @@ class Record(Generic[S]):
 
     @property
     def headed(self) -> list[str]:
-        """Keys of the quantities that have a column head for tables."""
+        """Keys of the quantities that have a column head of their own, and so appear in tables of reports."""
         return [quantity.key for quantity in self.quantities if quantity.head]
 
     def __call__(self, source: S) -> dict[str, Any]:
-        """Return the numbers of one source as JSON holds them."""
+        """Return the numbers of one source, the object that the record describes, as plain data for a JSON file."""
         values = ((quantity, quantity.value(source)) for quantity in self.quantities)
         return {
             quantity.key: plain_data(value)
@@ -218,7 +220,13 @@ class Record(Generic[S]):
                     yield from quantity.record.warnings(below)
 
     def of_part(self, part: Callable[[T], S]) -> list[Quantity[T]]:
-        """Return the quantities for the record of an object that has this record's source as a part."""
+        """Return the record's quantities as quantities of a larger object, which has this record's source as a part.
+
+        Parameters
+        ----------
+        part : callable
+            Function from the larger object to the source of this record.
+        """
 
         def through(of: Callable[[S], Any]) -> Callable[[T], Any]:
             return lambda source: of(part(source))

@@ -151,7 +151,7 @@ class RunFolder:
             raise RunFolderError(f"cannot write to {self.target}: {reason(error)}; nothing was kept") from error
 
     def _remove(self) -> None:
-        """Remove everything that was made."""
+        """Remove the temporary folder and everything in it after a failure."""
         if self._unfinished is not None:
             shutil.rmtree(self._unfinished.path(owned_files.PARTIAL), ignore_errors=True)
             self._unfinished.close()
@@ -218,11 +218,19 @@ class RunFolder:
                 release_memory(content)
 
     def write_with(self, name: str, writer: Callable[[Path], None]) -> None:
-        """Call ``writer`` with the path of the file of that name."""
+        """Let a function write a file of the run folder.
+
+        Parameters
+        ----------
+        name : str
+            Path of the file in the run folder.
+        writer : callable
+            Function that is called with the path of the file to write.
+        """
         writer(self._place(name))
 
     def _place(self, name: str) -> Path:
-        """Return the path of a file, whose folder is made."""
+        """Return the path of a file in the temporary folder, after making the folders that contain it."""
         path = self.path / (_WAITING if name == MANIFEST else name)
         path.parent.mkdir(parents=True, exist_ok=True)
         return path
@@ -233,7 +241,7 @@ class RunFolder:
 
 
 def json_text(data: Any) -> str:
-    """Return the text of a JSON file in the format of all commands."""
+    """Return data as JSON text in the layout that the files of all commands have."""
     return json.dumps(data, indent=2, allow_nan=False) + "\n"
 
 
@@ -588,7 +596,7 @@ class KeptWork:
         return path
 
     def left(self) -> str:
-        """Return the message about what is kept of an interrupted run."""
+        """Return the message on which intermediate results of an interrupted run are kept, and how to continue."""
         if self._place is None or not self._place.exists():
             return "nothing was kept"
         return f"finished work is kept, continue with: {self._command} --resume"

@@ -207,7 +207,10 @@ class SecondProcess:
 
 
 def _turns(pipe: int) -> Iterator[int]:
-    """Yield the numbers of tasks that no other process has taken yet, until none is left."""
+    """Yield numbers of tasks from a pipe that both processes read, so that each task is done by one of them.
+
+    It ends when no task is left.
+    """
     while True:
         select.select([pipe], (), ())
         try:

@@ -29,9 +29,9 @@ BLUE, ORANGE, GREEN, VERMILION, SKY, PURPLE, YELLOW = (
 BROWN = "#7a4a12"
 INK, GREY, LIGHT, SHADE = "#1b1f24", "#6b7280", "#d9dde3", "#eef3f8"
 BEFORE, AFTER = SKY, VERMILION
-"""Colours of the centroid marks before and after the change."""
+"""Colours, in figures of spots, of the centroids measured before and after the change of the instrument."""
 GRAY, DIVERGING = "gray", "RdBu_r"
-"""Colour maps of images, and of values with a sign."""
+"""Names of Matplotlib's colour maps for images, and for values with a sign (white at zero)."""
 
 _STYLE: dict[str, Any] = {
     "font.size": 9.0,

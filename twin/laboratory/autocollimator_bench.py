@@ -1,9 +1,9 @@
-"""Simulated bench of two autocollimators that measure the rotation of two mirrors on a turntable (paper 001).
+"""Simulated bench of two autocollimators that measure two mirrors on a turntable (paper 001, Wang et al. 2018).
 
-Errors of the bench are motions of its bodies. They are drawn from the seed and applied to the simulated bench alone:
-the analysis reads the frames with the calibration of the ideal autocollimator and the nominal angles of the turntable
-and the mirrors. Each series begins with a reading at zero, which is subtracted from all others; its first row is a
-second reading at zero, which shows the repeatability.
+Errors of the bench (mounting, focus, turntable) are motions of its bodies. They are drawn from the seed and applied to
+the simulated bench alone: the analysis evaluates the frames with the calibration of the ideal autocollimator and the
+nominal angles of the turntable and the mirrors. Each series begins with a reading at zero, which is subtracted from all
+others; its first row is a second reading at zero, which shows the repeatability.
 
 Images. The light goes from the pinhole through the lens to the mirror and back through the lens to a window of the area
 CCD. As in ``twin.monitor.monitor_path``, rays from the pinhole are aimed at quadrature nodes of the smallest aperture,
@@ -14,7 +14,7 @@ nothing else.
 
 Frames, all right-handed. System frame 1-XYZ (paper 001, section 3.1): X up, Y horizontal, Z = X x Y along the view of
 autocollimator 1, from its lens to its mirror; the origin is the intersection of the three axes of the turntable. Frame
-2-XYZ is frame 1 rotated about X by b = 2 theta, so that
+2-XYZ is frame 1 rotated about X by the angle b = 2 theta between the mirrors' normals, so that
 
     Y1 = Y2 cos b - Z2 sin b,    Z1 = Y2 sin b + Z2 cos b.
 
@@ -57,7 +57,7 @@ from twin.sensors.area_detector import EmvaDetector, FixedPattern
 BENCH = "bench"
 AXES = ("X", "Y", "Z")
 UNITS = (1, 2)
-"""The two autocollimators, each with its mirror."""
+"""Numbers of the two autocollimators; each views the mirror of the same number."""
 
 _ABOUT_Y = np.diag([-1.0, 1.0, -1.0])  # half a turn
 _DETECTOR = np.stack([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]], axis=-1)
@@ -89,12 +89,12 @@ def mirror_body(unit: int) -> str:
 
 
 def outgoing(unit: int) -> str:
-    """Return the name of the element sequence from the pinhole to the mirror."""
+    """Return the name of the sequence of surfaces from the pinhole to the mirror of autocollimator 1 or 2."""
     return f"outgoing_{unit}"
 
 
 def round_trip(unit: int) -> str:
-    """Return the name of the element sequence from the pinhole via the mirror to the area CCD."""
+    """Return the name of the sequence of surfaces from the pinhole via the mirror to the area CCD of unit 1 or 2."""
     return f"round_trip_{unit}"
 
 
@@ -210,19 +210,19 @@ def _autocollimator_bodies(spec: AutocollimatorTestSpec, unit: int, pose: Pose) 
 
 
 AIM_TOLERANCE = 1e-9
-"""Tolerance of the ray aiming at the mirror, metres."""
+"""Largest distance on the mirror between an aimed ray and its target point, metres."""
 MAP_TERMS = 15
-"""Number of Zernike terms that interpolate ray directions between the nodes of the mirror."""
+"""Number of Zernike terms that represent ray directions as functions of the position on the mirror."""
 FINE = 2
-"""Number of samples along each side of a pixel.
+"""Number of samples along each side of a pixel at which the irradiance is computed.
 
-Whole pixels would sample the irradiance at 0.43 cycles per pixel, too near to the limit of 0.5 for the exact pixel
-filter; on half pixels it is exact, and the mean of four of them is the mean over a pixel.
+With one sample per pixel, the irradiance contains up to 0.43 cycles per sample, too near to the limit of 0.5 for the
+exact pixel filter; with two per side it is exact, and the mean of the four samples is the mean over a pixel.
 """
 CHUNK = 24
 """Number of states that are traced and rendered at once, to limit memory."""
 TILE = 64
-"""Side of the square tiles in which the fixed pattern of a CCD is drawn, pixels."""
+"""Side, in pixels, of the square tiles in which the random fixed pattern of a CCD is generated."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -292,10 +292,10 @@ class AutocollimatorPath:
 
     @cached_property
     def _slopes(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Matrices for derivatives of smooth functions over the mirror.
+        """Matrices for derivatives of smooth functions over the mirror, by a Zernike series.
 
-        They are (T, N) from values at N nodes to T Zernike terms, and (N, T) from the terms to d/dx and to d/dy at the
-        nodes.
+        They are (T, N) from values at N nodes to the coefficients of T Zernike terms, and (N, T) from the coefficients
+        to d/dx and to d/dy at the nodes, where x and y are coordinates on the mirror in units of its radius.
         """
         x, y = self.nodes.x, self.nodes.y
         root = np.sqrt(self.nodes.weight)
@@ -307,7 +307,8 @@ class AutocollimatorPath:
     def _start(self) -> tuple[np.ndarray, np.ndarray]:
         """Initial aim parameters of the N rays of both autocollimators, (2, N, 2), and their Jacobian.
 
-        They are those of the unperturbed bench.
+        They are those of the unperturbed bench. The aim parameters are two components of a ray's launch direction; the
+        Jacobian holds the derivatives of the point on the mirror with respect to them.
         """
         placed = self.bench.assembly.place()
         fan, systems = self._fan(placed, [{}])
@@ -321,7 +322,10 @@ class AutocollimatorPath:
         return 0.5 * self.bench.spec.mirrors.aperture * np.stack([self.nodes.x, self.nodes.y], axis=-1)
 
     def _fan(self, placed: PlacedBodies, states: Sequence[State]) -> tuple[RayFan, SystemBatch]:
-        """Return the rays from the pinholes toward the lens, unit by unit, and the systems up to the mirror."""
+        """Return the rays launched from the pinholes toward the lenses, and the optical systems up to the mirrors.
+
+        All states of autocollimator 1 come first, then those of autocollimator 2.
+        """
         origin = np.concatenate([placed.translation[:, placed.index[pinhole_body(u)]] for u in UNITS])[:, None]
         frames = np.concatenate([placed.rotation[:, placed.index[autocollimator_body(u)]] for u in UNITS])
         view, up = frames[:, None, :, 2], frames[:, None, :, 0]
@@ -387,7 +391,7 @@ class AutocollimatorPath:
         return SpotWindows(*(np.concatenate([part[k] for part in parts], axis=1) for k in (0, 1)))
 
     def _pieces(self, states: Sequence[State]) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-        """Yield photons and window corners of the images, CHUNK states at a time."""
+        """Yield photons and window corners of the images for CHUNK states at a time, which limits memory."""
         kernel_radius = self.response.reach
         count = FINE * self.window + 2 * kernel_radius
         grid = Grid(-0.5 * (count - 1) * self.pitch / FINE, self.pitch / FINE, count)
@@ -407,7 +411,10 @@ class AutocollimatorPath:
             yield photons.reshape(2, len(chunk), *photons.shape[1:]), corner.reshape(2, len(chunk), 2)
 
     def _field(self, position: np.ndarray, direction: np.ndarray, path: np.ndarray, valid: np.ndarray) -> PupilField:
-        """Return the plane waves about the origin of ``position``, for an evenly illuminated mirror."""
+        """Return the light of traced rays at the CCD as one plane wave for each ray, for an evenly illuminated mirror.
+
+        Positions count from the origin of ``position``.
+        """
         u, v = direction[..., 0], direction[..., 1]
         solve, dx, dy = self._slopes
         a, b = u @ solve.T, v @ solve.T
@@ -417,7 +424,10 @@ class AutocollimatorPath:
         return PupilField(u, v, phase - phase[:, :1], amplitude, self.bench.spec.autocollimator.wavelength)
 
     def _corner(self, position: np.ndarray, valid: np.ndarray) -> np.ndarray:
-        """Return the first pixels of B windows, (B, 2), around the mean of N rays each, (B, N, 3), on the CCDs."""
+        """Return row and column of the first pixel of each window, (B, 2), centred on the mean of its rays.
+
+        ``position`` holds the positions of N rays of each of B windows on the CCDs, (B, N, 3), metres.
+        """
         share = self.nodes.share * valid
         mean = np.einsum("bn,bnk->bk", share, position[..., 1::-1]) / share.sum(axis=1, keepdims=True)
         pixel = mean / self.pitch + 0.5 * (np.array(self.shape) - 1)
@@ -436,7 +446,7 @@ class AutocollimatorPath:
 def window_pattern(
     detector: EmvaDetector, corner: np.ndarray, window: int, seed: int, key: tuple[int, ...]
 ) -> FixedPattern:
-    """Return the fixed pattern of S windows of one large CCD, (S, window, window).
+    """Return the fixed pattern (gain and offset of each pixel) of S windows of a large CCD, (S, window, window).
 
     A pixel has the same gain and offset in every window that contains it.
 
@@ -496,20 +506,21 @@ class Series:
 
     @property
     def stream(self) -> tuple[int, int, int]:
-        """Key of the series' random streams, which makes its draws independent of the other series of a run."""
+        """Key of the series' random streams, which makes its random numbers independent of those of other series."""
         return autocollimator.AXES.index(self.axis), round(self.half_angle / ARCSEC), round(1e3 * self.step / ARCSEC)
 
 
 @dataclass(frozen=True, eq=False)
 class SeriesResult:
-    """Readings of one rotation series.
+    """Readings of one rotation series: rotations of both mirrors at each angle of the turntable.
 
     Attributes
     ----------
     series : Series
         Series that was measured.
     readings : (2, rows, 2) ndarray
-        Rotations of both mirrors about X and Y of their autocollimator, relative to the reading at zero, radians.
+        Rotations of both mirrors about X and Y of their autocollimator, relative to the first reading at zero, radians;
+        one row for each commanded angle.
     sigma : (2, rows, 2) ndarray
         Standard deviations of the readings due to image noise alone, radians.
     """
@@ -520,7 +531,7 @@ class SeriesResult:
 
     @property
     def scale(self) -> float:
-        """Factor applied to the readings of mirror 2: 1 (X), 1 / cos b (Y), 1 / sin b (Z).
+        """Factor applied to the readings of mirror 2 in a series about X (1), Y (1 / cos b) or Z (1 / sin b).
 
         The angle b is that between the mirrors' normals.
         """
@@ -528,22 +539,23 @@ class SeriesResult:
 
     @property
     def columns(self) -> tuple[np.ndarray, np.ndarray]:
-        """Readings of mirror 1 and scaled readings of mirror 2, (rows,) each, radians."""
+        """Readings of mirror 1 and scaled readings of mirror 2 about the series' axis, (rows,) each, radians."""
         component = autocollimator.column_component(self.series.axis)
         return self.readings[0, :, component], self.scale * self.readings[1, :, component]
 
     @property
     def mean_difference(self) -> float:
-        """Mean absolute difference between mirror 1 and scaled mirror 2, radians.
+        """Mean absolute difference between the readings of mirror 1 and the scaled readings of mirror 2, radians.
 
-        About Z, where mirror 1 has no reading, it is compared with the commanded angle of the turntable.
+        In a series about Z, a rotation that mirror 1 does not show, mirror 2 is compared with the commanded angle of
+        the turntable.
         """
         first, second = self.columns
         return autocollimator.mean_difference(self.series.angles if self.series.axis == "Z" else first, second)
 
     @property
     def from_exact(self) -> np.ndarray:
-        """Readings minus those of ideal mirrors, lens and turntable, (2, rows, 2), radians."""
+        """Readings minus the exact ones for an ideal turntable, mirrors and lenses, (2, rows, 2), radians."""
         args = self.series.axis, self.series.angles
         return self.readings - np.stack(
             [autocollimator.exact_reading(*args, u, 2.0 * self.series.half_angle) for u in UNITS]
@@ -552,7 +564,7 @@ class SeriesResult:
 
 @dataclass(frozen=True, eq=False)
 class ReadingTable:
-    """All series of one run of the experiment.
+    """Readings of all rotation series in one run of the experiment.
 
     Attributes
     ----------
@@ -580,13 +592,13 @@ class ReadingTable:
 
 
 AIRY_RADII = 4.0
-"""Radius of the centroid's window in radii of the first dark ring."""
+"""Radius of the centroid's window, in units of the radius of the first dark ring of the Airy pattern."""
 CALIBRATION_POINTS = 9
 """Number of rotations about each axis at which an autocollimator is calibrated."""
 DRAWS = 4000
-"""Number of random benches, without images, from which the spread of the readings is computed."""
+"""Number of random benches from which the spread of the readings is computed, without rendering images."""
 _BENCH, _PATTERN, _READINGS, _FRAMES = range(4)
-"""Numbers of the random streams of the seed."""
+"""Numbers of the random streams of the seed: errors of the bench, pixel patterns, readings, and noise of frames."""
 
 
 def series_per_axis(spec: AutocollimatorTestSpec) -> tuple[Series, ...]:
@@ -604,7 +616,7 @@ def run_autocollimator_test(
     reader: Reader | None = None,
     progress: Callable[[str], None] | None = None,
 ) -> ReadingTable:
-    """Render and read the experiment.
+    """Simulate the experiment: render and expose the images of every series, and measure the mirrors' rotations.
 
     Parameters
     ----------
@@ -649,7 +661,7 @@ def run_autocollimator_test(
 
 
 def states_of(spec: AutocollimatorTestSpec, series: Series, seed: int | None) -> list[State]:
-    """Return the reading at zero and all rows of a series as states of the bench, with errors drawn from the seed.
+    """Return the states of the bench for the reading at zero and all rows of a series, with random errors.
 
     Errors of the bench are the same in all series of a seed, except the mounting errors of the mirrors, which are drawn
     anew for every half angle. ``seed`` None is the ideal bench.
@@ -686,7 +698,9 @@ def states_of(spec: AutocollimatorTestSpec, series: Series, seed: int | None) ->
 def declared_spread(
     spec: AutocollimatorTestSpec, series: Series, image_sigma: float, draws: int = DRAWS, seed: int = 0
 ) -> np.ndarray:
-    """Draw mean differences of a series, (draws,), radians, under the specified errors, without images.
+    """Return random values of a series' mean difference under the specified errors, (draws,), radians.
+
+    The mean difference is that of `SeriesResult.mean_difference`; no images are rendered.
 
     Parameters
     ----------
@@ -697,9 +711,9 @@ def declared_spread(
     image_sigma : float
         Standard deviation of one reading due to image noise, radians.
     draws : int
-        Number of drawn benches.
+        Number of random benches.
     seed : int
-        Seed of the draws.
+        Seed of the random numbers.
     """
     e, rng = spec.errors, np.random.default_rng(seed)
     mirror_angle = 2.0 * series.half_angle
@@ -736,6 +750,8 @@ def _triple(vector: Sequence[float] | np.ndarray) -> tuple[float, float, float]:
 class Reader:
     """Detectors and calibration of the two autocollimators, which are equal.
 
+    It exposes the detectors to the light and measures the rotations of the mirrors from the frames.
+
     Parameters
     ----------
     setup
@@ -758,7 +774,7 @@ class Reader:
         self.map = self._calibrate()
 
     def path(self, half_angle: float) -> AutocollimatorPath:
-        """Return the light path for a half angle theta between the mirrors, radians; it is built once."""
+        """Return the light path for a half angle theta between the mirrors' normals, radians; it is built only once."""
         if half_angle not in self._paths:
             self._paths[half_angle] = AutocollimatorPath(build_bench(self.spec, half_angle), self.backend)
         return self._paths[half_angle]
@@ -779,7 +795,7 @@ class Reader:
         )
 
     def place(self, mean: np.ndarray, corner: np.ndarray) -> tuple[np.ndarray, SpotPositions]:
-        """Measure spots of B images in pixels of the whole CCD, (B, 2) row and column.
+        """Measure the positions of the spots in B window images, in pixels of the whole CCD.
 
         Parameters
         ----------
@@ -791,7 +807,7 @@ class Reader:
         Returns
         -------
         tuple of ndarray and SpotPositions
-            Positions on the CCD, and the spot measurements in their windows.
+            Positions (row, column) on the CCD, (B, 2), and the spot measurements in their windows.
         """
         bench = self.path(self.spec.programme.narrow).bench
         airy = 0.61 * self.spec.autocollimator.wavelength / bench.numerical_aperture
@@ -801,7 +817,7 @@ class Reader:
         return spots.position + corner, spots
 
     def expose(self, windows: SpotWindows, stream: tuple[int, ...], seed: int) -> np.ndarray:
-        """Expose frames of both CCDs in S states, uint16 (2, S, frames, window, window)."""
+        """Expose frames of both CCDs in S states of the bench, uint16 (2, S, frames, window, window)."""
         out = []
         for n, (photons, corner) in enumerate(zip(windows.photons, windows.corner, strict=True)):
             pattern = window_pattern(self.detector, corner, photons.shape[-1], seed, (_PATTERN, n))
@@ -810,7 +826,7 @@ class Reader:
         return np.stack(out)
 
     def read(self, series: Series, windows: SpotWindows, seed: int | None) -> SeriesResult:
-        """Measure the mirrors' rotations from the images of a series that begins with the reading at zero."""
+        """Measure the mirrors' rotations from the images of a series, relative to its first reading at zero."""
         if seed is None:
             mean = self.detector.expected_dn(windows.photons, self.exposure)
         else:

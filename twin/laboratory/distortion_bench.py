@@ -4,10 +4,11 @@ The transfer function of an image about its chief ray varies slowly over the fie
 spectrum and the line CCD's transfer function is therefore computed at a few Chebyshev nodes and interpolated with the
 polynomial through them. An image is then a Fourier sum at the pixel centres, shifted exactly.
 
-World frame = camera frame. When the table rotates by W the light's direction rotates by +W about the table's axis,
-which is the camera's X but for a tilt: from (0, 0, -1) to (0, sin W, -cos W), whose image lies at L = +f tan W along
-the line. W counts from the true angle of the table at which the as-built camera images the pinhole to the middle of the
-line. The image is read out where the line's scan sees it: over the field its rows drift by the smile of the mapping.
+World frame = camera frame. When the table rotates by the angle W the light's direction rotates by +W about the table's
+axis, which is the camera's X but for a small tilt: from (0, 0, -1) to (0, sin W, -cos W), whose image lies at L = +f
+tan W along the line, with the focal length f. W counts from the true angle of the table at which the as-built camera
+images the pinhole to the middle of the line. The image is rendered where the line's scan passes it: over the field its
+row drifts by the smile of the mapping.
 """
 
 from __future__ import annotations
@@ -38,18 +39,20 @@ from twin.targets.target_path import TargetPath
 NODES = 10
 """Number of Chebyshev nodes over the field at which images are computed.
 
-Interpolated between them, images of gf7 are accurate to 1e-5 of their peak and their centroids to 1 nm.
+Interpolated between them, images of the example camera gf7 are accurate to 1e-5 of their peak and their centroids to 1
+nm.
 """
 
 GUARD = 160.0
-"""Distance between the window and the periodic copies of the spot in the Fourier sum, in units of 1/cut-off.
+"""Distance between the window and the periodic copies of the spot in the Fourier sum, in periods of the cut-off
+frequency.
 
-The irradiance of a clear pupil falls as 1/distance^3: over the window of the pan line a copy is below 1e-6 of the peak,
-and nearly even.
+The irradiance of a clear pupil falls as 1/distance^3: over the window of the panchromatic line a copy is below 1e-6
+of the peak, and nearly even.
 """
 
 _RIM = np.pi * np.arange(16) / 16
-"""Azimuths at which the cut-off frequency of a pupil is evaluated, radians."""
+"""Azimuths, in radians, of the spatial frequencies at which the cut-off of a pupil's transfer function is evaluated."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,9 +64,9 @@ class PinholeImages:
     half_field : float
         Largest rotation of the camera to either side, radians.
     fx, fy : ndarray
-        The U frequencies along the line (non-negative half), (U,), and the V along the track, (V,), cycles/m.
+        U spatial frequencies along the line (non-negative half), (U,), and V along the track, (V,), cycles/m.
     spectra : (nodes, V, U) ndarray of complex
-        Spectra at the nodes of the field; a large uniform bright area would have level 1.
+        Spectra at the nodes of the field, scaled so that a large uniform bright area has signal 1.
     pitch : float
         Pixel pitch, metres.
     window : int
@@ -92,7 +95,7 @@ class PinholeImages:
         window: int,
         progress: Callable[[int, int], None] = lambda done, total: None,
     ) -> PinholeImages:
-        """Compute the spectra at the nodes of the field.
+        """Compute the spectra of the pinhole's images at the Chebyshev nodes of the field.
 
         Parameters
         ----------
@@ -150,12 +153,12 @@ class PinholeImages:
         field_angle : float
             Rotation of the camera, radians.
         position : (S, 2) ndarray
-            Chief rays (along, across) relative to the centre of the window's first pixel, metres.
+            Chief rays (along, across the line) relative to the centre of the window's first pixel, metres.
 
         Returns
         -------
         (S, window, window) ndarray
-            Images, rows along the track; a large uniform bright area would have level 1.
+            Images, rows along the track, scaled so that a large uniform bright area has signal 1.
         """
         spectrum = np.tensordot(_node_weights(field_angle / self.half_field), self.spectra, 1)
         pixel = self.pitch * np.arange(self.window)
@@ -172,7 +175,7 @@ class PinholeImages:
 
 
 def centroid_offset(path: TargetPath, state: State, directions: np.ndarray) -> np.ndarray:
-    """Return the energy centroid of a point's image minus its chief ray along the line at F fields, (F,), metres.
+    """Return energy centroid minus chief ray of a point's image along the line at F field points, (F,), metres.
 
     It is the mean slope of the wavefront over the pupil, the same for all wavelengths, and is computed from the phase
     of the transfer function at a ten-thousandth of the cut-off frequency.
@@ -193,23 +196,23 @@ def field_nodes(half_field: float) -> np.ndarray:
 
 
 def interpolated(values: np.ndarray, half_field: float, field_angle: np.ndarray) -> np.ndarray:
-    """Return the polynomial through values at the nodes, (NODES,), evaluated at M field angles, (M,)."""
+    """Return the polynomial through values at the Chebyshev nodes, (NODES,), evaluated at M field angles, (M,)."""
     return np.array([_node_weights(angle / half_field) @ values for angle in field_angle])
 
 
 def _nodes() -> np.ndarray:
-    """Return the Chebyshev nodes on -1 ... 1 in increasing order."""
+    """Return the Chebyshev nodes of the interpolation over the field, scaled to -1 ... 1, in increasing order."""
     return np.asarray(-np.cos(np.pi * (np.arange(NODES) + 0.5) / NODES))
 
 
 def _node_weights(position: float) -> np.ndarray:
-    """Return the weight of each node's value in the polynomial at a position on -1 ... 1, (NODES,)."""
+    """Return the interpolation weights of the values at the nodes, (NODES,), for a position on -1 ... 1."""
     order = np.polynomial.chebyshev.chebvander(_nodes(), NODES - 1)
     return np.linalg.solve(order.T, np.polynomial.chebyshev.chebvander(np.array([position]), NODES - 1)[0])
 
 
 def _extent_x(image: Disk | Polygon) -> float:
-    """Return the size of a shape along x, metres."""
+    """Return the size of a target's image (disk or polygon) along x, metres."""
     low, high, _, _ = image.bounds
     return high - low
 
@@ -230,12 +233,18 @@ BLUR = 3.0
 """Pixels around the pinhole's geometric image that the centroid's window must also contain."""
 
 _BENCH, _SETTING, _READING, _PATTERN, _NOISE = range(10, 15)
-"""Numbers of the random streams of the seed; those below 10 belong to the turntable."""
+"""Numbers of the random streams of the seed; those below 10 belong to the turntable.
+
+They are for the bench's misalignment, the settings of the table, the reference's readings, the pattern of the pixels,
+and the noise of frames.
+"""
 
 
 @dataclass(frozen=True, eq=False)
 class DistortionTruth:
     """True values that the analysis must not use, for N points and S sets of repeated exposures.
+
+    A point is a nominal angle of the turntable; in each set every point is exposed once.
 
     Attributes
     ----------
@@ -247,7 +256,7 @@ class DistortionTruth:
     field_angle : (N, S) ndarray
         Field angle W of each exposure, radians.
     position : (N, S, 2) ndarray
-        Position (along, across) of the chief ray, metres.
+        Position (along, across the line) of the chief ray, metres.
     gross : (N, S) ndarray of bool
         Exposures with a gross error from a shock.
     """
@@ -262,6 +271,8 @@ class DistortionTruth:
 @dataclass(frozen=True, eq=False)
 class DistortionRecord:
     """Measurements that a test gives to the analysis, for N points and S sets of repeated exposures.
+
+    A point is a nominal angle of the turntable; in each set every point is exposed once.
 
     Attributes
     ----------
@@ -280,12 +291,12 @@ class DistortionRecord:
 
 @dataclass(frozen=True, eq=False)
 class DistortionBench:
-    """Bench with all that stays the same from test to test.
+    """Simulated bench with everything that stays the same from test to test.
 
     Attributes
     ----------
     setup : DistortionSetup
-        Test with all files that it refers to.
+        Test with the contents of all files that it refers to.
     path : TargetPath
         Light path from the collimator to the image.
     as_built : State
@@ -318,7 +329,7 @@ class DistortionBench:
 
     @classmethod
     def build(cls, setup: DistortionSetup, backend: Backend, advance: Advance = silent) -> DistortionBench:
-        """Trace the camera and compute the spectra of its spots.
+        """Trace the camera and compute the spectra of its spots, from which all images are made.
 
         Raises
         ------
@@ -363,19 +374,19 @@ class DistortionBench:
             raise BenchError(
                 f"the camera's beam cannot be traced: {error}",
                 ("collimator",),
-                "a wider collimator, or smaller `as_built`",
+                "a wider collimator, or smaller errors in `as_built`",
             ) from error
         known, true = (interpolated(offset, half_field, field_angle) for offset in offsets)
         return cls(setup, path, camera.as_built, ccd, images, field_angle, centre_direction, known, true)
 
     @property
     def noise(self) -> NoiseModel:
-        """Noise model of one frame."""
+        """Noise model of one frame of the line CCD."""
         return self.ccd.noise
 
     @property
     def radius(self) -> float:
-        """Radius of the centroid's window, pixels."""
+        """Radius of the window over which a spot's centroid is computed, pixels."""
         return 0.5 * self.setup.test.window - MARGIN
 
     @property
@@ -384,7 +395,10 @@ class DistortionBench:
         return 0.5 * (self.ccd.band.pixels - 1)
 
     def positions(self, axis: np.ndarray, field_angle: np.ndarray) -> np.ndarray:
-        """Return chief rays on the focal plane, (..., 2) (along, across), metres, for rotations (...) about an axis."""
+        """Return the chief rays' positions on the focal plane, (..., 2) (along, across the line), metres.
+
+        ``axis`` is the table's axis, a unit vector; ``field_angle`` are the rotations about it, (...), radians.
+        """
         light = _rotated(axis, np.ravel(field_angle), self.centre_direction)
         return self.path.places(self.as_built, light).reshape(*np.shape(field_angle), 2)
 
@@ -398,7 +412,7 @@ class DistortionBench:
         table : TurntableModel
             Turntable that rotates the camera.
         seed : int
-            Seed of everything else that is drawn.
+            Seed of all other random numbers.
         advance : Advance
             Called with the number of recorded points.
 
@@ -453,7 +467,10 @@ class DistortionBench:
 
 
 def _rotated(axis: np.ndarray, field_angle: np.ndarray, direction: np.ndarray) -> np.ndarray:
-    """Return directions of the light after M rotations, (M, 3); the rotations, (M,), are about an axis, radians."""
+    """Return the light's direction rotated about an axis by M angles, (M, 3).
+
+    ``field_angle`` holds the angles, (M,), radians.
+    """
     return np.asarray(rotation_matrix(field_angle[:, None] * axis) @ direction)
 
 

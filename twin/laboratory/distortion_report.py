@@ -1,4 +1,4 @@
-"""Report of a distortion test: results, accuracy and its limits; of a simulated bench also the truth."""
+"""Report of a distortion test: results, accuracy and what limits it; for a simulated bench also the true values."""
 
 from __future__ import annotations
 
@@ -28,13 +28,16 @@ if TYPE_CHECKING:
 
 RAW, COMPENSATED = "angles as read", "compensated angles"
 SHOWN = 3
-"""Number of points whose frames are saved: first, middle, last."""
+"""Number of points (angles) of the test whose frames are saved: first, middle, last."""
 ZERO_SHARE = 0.3
-"""Shift of the principal point due to the zero of the angles, relative to its sigma, above which it is reported."""
+"""Ratio above which a shift of the principal point due to an error of the angles' zero is reported.
+
+The ratio is that of the shift to the standard deviation of the principal point.
+"""
 
 
 def distortion_report(run: DistortionRun) -> Report:
-    """Build the report of a distortion test."""
+    """Return the report of a distortion test: results, accuracy, figures and tables."""
     data = DISTORTION(run)
     verdict, more = _verdict(run, data)
     simulated = run if isinstance(run, SimulatedDistortion) else None
@@ -56,7 +59,7 @@ def distortion_report(run: DistortionRun) -> Report:
 
 
 def _frames(run: SimulatedDistortion) -> tuple[dict[str, np.ndarray], dict[str, FrameFacts]]:
-    """Return the frames of a simulated bench that are saved, and their facts."""
+    """Return the frames of a simulated bench that are saved, by name, and facts about each for the report."""
     test = run.setup.test
     facts = FrameFacts(f"{test.camera}, line CCD {test.band}", run.bench.ccd.band.pitch, note="spot of the pinhole")
     numbers = np.linspace(0, len(run.reading) - 1, SHOWN).astype(int)
@@ -65,7 +68,7 @@ def _frames(run: SimulatedDistortion) -> tuple[dict[str, np.ndarray], dict[str, 
 
 
 def _facts(run: DistortionRun, data: Mapping[str, Any]) -> tuple[tuple[str, str], ...]:
-    """Return the facts about the test, as pairs of label and text."""
+    """Return the facts about the distortion test, as pairs of label and text."""
     count, sets = run.reading.shape
     first, last = np.degrees([np.min(run.compensated.fit.angle), np.max(run.compensated.fit.angle)])
     facts = [("points, sets", f"{count} from {first:.3f}° to {last:.3f}°, {sets} sets, {np.sum(run.present)} spots")]
@@ -123,7 +126,7 @@ def _shares(run: DistortionRun) -> dict[str, float]:
 
 
 def _verdict(run: DistortionRun, data: Mapping[str, Any]) -> tuple[str, tuple[str, ...]]:
-    """Return the verdict and the sentences that follow it."""
+    """Return the verdict on the measured distortion and the sentences that follow it."""
     noise, f, sigma = data["noise"], data["principal_distance_mm"], data["principal_distance_mm_sigma"]
     expected, truth = noise["rejected_expected_by_chance"], data.get("truth")
     distortion_text = f"distortion has σ = {1e6 * float(np.sqrt(np.mean(run.compensated.sigma**2))):.2f} µm"
@@ -165,7 +168,7 @@ def _typeset(text: str) -> str:
 
 
 def _warnings(run: DistortionRun, data: Mapping[str, Any]) -> tuple[str, ...]:
-    """Return the warnings of the report."""
+    """Return the warnings about the measurements and their analysis."""
     out = []
     fit = run.compensated.fit
     f, sigma = fit.value("principal_distance"), fit.sigma("principal_distance")
@@ -236,7 +239,7 @@ def _summary(run: DistortionRun, data: Mapping[str, Any]) -> Table:
 
 
 def _curve(run: DistortionRun, data: Mapping[str, Any]) -> Section:
-    """Return the section on distortion over the field."""
+    """Return the report section on the measured distortion over the field."""
     text, caption = [], "Means of the sets."
     if isinstance(run, SimulatedDistortion):
         with_it, without = (rms(run.error(d) / d.sigma) for d in (run.compensated, run.raw))
@@ -254,7 +257,7 @@ def _curve(run: DistortionRun, data: Mapping[str, Any]) -> Section:
 
 
 def _compensation(run: DistortionRun) -> Section:
-    """Return the section that compares raw and compensated angles."""
+    """Return the section that compares distortion from raw angles and from angles corrected for the dividing error."""
     raw, compensated = run.raw, run.compensated
     pairs = {
         "residual from the smooth curve": (raw.smooth.residual, compensated.smooth.residual),
@@ -286,11 +289,13 @@ ESTIMATES = {
     "constant": "constant, balanced f, p (adopted)",
     "constant_radial3": "constant, f, p, radial (joint)",
 }
-"""Name of an estimate -> its description in reports."""
+"""Key of an estimate by an equation or fit -> its description in reports."""
 
 
 def _joint(joint: Mapping[str, Any]) -> Section:
-    """Return the section on the joint model with a radial term, as fitted and as a line of a payload's file.
+    """Return the report section on the joint model, which fits a radial distortion term with the orientation.
+
+    It gives the parameters as fitted, and converted to those of a line in a payload's file.
 
     Parameters
     ----------
@@ -331,7 +336,7 @@ def _joint(joint: Mapping[str, Any]) -> Section:
 
 
 def _estimates(run: DistortionRun, data: Mapping[str, Any]) -> Section:
-    """Return the section on the estimates by each equation and on which quantities can be observed."""
+    """Return the report section on the estimates by each equation, and on which quantities they can determine."""
     heads, digits = (["estimate", *(q.shown_head for q in ESTIMATE)], [None, *(q.decimals for q in ESTIMATE)])
     rows: list[tuple[Cell, ...]] = [(ESTIMATES[name], *record.values()) for name, record in data["estimates"].items()]
     constant_text = (
@@ -369,7 +374,7 @@ def _estimates(run: DistortionRun, data: Mapping[str, Any]) -> Section:
 
 
 def _noise(run: DistortionRun, data: Mapping[str, Any]) -> Section:
-    """Return the section on noise and rejected spots."""
+    """Return the report section on the noise of the spots and on rejected spots."""
     noise, stated = data["noise"], data["specified_exposure_um"]
     text = [
         f"One spot scatters by {noise['exposure_um']:.3f} µm "

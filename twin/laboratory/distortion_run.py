@@ -1,9 +1,11 @@
-"""Interior orientation and distortion by paper 004 (section 3), from the turntable's calibration to distortion.json.
+"""Interior orientation and distortion by paper 004 (Li et al. 2020, section 3).
 
-The analysis gets frames, readings, the calibration of the table and what a laboratory knows beforehand: the pixels,
-their noise, and the energy centroid of a spot minus its chief ray by the camera's design; or spots and readings from
-files of measurements. The truth of a simulated bench comes from exact chief rays of the as-built camera at the true
-angles, and is put through the same definitions.
+The run goes from the turntable's calibration to distortion.json.
+
+The analysis gets frames, turntable readings, the calibration of the table and what a laboratory knows beforehand: the
+pixels, their noise, and the energy centroid of a spot minus its chief ray by the camera's design; or spots and readings
+from files of measurements. The true values of a simulated bench come from exact chief rays of the as-built camera at
+the true angles, from which the same equations compute the true orientation and distortion.
 
 The records at the end define the contents of distortion.json.
 """
@@ -51,16 +53,20 @@ from twin.laboratory.measured_readings import (
 from twin.laboratory.turntable_run import TurntableModel, rms, usable_fits
 
 CLOSED_FORMS = tuple(name for name in FITS if name != "network")
-"""Names of the fits of the dividing error from which the compensation is chosen.
+"""Names of the closed-form fits of the turntable's dividing error from which the compensation is chosen.
 
-The network, which takes minutes to train, is ranked by the turntable test only.
+The neural network, which takes minutes to train, is compared in the turntable test only.
 """
 MAX_FIELD_ANGLE = np.radians(40.0)
-"""Largest plausible angle from the middle of the line, radians; the model's tangents end at 45 deg."""
+"""Largest plausible angle from the middle of the line, radians.
+
+The distortion model uses tangents of the angle only up to 45 deg.
+"""
 _EXACT = 1e-9
-"""Nominal noise of the true positions, metres; the estimates from them do not depend on it."""
+"""Nominal noise given to the true positions, metres, because a fit needs a weight; the estimates do not depend on it.
+"""
 _GREY, _SPOT_PIXEL = 2.0, 33.0
-"""Bytes per pixel of a frame, and of the mean image of a spot."""
+"""Memory per pixel, in bytes: of a frame, and of the mean image of a spot with its fit."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,7 +80,7 @@ class Estimate:
     distortion : (N,) ndarray
         Distortion of the N points, metres.
     f_sigma, p_sigma : float or None
-        Standard deviations, metres; None where an equation gives none.
+        Standard deviations of f and p, metres; None where an equation gives none.
     """
 
     f: float
@@ -86,22 +92,24 @@ class Estimate:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class DistortionRun:
-    """Distortion test on a simulated bench or on measured angles and spots.
+    """Results of a distortion test on a simulated bench or on measured angles and spots.
+
+    Dimensions: N points (nominal angles of the turntable), S sets of repeated exposures.
 
     Attributes
     ----------
     test : DistortionTestSpec or MeasuredDistortionSpec
         Specification from the test's file.
     seed : int
-        Seed of all that was drawn.
+        Seed of all random numbers.
     approximate_f : float
         Approximate principal distance, metres, used to compare sets with each other.
     reading : (N, S) ndarray
-        Readings of the turntable at N points in S sets, radians.
+        Readings of the turntable, radians.
     present : (N, S) ndarray of bool
         Exposures that were made.
     calibration : CalibrationSeries or None
-        Calibration of the turntable; None if angles count as read.
+        Calibration of the turntable; None if readings are used uncorrected.
     compensation : DividingCompensation or None
         Compensation of the dividing error; None without a calibration.
     spots : Spots
@@ -111,7 +119,7 @@ class DistortionRun:
     raw, compensated : Distortion
         Distortion with angles as read, and with angles corrected for the dividing error; equal without a calibration.
     specified_fit : InteriorOrientation
-        Fit of the smooth model with the specified noise alone, for its chi-square.
+        Fit of the smooth model weighted with the specified noise alone, for its chi-square.
     readings : SpotReadings or None
         Table of spots that was read; None for a simulated bench.
     tables : tuple of Comparisons
@@ -140,18 +148,21 @@ class DistortionRun:
 
     @cached_property
     def line(self) -> interior.LineOrientation:
-        """Joint model with compensated angles, as the parameters of a line in a payload's file."""
+        """Joint model of orientation and radial distortion, as the parameters of a line in a payload's file.
+
+        It uses compensated angles.
+        """
         return interior.line_orientation(self.compensated.smooth)
 
     @cached_property
     def estimates(self) -> Mapping[str, Estimate]:
-        """Name -> estimate by the printed equations and by the fits with a constant, all with compensated angles."""
+        """Name -> estimate by equations of paper 004 or by a fit with a constant term, all with compensated angles."""
         return _estimates(self.compensated.fit, self.compensated.smooth, self.compensated.zero)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class SimulatedDistortion(DistortionRun):
-    """Distortion test on the simulated bench, with its truth.
+    """Distortion test on the simulated bench, with the true values.
 
     Attributes
     ----------
@@ -178,11 +189,14 @@ class SimulatedDistortion(DistortionRun):
 
     @property
     def setup(self) -> DistortionSetup:
-        """Test with all files that it refers to."""
+        """Test with the contents of all files that it refers to."""
         return self.bench.setup
 
     def true_fit(self, terms: Sequence[str] = interior.CALIBRATED) -> interior.InteriorOrientation:
-        """Fit the exact chief rays at the true angles, with the terms and exposures of the measurement."""
+        """Fit the orientation model to exact chief rays at the true angles.
+
+        The fit has the terms and exposures of the measurement's fit.
+        """
         position, angles = self.means.mean(self.truth.position[..., 0]), self.means.mean(self.truth.field_angle)
         return interior.fit_interior_orientation(position, angles, _EXACT, terms)
 
@@ -204,10 +218,10 @@ class SimulatedDistortion(DistortionRun):
 def _estimates(
     fit: interior.InteriorOrientation, smooth: interior.InteriorOrientation, zero: float
 ) -> dict[str, Estimate]:
-    """Return name -> estimate by the paper's equations (2), (3) and (4), and by the fits with a constant.
+    """Return name -> estimate by equations (2), (3) and (4), and by the fits with a constant term.
 
-    Equation (4) uses the principal distance of (3); equation (2) is evaluated once more with angles counted from
-    `zero`.
+    The equations are those of paper 004 (Li et al. 2020). Equation (4) uses the principal distance of (3). Equation
+    (2) is also evaluated with the angles counted from `zero`, radians.
     """
     position, angles = fit.position, fit.angle
 
@@ -302,11 +316,11 @@ def reduce(
     approximate_f : float
         Approximate principal distance, metres, used to compare sets with each other.
     compensation : DividingCompensation or None
-        Compensation of the turntable; None for angles as read.
+        Compensation of the turntable's dividing error; None to use angles as read.
     angle_sigma : float
         Standard deviation of the angles as read, without a compensation, radians.
     reverse : bool
-        Readings increase where positions on the line decrease.
+        True if readings increase where positions on the line decrease.
     present : (N, S) ndarray of bool, optional
         Exposures that were made; by default all.
 
@@ -353,7 +367,7 @@ def reduce(
 
 
 def measure_files(spec: MeasuredDistortionSpec, seed: int) -> DistortionRun:
-    """Read measured angles and spots, and reduce them.
+    """Read measured angles and spots from files, and compute interior orientation and distortion.
 
     Raises
     ------
@@ -390,21 +404,21 @@ def measure_files(spec: MeasuredDistortionSpec, seed: int) -> DistortionRun:
 
 def _check_region(files: DistortionFiles, readings: SpotReadings, series: CalibrationSeries, zero: float) -> None:
     """Raise InputError if a reading lies outside of the calibrated region of the turntable."""
-    allowed = f"{calibrated_text(series.angle)}, where the turntable is calibrated"
+    allowed = f"{calibrated_text(series.angle)}, the calibrated range"
     if not covered(series.angle, zero):
         shown = f"{np.degrees(files.zero):.9g} deg"
-        raise files.error("outside of the calibrated readings", ("zero",), found=shown, allowed=allowed)
+        raise files.error("the turntable is not calibrated at this reading", ("zero",), found=shown, allowed=allowed)
     beyond = ~covered(series.angle, readings.reading) & (readings.lines > 0)
     if np.any(beyond):
         place = np.argwhere(beyond)[0]
         shown = f"{np.degrees(readings.reading[tuple(place)]):.9g} deg"
         line = int(readings.lines[tuple(place)])
-        text = "outside of the calibrated readings"
+        text = "the turntable is not calibrated at this reading"
         raise InputError(Issue(text, readings.file.file, line, (readings.head,), shown, allowed))
 
 
 def _check_angles(files: DistortionFiles, readings: SpotReadings, zero: float) -> None:
-    """Raise InputError for readings far from the zero, which point to a mistaken zero or unit."""
+    """Raise InputError for readings far from the angle zero, which suggest a wrong zero or unit in the file."""
     distance = np.abs(readings.reading - zero) * (readings.lines > 0)
     if np.max(distance) > MAX_FIELD_ANGLE:
         index = np.unravel_index(int(np.argmax(distance)), distance.shape)
@@ -461,7 +475,7 @@ def run_distortion(
 
 JOINT_MODEL = "L = constant + principal_distance tan W - principal_point tan^2 W + radial3 tan^3 W"
 _LINE_UNIT = np.array([1.0 / ARCSEC, MM_PER_M, MM_PER_M, 1.0])
-"""Factors from SI units to the units of `LINE`: arcsec, mm, mm, 1/m^2."""
+"""Factors from SI units to the units in which the parameters of `LINE` are reported: arcsec, mm, mm, 1/m^2."""
 
 POINTS: Record[DistortionRun] = Record(
     "One point of the line: means of the sets that Chauvenet's criterion accepts.",
@@ -547,7 +561,7 @@ TRUE_ESTIMATE: Record[_Pair] = Record(
 
 
 def _f_error(run: SimulatedDistortion) -> float:
-    """Return the error of the principal distance from the fit with a constant, in its sigmas."""
+    """Return the error of the principal distance from the fit with a constant term, in units of its sigma."""
     fit = run.compensated.fit
     error = fit.value("principal_distance") - run.true_fit().value("principal_distance")
     return float(error / fit.sigma("principal_distance"))
@@ -565,7 +579,7 @@ def _read(run: DistortionRun) -> SpotReadings:
 
 
 def _across(run: DistortionRun) -> float | None:
-    """Return the range of the spots across the line, metres, or None if it was not measured."""
+    """Return the range of the spots' positions across the line, metres, or None if they were not measured."""
     across = None if run.readings is None else run.readings.across
     return None if across is None else float(np.ptp(across))
 
@@ -575,13 +589,13 @@ def _files(run: DistortionRun) -> list[DataFile] | None:
 
 
 def _from_mean(run: DistortionRun) -> Array:
-    """Return how far rejected exposures are from the mean of their point, metres on the line."""
+    """Return the distances of rejected exposures from the mean of their point, metres along the line."""
     rest = run.compensated.position - run.approximate_f * np.tan(run.compensated.angle)
     return np.asarray((rest - run.means.mean(rest)[:, None])[run.rejected])
 
 
 def _paired(run: SimulatedDistortion) -> dict[str, _Pair]:
-    """Return each estimate with the corresponding estimate from the truth."""
+    """Return name -> (measured estimate, the same estimate computed from the true values)."""
     return {name: (estimate, run.true_estimates[name]) for name, estimate in run.estimates.items()}
 
 

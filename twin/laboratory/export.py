@@ -1,7 +1,7 @@
 """Export of a simulated bench's measurements as files, with a test's file that reads them back (``--export DIR``).
 
-The files are exactly those that a real bench would fill and contain nothing of the truth. Their numbers are in SI units
-with all digits, so that reading them back reproduces every bit.
+The files are exactly those that a user of a real bench would fill in, and contain no true values. Their numbers are in
+SI units with all digits, so that reading them back reproduces every bit.
 """
 
 from __future__ import annotations
@@ -25,11 +25,15 @@ from twin.laboratory.turntable_run import TurntableRun
 Files: TypeAlias = Mapping[str, str | bytes]
 """Path of a file in the export folder -> its contents."""
 COMPARISONS, HELD_OUT, SPOTS = "comparisons.csv", "held_out.csv", "spots.csv"
-"""Names of tables."""
+"""Names of the exported tables: comparisons of a turntable with its reference, held-out ones, and spot positions."""
 
 
 def export_turntable(run: TurntableRun) -> Files:
-    """Return comparisons and held-out comparisons of a simulated bench, and ``turntable.yaml``."""
+    """Return the files of a simulated turntable test: two tables of comparisons and ``turntable.yaml``.
+
+    A comparison is a turntable reading with the reference angle; the second table, of held-out angles, is for
+    validation.
+    """
     spec = run.spec
     assert isinstance(spec, TurntableTestSpec)
     assert run.held_out is not None
@@ -42,7 +46,10 @@ def export_turntable(run: TurntableRun) -> Files:
 
 
 def export_distortion(run: SimulatedDistortion) -> Files:
-    """Return the spots with readings, the turntable's calibration, and ``distortion.yaml``."""
+    """Return the files of a simulated distortion test.
+
+    They are the table of spots with turntable readings, the turntable's calibration, and ``distortion.yaml``.
+    """
     setup = run.setup
     out: dict[str, str | bytes] = {}
     turntable = _turntable_files(out, setup.turntable, run.calibration, run.table.held_out())
@@ -95,7 +102,7 @@ def export_focus(run: SimulatedFocus) -> Files:
 def _focus_tables(
     run: SimulatedFocus, state: SimulatedState, number: int, stem: str, out: dict[str, str | bytes]
 ) -> tuple[list[Sequence[Any]], list[Sequence[Any]]]:
-    """Return the tables of images and of MTF values; the images are put into ``out``."""
+    """Return the rows of the tables of images and of MTF values; the image files are added to ``out``."""
     bench = run.bench
     recorder = recorder_of(bench, state.placement, run.seed, number)
     where = ("band", "x [m]", "y [m]", "edge", "shift [m]")
@@ -120,7 +127,7 @@ def _focus_tables(
 def _focus_test(
     run: SimulatedFocus, state: SimulatedState, table: dict[str, str], shims: tuple[float, ...]
 ) -> camera_tests.MeasuredFocusSpec:
-    """Return the test's file for one table of measurements."""
+    """Return the test specification that reads one table of focus measurements back."""
     noise = {}
     for name, ccd in run.bench.ccds.items():
         # the file cannot express noise beyond the model of EMVA 1288: it is then estimated from the images
@@ -153,7 +160,7 @@ def _focus_test(
 def _turntable_files(
     out: dict[str, str | bytes], spec: TurntableTestSpec, series: CalibrationSeries, held_out: CalibrationSeries
 ) -> TurntableFiles:
-    """Put the tables of both series into ``out`` and return the section that refers to them."""
+    """Add the tables of both turntable series to ``out`` and return the section of a test's file that names them."""
     for name, comparisons in ((COMPARISONS, series), (HELD_OUT, held_out)):
         out[name] = csv_table(_comparisons(comparisons))
     return TurntableFiles.model_construct(
@@ -162,7 +169,7 @@ def _turntable_files(
 
 
 def _comparisons(series: CalibrationSeries) -> Iterator[Sequence[Any]]:
-    """Yield the rows of a table of comparisons, its head first."""
+    """Yield the rows of a table of turntable readings and reference angles, beginning with the column names."""
     yield "reading [rad]", "repeat", "difference [rad]"
     for angle, row in zip(series.angle, series.comparisons, strict=True):
         yield from ((float(angle), k + 1, float(value)) for k, value in enumerate(row))

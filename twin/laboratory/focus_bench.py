@@ -4,8 +4,8 @@ All numbers are in the focal-plane frame of the camera's prescription (X' flight
 the light). A ``Pose`` places the focal-plane assembly in it, and the chip of each band lies at a height above the
 assembly.
 
-At every site the target is moved through focus, its edge recorded, the MTF measured, and the vertex of the MTF curve
-fitted.
+At every site (a position on a line CCD) the target is moved through focus, its edge recorded, the MTF measured, and the
+vertex of the MTF curve, its peak, fitted.
 """
 
 from __future__ import annotations
@@ -36,12 +36,12 @@ if TYPE_CHECKING:
     from scenes.specs.resolved import FocusSetup
 
 _SEARCH = 0.3e-3
-"""Largest defocus to either side in the search for best focus, metres."""
+"""Largest defocus to either side, metres, that is searched for the best focus of the simulated optics."""
 
 
 @dataclass(frozen=True, eq=False)
 class Site:
-    """Position on the focal plane where the edge is imaged.
+    """Position on the focal plane where the edge target is imaged.
 
     Attributes
     ----------
@@ -54,12 +54,12 @@ class Site:
     point, direction : (3,) ndarray
         Point (metres) and unit direction of the chief ray in the focal-plane frame.
     imagers : mapping
-        Edge -> imager of that edge.
+        Edge (direction in which it measures the MTF) -> imager of that edge.
     defocus_per_shift : mapping
         Edge -> true defocus of the image per metre of target shift, in the direction of the edge's normal: (f of the
-        camera / f of the collimator)^2, with the camera's f in that direction.
+        camera / f of the collimator)^2, with the camera's focal length f in that direction.
     nominal_per_shift : mapping
-        Edge -> the corresponding ratio of the prescription, which the analysis may know.
+        Edge -> the corresponding ratio by the design prescription, which the analysis may know.
     edge_focus : mapping
         Edge -> Z' at which its MTF at the Nyquist frequency is largest, metres.
     """
@@ -85,7 +85,15 @@ class Site:
         return self.imagers[ALONG].ccd.band.nyquist
 
     def crossing(self, placement: Pose, height: float) -> np.ndarray:
-        """Return the intersection of the chief ray and the chip in the focal-plane frame, (3,), metres."""
+        """Return the intersection of the chief ray and the chip's surface in the focal-plane frame, (3,), metres.
+
+        Parameters
+        ----------
+        placement : Pose
+            Position and orientation of the focal-plane assembly in the focal-plane frame.
+        height : float
+            Height of the chip above the assembly, along the assembly's normal, metres.
+        """
         normal = placement.rotation[:, 2]
         chip = placement.translation + height * normal
         return np.asarray(self.point + self.direction * ((chip - self.point) @ normal) / (self.direction @ normal))
@@ -95,14 +103,14 @@ class Site:
         return float(self.crossing(placement, height)[2] - self.best)
 
     def column(self, placement: Pose, height: float) -> int:
-        """Return the first column of the recorded region, which has the image of the edge in its middle."""
+        """Return the first column of the recorded region, in whose middle the image of the edge lies."""
         imager = self.imagers[ALONG]
         along = placement.inverse().apply(self.crossing(placement, height))[1]
         middle = along / imager.ccd.band.pitch + 0.5 * (imager.ccd.band.pixels - 1)
         return int(np.clip(round(middle - 0.5 * imager.region), 0, imager.ccd.band.pixels - imager.region))
 
     def image(self, edge: str, placement: Pose, height: float, target_shift: float, offset: float) -> np.ndarray:
-        """Return the signal of every pixel as a fraction of white.
+        """Return the signal of every pixel in the image of an edge, as a fraction of that in the bright area.
 
         Parameters
         ----------
@@ -113,7 +121,7 @@ class Site:
         height : float
             Height of the chip above the assembly, metres.
         target_shift : float
-            Shift of the target, metres.
+            Shift of the target along the light, metres.
         offset : float
             Offset of the edge on the chip, metres.
         """
@@ -132,7 +140,7 @@ class BudgetLine:
     edge : str
         Direction in which the MTF is measured.
     factors : mapping
-        Effect -> its transfer factor.
+        Effect (such as diffraction or the pixel) -> its MTF factor.
     total : float
         MTF, the product of the factors.
     """
@@ -144,16 +152,16 @@ class BudgetLine:
 
 
 class FocusBench:
-    """Bench with all that stays the same from alignment to alignment.
+    """Simulated bench with everything that stays the same from alignment to alignment.
 
     Parameters
     ----------
     setup
-        Test with all files that it refers to.
+        Test with the contents of all files that it refers to.
     backend
         Array backend of the trace.
     advance
-        Called with the number of tables done and their total.
+        Called with the number of image tables done and their total.
 
     Raises
     ------
@@ -181,7 +189,7 @@ class FocusBench:
         return 1.22 * f_number / self.ccds[band].band.nyquist
 
     def _build_sites(self, advance: Advance) -> tuple[Site, ...]:
-        """Trace all sites and tabulate their images."""
+        """Trace all sites and tabulate the edge's images over defocus at each."""
         test, bands = self.setup.test, self.setup.camera.bands
         keys = [(name, field) for name in bands for field in test.fields]
         half = {n: 0.5 * (b.pixels - 2.0 * test.edge.region) * b.pitch for n, b in bands.items()}
@@ -197,7 +205,7 @@ class FocusBench:
         return tuple(sites)
 
     def _site(self, band: str, field: float, direction: np.ndarray, hit: np.ndarray, pupil: PupilFunction) -> Site:
-        """Build the site of one band and field from its traced pupil."""
+        """Build the site of one band and field point, from its traced pupil."""
         test, ccd = self.setup.test, self.ccds[band]
         local = self.path.local_map(self.camera.as_built, direction, ccd.band.pitch * test.edge.region)
         nominal = self.path.local_map({}, direction, ccd.band.pitch * test.edge.region)
@@ -250,9 +258,9 @@ def _modulus(optics: EdgeOptics, defocus: float, frequency: float) -> float:
 def _longitudinal(local: LocalMap, normal: np.ndarray) -> float:
     """Return the longitudinal magnification in the direction of an edge's normal: image shift per target shift.
 
-    A target moved by s adds s |p|^2 / 2F^2 to the path at the point p of the entrance pupil, with the collimator's
-    focal length F. By Lagrange's invariant p = F J^T u for direction cosines u at the image and the map's Jacobian J,
-    so the image's curvature is s J J^T.
+    A target moved by s along the axis adds s |p|^2 / 2F^2 to the optical path at the point p of the entrance pupil,
+    with the collimator's focal length F. By Lagrange's invariant p = F J^T u for direction cosines u at the image and
+    the Jacobian J of the map from object to image directions, so the curvature of the image's wavefront is s J J^T.
     """
     return float(np.sum((local.jacobian.T @ normal) ** 2))
 
@@ -273,23 +281,26 @@ NYQUIST = 0.5
 """Nyquist frequency, cycles per pixel."""
 
 VERTEX_ERROR = 0.5e-6
-"""Standard deviation of the error common to all fitted vertices, metres.
+"""Standard deviation of the error that all fitted positions of the MTF peak have in common, metres.
 
 It is due to the difference between the true MTF curve near its peak and the fitted form: wavefronts of 0.2 waves shift
 the vertices by this much. Without noise the vertices of the example are up to 0.6 um off.
 """
 
 VERTEX_TREND = 0.15e-6
-"""Standard deviation of the variation of the vertices' common error over the focal plane, metres.
+"""Standard deviation of the variation over the focal plane of the error in the fitted MTF peaks, metres.
 
 The variation is that from the middle to the ends of the line and of the bands, as wavefront and wavelength change.
 """
 
 _OFFSET, _FRAMES = range(2)
 _COARSE = 4
-"""Smallest number of positions of the first scan within the defocus at which all contrast is lost."""
+"""Smallest number of scan positions over the range of defocus in which the edge has contrast.
+
+A coarser scan could miss the peak.
+"""
 _ATTEMPTS = 3
-"""Largest number of scans of one site."""
+"""Largest number of times that one site is scanned through focus until its peak is found."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -310,13 +321,12 @@ class Placement:
 
 @dataclass(frozen=True, eq=False)
 class SiteScan:
-    """Through-focus measurement of one site.
+    """Through-focus measurement of one site, at Z positions of the target.
 
     Attributes
     ----------
     shift : mapping
-        Edge -> shifts of the image at Z positions, in the edge's direction, metres, (Z,), computed from the target's
-        shifts.
+        Edge -> shifts of the image, in the edge's direction, metres, (Z,), computed from the target's shifts.
     mtf, sigma : mapping
         Edge -> MTF at the Nyquist frequency and its standard deviation, (Z,); the latter is infinite where no edge
         could be measured.
@@ -340,7 +350,7 @@ class SiteScan:
 
     @property
     def defocus(self) -> float:
-        """Defocus of the CCD from the mean of the edges' vertices, positive downstream of best focus, metres."""
+        """Defocus of the CCD, the mean over the edges' fitted MTF peaks, positive downstream of best focus, metres."""
         return float(np.mean([v.position for v in self.vertex.values()]))
 
     @property
@@ -351,12 +361,12 @@ class SiteScan:
 
 @dataclass(frozen=True, eq=False)
 class NyquistMtf:
-    """MTF of one site with the target at the collimator's focus.
+    """MTF of one site at the Nyquist frequency, with the target at the collimator's focus.
 
     Attributes
     ----------
     by_edge : mapping
-        Edge -> MTF at the Nyquist frequency and its standard deviation.
+        Edge (direction in which it measures the MTF) -> MTF at the Nyquist frequency and its standard deviation.
     frames : mapping
         Edge -> recorded frames, (frames, region, region), DN.
     """
@@ -366,7 +376,7 @@ class NyquistMtf:
 
 
 class Recorder:
-    """Recorder of edge images for one placement of the assembly.
+    """Recorder of images of slanted edges, for one placement of the focal-plane assembly.
 
     Parameters
     ----------
@@ -393,7 +403,7 @@ class Recorder:
         self.patterns = patterns
 
     def frames(self, number: int, edge: str, shift: float, take: int) -> np.ndarray:
-        """Record frames (frames, region, region) of an edge at one site.
+        """Record frames of an edge at one site, (frames, region, region), DN.
 
         Parameters
         ----------
@@ -433,7 +443,11 @@ class Recorder:
         return *measure_pages(frames, noise=ccd.noise, step=grey_step(frames), even=True).at(NYQUIST), frames
 
     def attempt(self, number: int, edge: str, shift: float, take: int) -> tuple[float, float, np.ndarray, str]:
-        """Measure like ``measure``; for an image without a usable edge return MTF 0, infinite sigma and the reason."""
+        """Record an edge; return its MTF at the Nyquist frequency, standard deviation, frames, and any problem.
+
+        For an image without a measurable edge the MTF is 0, the standard deviation infinite, and the text gives the
+        reason.
+        """
         try:
             return *self.measure(number, edge, shift, take), ""
         except EdgeError as error:
@@ -446,12 +460,12 @@ def scan(recorder: Recorder, advance: Advance = silent, search: bool = True) -> 
     Parameters
     ----------
     recorder : Recorder
-        Recorder of one placement.
+        Recorder of one placement of the focal-plane assembly.
     advance : Advance
         Called with the number of sites done and their total.
     search : bool
-        First search the peak over the whole range of the scan. Otherwise the peak is assumed near zero, and searched
-        for only where it is not.
+        True to search the peak first over the whole range of the scan. False to assume it near zero, and search only
+        where it is not.
 
     Raises
     ------
@@ -493,7 +507,7 @@ def in_focus(recorder: Recorder) -> tuple[NyquistMtf, ...]:
 
 
 def _scan_site(recorder: Recorder, number: int, search: bool) -> SiteScan:
-    """Measure one site through focus and fit its vertices."""
+    """Measure one site through focus and fit the peaks (vertices) of its MTF curves."""
     bench = recorder.bench
     site, plan = bench.sites[number], bench.setup.test.scan
     zero = bench.geometric_zero(site.band)
@@ -525,9 +539,9 @@ def _scan_site(recorder: Recorder, number: int, search: bool) -> SiteScan:
 
 
 def _search(recorder: Recorder, number: int, zero: float, first: int = 0) -> float:
-    """Return the target shift with the highest contrast along the line over the whole range of the scan, metres.
+    """Return the target shift at which an edge's contrast along the line is highest, metres.
 
-    ``first`` is the number of the first image.
+    The whole range of the scan is searched; ``first`` is the number of the first image.
     """
     plan = recorder.bench.setup.test.scan
     site = recorder.bench.sites[number]
@@ -557,7 +571,7 @@ def _search(recorder: Recorder, number: int, zero: float, first: int = 0) -> flo
 
 
 def _lost(site: Site, problem: FocusError) -> BenchError:
-    """Return the error for a site without a best focus in the scan."""
+    """Return the error for a site whose scan through focus contains no best focus."""
     return BenchError(
         f"no best focus of {site.band} at field {site.field:g}: {problem}",
         ("scan",),

@@ -1,6 +1,6 @@
-"""Report of a focal-plane alignment: results, accuracy and its limits; of a simulated bench also the truth.
+"""Report of a focal-plane alignment: results, accuracy and what limits it; for a simulated bench also the true values.
 
-Its plots show the curves through focus, the defocus of the CCDs, MTF curves and recorded edges.
+Its plots show the MTF curves through focus, the defocus of the CCDs, MTF curves over frequency and recorded edges.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ _COLUMNS, _MOST_BANDS = 5, 10
 
 
 def _shown(run: FocusRun) -> list[tuple[int, FocusState, str]]:
-    """Return number, state and title of the first and the last measured state."""
+    """Return number, state and title of the first and the last state (placement of the focal plane) measured."""
     states = run.states
     return (
         [(0, states[0], "before"), (len(states) - 1, states[-1], "after")] if len(states) > 1 else [(0, states[0], "")]
@@ -82,14 +82,17 @@ def _curves(axes: Axes, run: FocusRun, state: FocusState, band: str) -> None:
 
 
 def _form(vertex: FocusVertex, positions: np.ndarray) -> np.ndarray:
-    """Return the fitted curve where it is above a third of its peak, elsewhere NaN."""
+    """Return the fitted MTF curve at given positions where it is above a third of its peak, NaN elsewhere."""
     u = -0.5 * vertex.curvature / vertex.peak * (positions - vertex.position) ** 2
     value = vertex.peak * (1.0 - u + QUARTIC * u**2)
     return np.where((value > vertex.peak / 3.0) & (u < 0.5 / QUARTIC), value, np.nan)
 
 
 def defocus_svg(run: FocusRun) -> str:
-    """Draw the defocus at every site before the first and after the last shims, with the fitted plane and any truth."""
+    """Draw the defocus at every site before the first and after the last shims, with the fitted plane.
+
+    For a simulated bench the true defocus is drawn too.
+    """
     shown = _shown(run)
     with svg.look("defocus"):
         figure = svg.new_figure(3.4)
@@ -104,7 +107,7 @@ def defocus_svg(run: FocusRun) -> str:
 
 
 def _defocus(axes: Axes, run: FocusRun, number: int, state: FocusState) -> None:
-    """Draw the defocus of one state by band."""
+    """Draw the defocus of the sites in one state (placement of the focal plane), band by band."""
     for k, band in enumerate(dict.fromkeys(run.bands)):
         of_band = np.array(run.bands) == band
         colour, places = FIELD_COLOURS[k % len(FIELD_COLOURS)], run.places[of_band]
@@ -125,7 +128,7 @@ def _defocus(axes: Axes, run: FocusRun, number: int, state: FocusState) -> None:
 
 
 def _middle(run: SimulatedFocus, band: str) -> int:
-    """Return the number of the band's site nearest to the middle of the field."""
+    """Return the number of the site of a band that is nearest to the middle of the field."""
     sites = run.bench.sites
     return min((i for i, s in enumerate(sites) if s.band == band), key=lambda i: abs(sites[i].field))
 
@@ -186,11 +189,11 @@ def edges_svg(run: SimulatedFocus) -> str:
 
 
 MOVED = {"image": "image, along the light", "target": "target, along the light", "focal_plane": "CCD, along the light"}
-"""Part that was moved through focus -> its description in reports."""
+"""What was moved through focus (image or target) -> its description in reports."""
 
 
 def focus_report(run: FocusRun) -> Report:
-    """Build the report of an alignment."""
+    """Return the report of a focal-plane alignment: results, accuracy, figures and tables."""
     data = focus_run.focus_numbers(run)
     sections = (_shims(run), _plane(run), _curve_section(run))
     if isinstance(run, SimulatedFocus):
@@ -225,7 +228,7 @@ def _alignment_verdict(run: SimulatedFocus, data: Mapping[str, Any]) -> tuple[st
 
 
 def _edge_frames(run: SimulatedFocus) -> dict[str, np.ndarray]:
-    """Return the frames of all edges after the alignment, by file name."""
+    """Return file name -> frames of all edges recorded after the alignment."""
     fields = run.bench.setup.test.fields
     return {
         f"{site.band}_field{fields.index(site.field) + 1}_{edge}": scan.frames[edge]
@@ -296,7 +299,10 @@ def _bench_facts(run: SimulatedFocus) -> tuple[tuple[str, str], ...]:
 
 
 def _rounds(data: Mapping[str, Any]) -> Table:
-    """Return the table of confocal error and line level before the alignment and after each round."""
+    """Return the table of focus errors before the alignment and after each round of shims.
+
+    It gives the largest distance of a CCD from best focus, and the rotation of the line.
+    """
     stages = [("before", data["initial"], data["truth"]["initial"])]
     for k, (measured, true) in enumerate(zip(data["rounds"], data["truth"]["rounds"], strict=True)):
         stages.append((f"after round {k + 1}", measured, true))
@@ -420,13 +426,13 @@ def _shims(run: FocusRun) -> Section:
 
 
 def _last(run: FocusRun) -> tuple[FocusRun, FocusState, Shimming]:
-    """Return the run with the last state to which a plane was fitted, and that plane with its shims."""
+    """Return the run, the last state to which a plane was fitted, and that plane with its shims."""
     number = len(run.shimmings) - 1
     return run, run.states[number], run.shimmings[number]
 
 
 def _plane(run: FocusRun) -> Section:
-    """Return the section on the plane from which the last shims were computed."""
+    """Return the section on the fitted plane of best focus from which the last shims were computed."""
     *_, shimming = last = _last(run)
     plane = shimming.plane
     text = (
@@ -479,7 +485,7 @@ def _curve_section(run: FocusRun) -> Section:
 
 
 def _mtf_section(run: SimulatedFocus, data: Mapping[str, Any]) -> Section:
-    """Return the section on the MTF at the Nyquist frequency and its budget."""
+    """Return the section on the MTF at the Nyquist frequency and the factors that it is the product of."""
     end, true = data["rounds"][-1], data["truth"]["rounds"][-1]
     rows = [
         (

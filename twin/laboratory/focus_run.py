@@ -1,10 +1,10 @@
-"""Focal-plane alignment by paper 004 (section 2), on a simulated bench or from a measured through-focus series.
+"""Focal-plane alignment by paper 004 (Li et al. 2020, section 2), on a simulated bench or from measured series.
 
 A round measures the through-focus MTF in every field and band, fits a weighted plane through best focus and computes
 the shims at the mounting holes. A simulated bench mounts the shims and measures again.
 
 The analysis gets MTF values, readings of a theodolite, the nominal focal length and the drawing of the mount. The true
-placement of a simulated assembly is drawn from the seed and enters the images alone.
+placement of a simulated assembly is drawn from the seed and affects only the images.
 
 The records at the end define the contents of focus.json.
 """
@@ -51,12 +51,12 @@ from twin.targets.target_images import ALONG, TRACK
 
 _MISSET, _PATTERNS, _LEVEL, _SETTING, _SCAN = range(5)
 _GREY, _EDGE_PIXEL = 2.0, 57.0
-"""Bytes per pixel of a frame that is kept, and of one of an edge while it is exposed and measured."""
+"""Memory per pixel, in bytes: of a stored frame, and of a frame of an edge while it is exposed and measured."""
 
 
 @dataclass(frozen=True, eq=False)
 class FocusState:
-    """Measurement of one placement of the assembly at N sites.
+    """Measurement of one state (placement of the focal-plane assembly) at N sites, which are positions on its CCDs.
 
     Attributes
     ----------
@@ -81,9 +81,9 @@ class FocusState:
 
     @property
     def skew(self) -> tuple[float, float]:
-        """Common shift of all vertices if the fitted curves may be skewed, and its sigma due to noise, metres.
+        """Shift of all fitted MTF peaks if the curves may be skewed, and its sigma due to noise, metres.
 
-        It is the weighted mean over the sites for each direction, averaged over the directions.
+        It is the weighted mean over the sites for each direction of the MTF, averaged over the directions.
         """
         moves, squares = [], []
         for edge in self.scans[0].vertex:
@@ -101,7 +101,9 @@ class FocusState:
 
 @dataclass(frozen=True, eq=False)
 class SimulatedState(FocusState):
-    """Measurement of one placement on the simulated bench, with its truth.
+    """Measurement of one state on the simulated bench, with the true values.
+
+    Dimensions: N sites (positions on the CCDs).
 
     Attributes
     ----------
@@ -130,7 +132,7 @@ class SimulatedState(FocusState):
     shims: Shimming | None
 
     def of_band(self, band: str) -> list[int]:
-        """Return the numbers of a band's sites."""
+        """Return the numbers of the sites that lie on a band's CCD."""
         return [k for k, site in enumerate(self.bench.sites) if site.band == band]
 
     def mtf(self, edge: str) -> dict[str, tuple[float, float]]:
@@ -142,7 +144,7 @@ class SimulatedState(FocusState):
         return out
 
     def true_chip_z(self, number: int) -> float:
-        """Return the true Z' at which the chief ray of a site meets its chip, metres."""
+        """Return the true Z' of the intersection of a site's chief ray with its chip, metres."""
         site = self.bench.sites[number]
         return float(site.crossing(self.placement.pose, self.placement.heights[site.band])[2])
 
@@ -159,7 +161,9 @@ class SimulatedState(FocusState):
 
 @dataclass(frozen=True, eq=False)
 class Shimming:
-    """Fitted plane and shims of one round.
+    """Fitted plane of best focus, and the shims computed from it, of one round.
+
+    A vertex is the fitted peak of an MTF curve through focus.
 
     Attributes
     ----------
@@ -168,7 +172,7 @@ class Shimming:
     plan : ShimPlan
         Shims and motion of the assembly.
     vertex_error : float
-        Standard deviation of the error common to all vertices, metres.
+        Standard deviation of the error that all vertices have in common, metres.
     vertex_trend : float
         Standard deviation of its change from the middle to the ends of the sites, metres.
     """
@@ -180,21 +184,24 @@ class Shimming:
 
     @property
     def systematic(self) -> np.ndarray:
-        """Sigmas of piston and slopes along X' and Y' due to the vertices' common error, (3,), metres and radians.
+        """Sigmas of the plane's piston and slopes along X' and Y' due to the common error of the MTF peaks, (3,).
 
-        This part is the same in every alignment of a camera.
+        They are in metres and radians. This error is the same in every alignment of a camera.
         """
         reach = np.max(np.abs(self.plane.position), axis=0)
         return np.array([self.vertex_error, *(self.vertex_trend / reach)])
 
     @property
     def covariance(self) -> np.ndarray:
-        """Covariance (3, 3) of piston, slope_x, slope_y due to noise and the vertices' common error, SI units."""
+        """Covariance (3, 3) of the plane's piston (m) and slopes along X' and Y' (rad).
+
+        It is due to noise and to the error that all fitted MTF peaks have in common.
+        """
         return self.plane.noise_covariance + np.diag(self.systematic**2)
 
     @property
     def plane_covariance(self) -> np.ndarray:
-        """Covariance (3, 3) of piston, slope_x, slope_y of a plane for all CCDs.
+        """Covariance (3, 3) of piston (m) and slopes (rad) of a plane that represents all CCDs.
 
         It is `covariance` plus the scatter of the measured CCDs about one plane.
         """
@@ -202,7 +209,10 @@ class Shimming:
 
     @property
     def change_sigma(self) -> np.ndarray:
-        """Standard deviation of the unrounded changes of the H shims, (H,), metres, with the vertices' common error."""
+        """Standard deviation of the unrounded changes of the H shims, (H,), metres.
+
+        It includes the error that all fitted MTF peaks have in common.
+        """
         holes, up = self.plan.mount.holes, self.plan.mount.normal
         lever = np.cross(holes, up)
         # a piston moves along Z'; a slope along X' is a rotation about -Y', one along Y' about X'
@@ -227,7 +237,7 @@ class FocusRun:
     test : FocusTestSpec or MeasuredFocusSpec
         Specification from the test's file.
     seed : int
-        Seed of all that was drawn.
+        Seed of all random numbers.
     bands : tuple of str
         Band of the CCD at each of the N sites; empty where a table has no bands.
     places : (N, 2) ndarray
@@ -250,26 +260,26 @@ class FocusRun:
 
     @property
     def edges(self) -> tuple[str, ...]:
-        """Directions that were measured."""
+        """Directions in which the MTF was measured, along the line and along the track."""
         return tuple(self.states[0].scans[0].vertex)
 
     @property
     def chi_square(self) -> tuple[float, int]:
-        """Chi-square of all curves through focus of the first state together, and their degrees of freedom."""
+        """Chi-square of all MTF curves through focus of the first state together, and its degrees of freedom."""
         vertices = [vertex for scan in self.states[0].scans for vertex in scan.vertex.values()]
         return sum(v.chi_square for v in vertices), sum(v.degrees_of_freedom for v in vertices)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class SimulatedFocus(FocusRun):
-    """Alignment on the simulated bench, with its truth.
+    """Alignment on the simulated bench, with the true values.
 
     Attributes
     ----------
     bench : FocusBench
         Bench of the alignment.
     states : tuple of SimulatedState
-        Measured states, one more than there are shimmings.
+        Measured states, one more than there are rounds of shims.
     """
 
     bench: FocusBench
@@ -277,13 +287,13 @@ class SimulatedFocus(FocusRun):
 
     @cached_property
     def budget(self) -> tuple[BudgetLine, ...]:
-        """MTF budget of the bands by `FocusBench.budget`."""
+        """MTF budget of the bands at the Nyquist frequency: the factors of which the MTF is the product."""
         return self.bench.budget()
 
     def true_plane(self, number: int) -> np.ndarray:
-        """Return piston and slopes, (3,), of the plane through the true defocus, metres and radians.
+        """Return piston and slopes, (3,), of the plane fitted to the true defocus, metres and radians.
 
-        Its weights are those of ``shimmings[number].plane``.
+        The sites have the weights of the measured fit, ``shimmings[number].plane``.
         """
         plane = self.shimmings[number].plane
         weight = 1.0 / np.sqrt(plane.sigma**2 + plane.extra_sigma**2)
@@ -318,7 +328,7 @@ def run_focus(setup: ExperimentSetup[Any], backend: Backend, seed: int, advance:
 
 
 def _require_memory(setup: FocusSetup) -> None:
-    """Raise an error unless the frames in focus and those of one edge per thread fit into memory."""
+    """Raise an error unless all frames in focus, and the frames of one edge per thread, fit into memory."""
     test = setup.test
     series = 2 * test.rounds * len(setup.camera.bands) * len(test.fields)  # of edges in two directions
     bytes_per_frame = test.edge.region**2 * (series * _GREY + cores() * _EDGE_PIXEL)
@@ -333,7 +343,7 @@ def align_files(spec: MeasuredFocusSpec, seed: int = 0, advance: Advance = silen
     spec : MeasuredFocusSpec
         Specification of the test.
     seed : int
-        Seed of the command; nothing is drawn.
+        Seed of the command, which is only reported: no random numbers are needed.
     advance : Advance
         Called with the progress.
 
@@ -380,7 +390,7 @@ def _check_light(bench: FocusBench) -> None:
 
 
 def align(bench: FocusBench, seed: int, advance: Advance = silent) -> SimulatedFocus:
-    """Misalign the focal plane at random and align it.
+    """Simulate an alignment: misalign the focal plane at random, then measure and shim it in rounds.
 
     Raises
     ------
@@ -433,7 +443,7 @@ def plan_shimming(
     present : (H,) ndarray
         Present thickness of the H shims, metres.
     vertex : tuple of float
-        Standard deviations of the error common to all vertices and of its trend, metres.
+        Standard deviations of the error common to all fitted MTF peaks and of its trend, metres.
 
     Raises
     ------
@@ -448,7 +458,7 @@ def plan_shimming(
 
 
 def draw_placement(bench: FocusBench, seed: int) -> Placement:
-    """Draw the misaligned placement at the beginning from the seed."""
+    """Return the random misaligned placement of the focal plane at the beginning, which the seed determines."""
     spec = bench.setup.test.misset
     random = np.random.default_rng(stream(seed, _MISSET))
     rotation = rotation_matrix(np.array(spec.rotate) * random.standard_normal(3))
@@ -458,7 +468,7 @@ def draw_placement(bench: FocusBench, seed: int) -> Placement:
 
 
 def mount_of(test: FocusTestSpec | MeasuredFocusSpec) -> Mount:
-    """Return the mounting surface of the drawing, in the assembly's frame.
+    """Return the mounting surface with its holes, as specified by the drawing, in the assembly's frame.
 
     Raises
     ------
@@ -473,7 +483,9 @@ def mount_of(test: FocusTestSpec | MeasuredFocusSpec) -> Mount:
 
 
 def plan_shims(correction: RigidMotion, mount: Mount, present: np.ndarray) -> ShimPlan:
-    """Compute the shims for a correction.
+    """Compute the shims that move the focal-plane assembly by a correction.
+
+    ``present`` is the present thickness of each shim, metres.
 
     Raises
     ------
@@ -495,7 +507,7 @@ def plan_shims(correction: RigidMotion, mount: Mount, present: np.ndarray) -> Sh
 
 
 def line_rotation(pose: Pose) -> float:
-    """Return the rotation of the line about Z', radians."""
+    """Return the rotation of the line about Z' in a pose of the assembly, radians."""
     x, y, _ = pose.rotation[:, 1]
     return float(np.arctan2(-x, y))
 
@@ -503,7 +515,7 @@ def line_rotation(pose: Pose) -> float:
 def recorder_of(
     bench: FocusBench, placement: Placement, seed: int, number: int, patterns: Mapping[str, FixedPattern] | None = None
 ) -> Recorder:
-    """Return the recorder of a placement, which returns the same frames for the same arguments.
+    """Return the recorder of edge images for a placement of the assembly; equal arguments give equal frames.
 
     Parameters
     ----------
@@ -523,7 +535,7 @@ def recorder_of(
 
 
 def _patterns(bench: FocusBench, seed: int) -> dict[str, FixedPattern]:
-    """Return the fixed pattern of the columns of each band."""
+    """Return band -> fixed pattern (gain and offset) of the columns of its line CCD, drawn from the seed."""
     return {name: ccd.pattern(stream(seed, _PATTERNS, k)) for k, (name, ccd) in enumerate(bench.ccds.items())}
 
 
@@ -566,22 +578,28 @@ def _on_new_shims(pose: Pose, plan: ShimPlan, mount: Mount, setting: float) -> P
 
 
 def _holes(values: Iterable[Any]) -> dict[str, Any]:
-    """Return name of the hole -> value, from values of the H mounting holes, (H, ...)."""
+    """Return name of the mounting hole -> value, from an array of the H holes' values, (H, ...)."""
     return {f"hole_{k + 1}": value for k, value in enumerate(values)}
 
 
 def _ground(metres: Any) -> Any:
-    """Return thicknesses of shims, metres, as whole grinding steps in micrometres, rounded to picometres."""
+    """Return shim thicknesses in micrometres, from metres in whole grinding steps, without rounding residue.
+
+    They are rounded to picometres.
+    """
     return np.round(UM * np.asarray(metres), 6)
 
 
 def _mtf(state: SimulatedState, edge: str, which: int) -> dict[str, float]:
-    """Return band -> MTF in one direction, or its sigma."""
+    """Return band -> MTF at the Nyquist frequency in one direction, or its sigma.
+
+    ``which`` is 0 for the MTF and 1 for its sigma.
+    """
     return {band: pair[which] for band, pair in state.mtf(edge).items()}
 
 
 def _shims(state: SimulatedState) -> Shimming:
-    """Return the shims that led to the placement of a state."""
+    """Return the shims with which the focal plane came to the placement of a state."""
     assert state.shims is not None
     return state.shims
 
@@ -747,7 +765,7 @@ ROW_FAULT: Record[RowFault] = Record(
 
 
 def _first_plane(run: FocusRun) -> _PlacePlane:
-    """Return the run with its first state and the plane fitted to it."""
+    """Return the run, its first state, and the plane fitted to that state's best foci."""
     return run, run.states[0], run.shimmings[0]
 
 
@@ -804,5 +822,5 @@ MEASURED: Record[FocusRun] = Record(
 
 
 def focus_numbers(run: FocusRun) -> dict[str, Any]:
-    """Return the contents of focus.json without its frames."""
+    """Return the contents of focus.json, all results of the alignment as plain data, without the frames."""
     return SIMULATED(run) if isinstance(run, SimulatedFocus) else MEASURED(run)

@@ -29,9 +29,9 @@ from twin.laboratory.measured_readings import DataFile
 from twin.targets.target_images import ALONG, DIRECTIONS
 
 MAX_SITES = 3000
-"""Largest number of sites of a series."""
+"""Largest number of sites (positions on the focal plane) in a measured series."""
 NANOMETRE = 1e-9
-"""Distance below which two positions are the same site, metres."""
+"""Distance below which two positions in a table are considered the same site, metres."""
 _WHERE = (
     Column("band", text=True, needed=False),
     Column("x", LENGTH, least=-10.0, most=10.0),
@@ -48,13 +48,13 @@ IMAGE_COLUMNS = (
     *(Column(name, needed=False, whole=True, least=1.0, most=1e5) for name in ("height", "width")),
 )
 _FALSE_ALARM = 1e-3
-"""Probability that any line of a table without errors is excluded as an outlier."""
+"""Probability that any row of a table without errors is excluded as an outlier."""
 _REGION = ("row", "column", "height", "width")
 
 
 @dataclass(frozen=True, eq=False)
 class _Place:
-    """Site of the focal plane with its rows of the table.
+    """Site (position) on the focal plane with its rows of the table.
 
     Attributes
     ----------
@@ -63,7 +63,7 @@ class _Place:
     place : (2,) ndarray
         Position (X', Y'), metres.
     rows : mapping
-        Edge -> its rows of the table, by shift.
+        Edge (direction of the MTF) -> indices of its rows of the table, sorted by shift.
     """
 
     band: str
@@ -77,7 +77,7 @@ class _Place:
 
 @dataclass(frozen=True, eq=False)
 class RowFault:
-    """Line of the table with the reason why it, or its image, is excluded or doubtful."""
+    """Row of the table that is excluded or doubtful, or whose image is, with the reason."""
 
     file: str
     line: int
@@ -86,7 +86,7 @@ class RowFault:
 
 @dataclass(frozen=True, eq=False)
 class FocusReadings:
-    """Measured through-focus series of N sites.
+    """Measured through-focus series of N sites (positions on the focal plane).
 
     Attributes
     ----------
@@ -103,7 +103,7 @@ class FocusReadings:
     uneven : tuple of RowFault
         Images with structure that their edge does not explain.
     excluded : tuple of RowFault
-        Rows that disagree with the curve of all others and have no weight.
+        Rows that disagree with the curve through all others and are not used.
     file : DataFile
         File of the table.
     """
@@ -162,12 +162,15 @@ def read_focus(files: FocusFiles, advance: Advance = silent) -> FocusReadings:
 
 
 def _faults(table: Table, reasons: Mapping[int, str]) -> tuple[RowFault, ...]:
-    """Return those lines of a table for which there is a reason of exclusion or doubt."""
+    """Return the rows of a table for which ``reasons`` (row -> reason) has an entry, with the reason."""
     return tuple(RowFault(table.file, int(table.lines[row]), reasons[row]) for row in sorted(reasons))
 
 
 def _per_shift(table: Table, files: FocusFiles) -> Array | float:
-    """Return the shift of the image along the light per unit of shift in the table."""
+    """Return the shift of the image along the light per unit of the shift that the table gives.
+
+    The table may give shifts of the image itself, or of the target in the collimator.
+    """
     if files.moved != "target":
         if "per shift" in table:
             raise table.error(0, "per shift", "only a target's shift differs from the image's", allowed="moved: target")
@@ -219,7 +222,7 @@ def _sites(table: Table) -> tuple[_Place, ...]:
 
 
 def _scan(table: Table, site: _Place, shift: Array, mtf: Array, sigma: Array, reasons: Mapping[int, str]) -> SiteScan:
-    """Fit the vertices of a site's curves through focus."""
+    """Fit the peaks (vertices) of a site's MTF curves through focus."""
     vertex = {}
     for edge, rows in site.rows.items():
         good = int(np.sum(np.isfinite(sigma[rows])))
@@ -249,7 +252,14 @@ def _scan(table: Table, site: _Place, shift: Array, mtf: Array, sigma: Array, re
 def _from_images(
     table: Table, files: FocusFiles, advance: Advance
 ) -> tuple[Array, Array, dict[int, str], dict[int, str]]:
-    """Return MTF and sigma of every row's image, why some have no edge, and doubts about the sigma of others."""
+    """Measure the MTF in the image of every row of a table.
+
+    Returns
+    -------
+    tuple
+        MTF and its sigma, (rows,) each; row -> reason why its image has no measurable edge; row -> reason to doubt its
+        sigma.
+    """
     region_columns = [name for name in _REGION if name in table]
     if region_columns and len(region_columns) < len(_REGION):
         allowed = "all of row, column, height and width, or none for whole images"

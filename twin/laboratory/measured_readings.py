@@ -1,6 +1,6 @@
 """Measured readings of a turntable, and spots of a camera on it, read from tables for the analysis.
 
-Rows are sorted before anything is computed, so that their order in a file changes no bit of a result.
+Rows are sorted before anything is computed, so that their order in a file does not change any digit of a result.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ MAX_CELLS = 30_000_000
 READING_TOLERANCE = 1e-9
 """Difference below which two readings are repeats of the same angle, radians (0.0002 arcsec)."""
 MAX_DIFFERENCE_CHANGE = np.radians(1.0)
-"""Largest change of the difference from the reference over the region, radians; no dividing error is that large."""
+"""Largest plausible change over the region of turntable minus reference, radians; dividing errors are smaller."""
 CIRCLE = 2.0 * np.pi
 # Columns that number repeats; largest fraction of rows that rounding makes equal; least number of such rows.
 _COUNTS, _COPIED, _LEAST_SET = ("set", "repeat"), 0.8, 3
@@ -66,12 +66,12 @@ class DataFile:
     file : str
         Path of the file.
     rows : int
-        Number of rows below its heads.
+        Number of rows below the column names.
     sha256 : str
         SHA-256 of its contents.
     copied : int
-        Number of rows that repeat another one to the last digit, counted if all rows of a set do, or most of those that
-        repeat a measurement where sets have no number; else 0.
+        Number of rows that repeat another one to the last digit, which suggests copied data. They are counted only if
+        all rows of a set do, or, where sets have no number, most of the rows that repeat a measurement; else 0.
     """
 
     file: str
@@ -81,7 +81,10 @@ class DataFile:
 
     @classmethod
     def of(cls, table: Table, where: Sequence[str]) -> DataFile:
-        """Return the file of a table; rows with equal values in columns ``where`` repeat the same measurement."""
+        """Return the description of a table's file.
+
+        Rows with equal values in the columns named in ``where`` repeat the same measurement.
+        """
         code = {name: np.unique(each, return_inverse=True)[1].ravel() for name, each in table.columns.items()}
         copy, again = np.ones((2, len(table)), bool)
         for rows, names in ((copy, set(code) - set(_COUNTS)), (again, set(code) & set(where))):
@@ -92,7 +95,7 @@ class DataFile:
 
     @property
     def doubts(self) -> tuple[str, ...]:
-        """Warnings about the contents of the file."""
+        """Warnings about the contents of the file, such as copied rows."""
         text = (
             "of a repeated measurement equal another one to the last digit: were they copied? All count in the sigmas"
         )
@@ -101,7 +104,7 @@ class DataFile:
 
 @dataclass(frozen=True, eq=False)
 class Comparisons:
-    """Measured series of comparisons of a turntable with a reference.
+    """Measured series of comparisons of a turntable's readings with a reference.
 
     Attributes
     ----------
@@ -112,7 +115,7 @@ class Comparisons:
     file : DataFile
         File that holds the series.
     head : str
-        Head of its column of readings.
+        Name of its column of readings.
     """
 
     series: CalibrationSeries
@@ -123,7 +126,7 @@ class Comparisons:
 
 @dataclass(frozen=True, eq=False)
 class SpotReadings:
-    """Measured spots: N points, S sets.
+    """Measured spots on a camera's line for turntable readings at N points, repeated in S sets.
 
     Attributes
     ----------
@@ -140,7 +143,7 @@ class SpotReadings:
     file : DataFile
         File that holds the spots.
     head : str
-        Head of its column of readings.
+        Name of its column of readings.
     numbered : bool
         True if the sets have numbers in the file.
     """
@@ -182,14 +185,14 @@ def read_turntable(files: TurntableFiles) -> tuple[Comparisons, ...]:
 
 
 def calibrated_text(angle: Array) -> str:
-    """Describe the region in which a turntable is calibrated, from its N angles, (N,), and the gaps in it."""
+    """Describe the region in which a turntable is calibrated, and the gaps in it, from its N angles, (N,)."""
     holes = [f"{a:.9g} to {b:.9g}" for a, b in np.degrees(gaps(angle))]
     first, last = np.degrees(angle[[0, -1]])
     return f"{first:.9g} to {last:.9g} deg" + (f" without the gaps {', '.join(holes)} deg" if holes else "")
 
 
 def unwrapped(reading: Array, around: float | None = None) -> Array:
-    """Return readings of a circle without a jump of a full turn among them.
+    """Return angle readings of a circle unwrapped, so that they have no jump of 360 deg.
 
     Parameters
     ----------
@@ -218,7 +221,7 @@ def read_comparisons(path: str, reference_sigma: float, fewest: int = 4, around:
     reference_sigma : float
         Standard deviation from the certificate of the reference, radians.
     fewest : int
-        Least number of different angles.
+        Smallest allowed number of different angles.
     around : float, optional
         Reading around which the circle is unwrapped, as in `unwrapped`.
 
@@ -333,7 +336,10 @@ def read_spots(files: DistortionFiles) -> SpotReadings:
 
 
 def _places(table: Table, files: DistortionFiles) -> tuple[Array, Array, Array]:
-    """Return positions on the line and their sigmas, independent per exposure and fixed, (rows,), metres."""
+    """Return the spots' positions along the line and their sigmas, (rows,) each, metres.
+
+    The first sigma is of the error that is independent in every exposure, the second of one that is fixed.
+    """
     if ("along" in table) is ("column" in table):
         found = "neither" if "along" not in table else "both"
         allowed = "'along [mm]' from the line's middle, or 'column' with `line:` in the test's file"
@@ -360,7 +366,7 @@ def _places(table: Table, files: DistortionFiles) -> tuple[Array, Array, Array]:
 
 
 def _few_points(table: Table, cells: _Cells, sets: Array | None) -> None:
-    """Raise InputError for too few points, in all or in a set, or more than fit into memory."""
+    """Raise InputError for too few points, in total or in one set, or for more points than fit into memory."""
     count, need = len(cells.count), len(CALIBRATED) + 2
     if count < need or count > MAX_ANGLES:
         few = "too few points" if count < need else "too many points"
@@ -379,7 +385,7 @@ def _few_points(table: Table, cells: _Cells, sets: Array | None) -> None:
 
 
 def _groups(table: Table) -> Integers:
-    """Return the number of the angle to which each row belongs, (rows,), increasing with the readings."""
+    """Return the number of the nominal angle to which each row belongs, (rows,), increasing with the readings."""
     reading = table["reading"]
     if "position" in table:
         _, group = np.unique(table["position"], return_inverse=True)
@@ -396,7 +402,7 @@ def _groups(table: Table) -> Integers:
 
 
 class _Cells:
-    """Lines of a table as a matrix: a row for each group (such as an angle), with its members as columns.
+    """Rows of a table arranged as a matrix: a matrix row for each group (such as an angle) of table rows.
 
     Parameters
     ----------
@@ -405,7 +411,7 @@ class _Cells:
     group
         Group of each sorted line, (lines,), non-decreasing.
     order
-        Line of the table of each sorted line, (lines,).
+        Index in the table of each sorted line, (lines,).
     slot
         Column of each sorted line in the matrix; by default members of a group one after the other.
     """
@@ -423,13 +429,13 @@ class _Cells:
         self.present[self.group, self.slot] = True
 
     def at(self, slot: Integers) -> _Cells:
-        """Return the same lines in a matrix with other columns."""
+        """Return the same lines arranged with the given matrix columns."""
         return _Cells(self.table, self.group, self.order, slot)
 
     def matrix(self, value: Array | Integers, empty: float | None = 0.0) -> np.ndarray:
-        """Return values of the table's lines as a matrix, groups by members.
+        """Return values of the table's lines as a matrix: a row for each group, a column for each member.
 
-        Empty cells get ``empty``, or with None the first value of their group.
+        Empty cells get ``empty``, or if that is None the first value of their group.
         """
         start = (
             np.asarray(value)[self.first] if empty is None else np.full(len(self.count), empty, np.asarray(value).dtype)
@@ -439,7 +445,7 @@ class _Cells:
         return out
 
     def centre(self, value: Array) -> Array:
-        """Return the mean of each of N groups, (N,); exactly the value where all are equal."""
+        """Return the mean of each of N groups, (N,), without rounding error where all its values are equal."""
         least, most = (np.full(len(self.count), side) for side in (np.inf, -np.inf))
         np.minimum.at(least, self.group, value[self.order])
         np.maximum.at(most, self.group, value[self.order])
@@ -447,7 +453,7 @@ class _Cells:
         return np.where(least == most, least, mean)
 
     def refuse_twice(self, number: Array, name: str) -> None:
-        """Raise InputError if two rows of a group have the same number."""
+        """Raise InputError if two rows of a group have the same number (such as that of a set) in a column."""
         numbers = number[self.order]
         same = (np.diff(self.group) == 0) & (np.diff(numbers) == 0)
         if np.any(same):
@@ -471,7 +477,10 @@ def _check_angles(cells: _Cells, angle: Array, fewest: int) -> None:
 
 
 def _check_positions(cells: _Cells, reading: Array, angle: Array) -> None:
-    """Raise InputError unless readings of a position are nearer to its mean than half the distance to the next one."""
+    """Raise InputError for repeated readings that are too far from the mean of their nominal angle.
+
+    The limit is half the distance between that mean and the next one.
+    """
     if "position" not in cells.table or len(angle) < 2:
         return
     same = np.diff(angle) == 0.0

@@ -1,4 +1,4 @@
-"""Report of a turntable test: results, accuracy and its limits; of a simulated table also the truth."""
+"""Report of a turntable test: results, accuracy and what limits it; for a simulated table also the true values."""
 
 from __future__ import annotations
 
@@ -42,7 +42,10 @@ _CURVE_POINTS = 801
 
 
 def comparison_figure(run: TurntableRun) -> Figure:
-    """Draw all comparisons about their accepted mean, and the RMS at each angle before and after rejection."""
+    """Draw all comparisons minus the mean of the accepted ones, and their RMS at each angle.
+
+    The RMS is drawn before and after the rejection of outliers.
+    """
     series = run.series
     angle = np.degrees(series.angle)
     off = series.from_mean / ARCSEC
@@ -104,7 +107,10 @@ def curve_figure(run: TurntableRun) -> Figure:
 
 
 def residual_figure(run: TurntableRun) -> Figure:
-    """Draw held-out points minus each fit, best first, and for a simulated table the true curve minus the fit."""
+    """Draw the held-out points minus each fit of the dividing error, best fit first.
+
+    For a simulated table the true curve minus the fit is drawn too.
+    """
     at = np.linspace(*run.compensation.region, _CURVE_POINTS)
     held = run.held_out
     assert held is not None
@@ -158,7 +164,7 @@ def _readings(run: TurntableRun) -> str:
 
 
 def _comparison(run: TurntableRun, result: Mapping[str, Any]) -> Section:
-    """Return the section on the comparisons with the reference."""
+    """Return the section on the comparisons of turntable readings with the reference."""
     series = run.series
     text = [
         f"Chauvenet's criterion rejects {series.rejected} of {np.sum(series.taken)} comparisons. By chance it would "
@@ -182,7 +188,7 @@ def _comparison(run: TurntableRun, result: Mapping[str, Any]) -> Section:
 
 
 def _fits(run: TurntableRun, result: Mapping[str, Any]) -> Section:
-    """Return the section on the fits of the dividing error."""
+    """Return the section on the functions fitted to the dividing error."""
     fits, chosen, held, model = result["fits"], result["chosen"], run.held_out, run.model
     best = result["ranking"][0]
     ranking_text = (
@@ -248,7 +254,10 @@ def rejected_table(record: Record[Any], name: str, what: str, rows: Sequence[Map
 
 
 def _ranking(result: Mapping[str, Any]) -> Table:
-    """Return the table of all fits, the best first; for a simulated table also against the truth."""
+    """Return the table of the RMS residuals of all fits, the best first.
+
+    For a simulated table it also has their true errors.
+    """
     fits, truth = result["fits"], result.get("truth")
     keys = ["heldout_rms_arcsec", "train_rms_arcsec", "cross_validation_rms_arcsec", "effective_parameters"]
     note = "RMS, the best fit first."
@@ -266,7 +275,7 @@ def _ranking(result: Mapping[str, Any]) -> Table:
 
 
 def _noise(run: TurntableRun) -> float:
-    """Return the sigma of a compensated angle due to noise of the calibration, RMS over its readings, arcsec."""
+    """Return the sigma of a compensated angle due to noise of the calibration, RMS over the readings, arcsec."""
     return float(np.sqrt(np.mean(np.diag(run.compensation.fit.covariance(run.series.angle))))) / ARCSEC
 
 
@@ -291,7 +300,7 @@ def _chi_square(result: Mapping[str, Any]) -> Table:
 
 
 def turntable_report(run: TurntableRun) -> Report:
-    """Build the report of a turntable test."""
+    """Return the report of a turntable test: dividing error, fits, remaining error, figures and tables."""
     data, spec = TURNTABLE(run), run.spec
     chosen, parts, truth = data["chosen"], data["compensation"], data.get("truth")
     sigma = float(np.sqrt(np.mean(run.compensation.sigma(run.series.angle) ** 2))) / ARCSEC
@@ -342,7 +351,7 @@ def turntable_report(run: TurntableRun) -> Report:
 
 
 def _warnings(run: TurntableRun, data: Mapping[str, Any]) -> tuple[str, ...]:
-    """Return the warnings of the report."""
+    """Return the warnings about the measurements and the fits of the dividing error."""
     warnings = []
     if run.too_few:
         warnings.append(f"too few angles for: {', '.join(FIT_NAMES[name] for name in run.too_few)}")

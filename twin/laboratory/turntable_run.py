@@ -1,13 +1,15 @@
-"""Turntable test of paper 004 (section 3.3): the dividing error of a table from comparisons with a reference.
+"""Turntable test of paper 004 (Li et al. 2020, section 3.3).
 
-Five fits are made of the comparisons and ranked on angles that no fit has used. The analysis gets the comparisons and
-the certificate of the reference, of a simulated bench or from files of measurements. The true dividing error of a
-simulated table serves for comparison only.
+It determines the dividing error of a table from comparisons with a reference.
 
-Dividing error = reading - true angle: the table that reads R is at the true angle phi = R - e(R). e is a sum of
-harmonics of the full turn; the subdivision error is a few harmonics of the grating's signal. All coefficients are drawn
-from the seed, so that the turntable test and the distortion test of one seed use the same table. All angles are in
-radians.
+Five functions are fitted to the comparisons and ranked on angles that no fit has used. The analysis gets the
+comparisons and the certificate of the reference, of a simulated bench or from files of measurements. The true dividing
+error of a simulated table serves for comparison only.
+
+Dividing error = reading - true angle: the table that reads R is at the true angle phi = R - e(R) with the dividing
+error e. It is a sum of harmonics of the full turn; the subdivision error, a part of it, is a few harmonics of the
+grating's signal. All coefficients are drawn from the seed, so that the turntable test and the distortion test of one
+seed use the same table. All angles are in radians.
 
 The records at the end define the contents of turntable.json.
 """
@@ -46,14 +48,18 @@ from twin.framework.record import Quantity, Record
 from twin.laboratory.measured_readings import Comparisons, DataFile, read_turntable
 
 _TABLE, _CALIBRATION, _HELD_OUT, _SPREAD = range(4)
-"""Numbers of the random streams of the seed."""
+"""Numbers of the random streams of the seed.
+
+They are for the table's dividing error, the comparisons of the calibration, the held-out comparisons, and the random
+offsets of their angles.
+"""
 _FIXED_POINT_STEPS = 8
 """Fixed-point iterations from a true angle to a reading; they leave less than rounding errors."""
 
 
 @dataclass(frozen=True, eq=False)
 class Harmonics:
-    """Periodic function sum_k cosine_k cos(k R) + sine_k sin(k R) of the reading R.
+    """Periodic function of a turntable reading R: sum over k of cosine_k cos(k R) + sine_k sin(k R), radians.
 
     Attributes
     ----------
@@ -69,16 +75,25 @@ class Harmonics:
 
     @classmethod
     def draw(cls, order: ArrayLike, rms: Array, rng: np.random.Generator) -> Harmonics:
-        """Draw normal coefficients of harmonics with given RMS.
+        """Return a function with random, normally distributed coefficients of its harmonics.
 
         The mean square of harmonic k over the circle is rms_k^2 on average.
+
+        Parameters
+        ----------
+        order : (K,) array_like of int
+            Numbers k of periods in a full turn, for K harmonics.
+        rms : (K,) ndarray
+            RMS of each harmonic, radians.
+        rng : Generator
+            Random generator.
         """
         k = np.asarray(order, np.int64)
         cosine, sine = rng.standard_normal((2, len(k))) * rms
         return cls(k, cosine, sine)
 
     def __call__(self, reading: ArrayLike) -> Array:
-        """Return the sum at turntable readings in radians, in their shape, radians."""
+        """Return the value of the function at turntable readings (radians), in their shape, radians."""
         at = np.asarray(reading, np.float64)
         phase = at.ravel()[:, None] * self.order
         return (np.cos(phase) @ self.cosine + np.sin(phase) @ self.sine).reshape(at.shape)
@@ -103,7 +118,7 @@ class DividingError:
 
     @classmethod
     def draw(cls, spec: DividingErrorSpec, seed: int) -> DividingError:
-        """Draw the dividing error of a table, which is determined by specification and seed."""
+        """Return the random dividing error of a table, which specification and seed determine."""
         rng = np.random.default_rng(stream(seed, _TABLE))
         g, sub = spec.graduation, spec.subdivision
         lines = np.arange(g.first, g.last + 1)
@@ -134,7 +149,7 @@ class TurntableModel:
     spec : TurntableTestSpec
         Specification of the test.
     seed : int
-        Seed of everything that is drawn.
+        Seed of all random numbers.
     """
 
     spec: TurntableTestSpec
@@ -142,7 +157,7 @@ class TurntableModel:
 
     @cached_property
     def error(self) -> DividingError:
-        """True dividing error of this table, which the analysis does not know."""
+        """True dividing error of the simulated table, which the analysis does not know."""
         return DividingError.draw(self.spec.dividing_error, self.seed)
 
     def true_angle(self, reading: ArrayLike, rng: np.random.Generator | None = None) -> Array:
@@ -161,8 +176,8 @@ class TurntableModel:
     def reading(self, true_angle: ArrayLike, rng: np.random.Generator | None = None) -> Array:
         """Return the readings of the table at these true angles, the inverse of `true_angle`, radians.
 
-        R = phi + e(R) is solved by fixed-point steps: |de/dR| is a few times 1e-2 (subdivision), so that eight steps
-        leave less than rounding errors.
+        For a true angle phi the reading R = phi + e(R), with the dividing error e, is solved by fixed-point iteration:
+        |de/dR| is a few times 1e-2 (subdivision), so that eight steps leave less than rounding errors.
         """
         phi = np.asarray(true_angle, np.float64)
         scatter = self._scatter(phi.shape, rng)
@@ -172,7 +187,7 @@ class TurntableModel:
         return reading
 
     def _scatter(self, shape: tuple[int, ...], rng: np.random.Generator | None) -> Array:
-        """Draw the repeatability error; zeros without a generator."""
+        """Return random repeatability errors, radians; zeros without a generator."""
         if rng is None:
             return np.zeros(shape)
         return rng.normal(0.0, self.spec.dividing_error.repeatability, shape)
@@ -183,14 +198,20 @@ class TurntableModel:
         return self._compare(self._steps(0.0, plan.count), plan.repeats, _CALIBRATION)
 
     def held_out(self) -> CalibrationSeries:
-        """Simulate the separate series at angles in the middle of the steps, displaced at random up to the spread."""
+        """Simulate a separate series for validation, at angles between those of the calibration.
+
+        The angles are in the middle of the steps, displaced at random by up to the specified spread.
+        """
         plan = self.spec.calibration
         rng = np.random.default_rng(stream(self.seed, _SPREAD))
         off = rng.uniform(-plan.held_out.spread, plan.held_out.spread, plan.count - 1)
         return self._compare(self._steps(0.5, plan.count - 1) + off, plan.held_out.repeats, _HELD_OUT)
 
     def _steps(self, start: float, count: int) -> Array:
-        """Return ``count`` readings a step apart, radians, the first ``start`` steps after the first calibrated one."""
+        """Return ``count`` readings one step apart, radians.
+
+        The first one is ``start`` steps after the first calibrated reading.
+        """
         plan = self.spec.calibration
         return np.asarray(plan.first + plan.step * (np.arange(count) + start), np.float64)
 
@@ -210,7 +231,7 @@ class TurntableModel:
 TRUTH_READINGS = 4000
 """Number of readings at which fits are compared with the true curve."""
 _GOLDEN = 0.5 * (np.sqrt(5.0) - 1.0)
-"""Golden ratio minus one, which spreads the readings evenly."""
+"""Golden ratio minus one; its multiples modulo 1 spread the readings evenly."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -222,7 +243,7 @@ class TurntableRun:
     spec : TurntableTestSpec or MeasuredTurntableSpec
         Specification of the test.
     seed : int
-        Seed of all that is drawn: the simulated bench, and the starting values of the network.
+        Seed of all random numbers: of the simulated bench, and of the network's starting values.
     series : CalibrationSeries
         Comparisons at the calibrated readings.
     held_out : CalibrationSeries or None
@@ -232,7 +253,7 @@ class TurntableRun:
     compensation : DividingCompensation
         Compensation by the chosen fit.
     model : TurntableModel or None
-        Simulated table and reference, which hold the truth; None for measurements.
+        Simulated table and reference, which hold the true values; None for measurements.
     tables : tuple of Comparisons
         Series that were read from files; empty for a simulated bench.
     too_few : tuple of str
@@ -251,7 +272,7 @@ class TurntableRun:
 
     @property
     def fits(self) -> dict[str, AngleFit]:
-        """Fits that succeeded, in the order in which they were made."""
+        """Name -> fit of the dividing error, for all fits that succeeded, in the order in which they were made."""
         return {name: trial.fit for name, trial in self.choice.trials.items()}
 
     def residual(self, name: str) -> Array:
@@ -272,26 +293,29 @@ class TurntableRun:
         return None if self.held_out is None else rms(self.held_out_residual(name))
 
     def _judged(self, name: str) -> float:
-        """Return the RMS by which a fit is ranked, radians."""
+        """Return the RMS by which a fit is ranked, radians: at the held-out readings, or else by cross-validation."""
         held_out = self.held_out_rms(name)
         return self.choice[name].validation.rms if held_out is None else held_out
 
     @cached_property
     def ranking(self) -> tuple[str, ...]:
-        """Names of the fits, the best first, by RMS at the held-out readings or, without these, by cross-validation."""
+        """Names of the fits, the best first, by their RMS at held-out readings.
+
+        Without held-out readings the RMS of the cross-validation is used.
+        """
         return tuple(sorted(self.fits, key=self._judged))
 
     @cached_property
     def chi_square(self) -> tuple[float, float]:
-        """Chi-square of the chosen fit at the calibrated readings, against their sigmas, and its degrees of freedom."""
+        """Chi-square of the chosen fit's residuals at the calibrated readings, and its degrees of freedom."""
         square = float(np.sum((self.residual(self.choice.chosen) / self.series.sigma) ** 2))
         return square, len(self.series.angle) - self.compensation.fit.effective_parameters
 
     @cached_property
     def held_out_chi_square(self) -> tuple[float, int] | tuple[None, None]:
-        """Chi-square at the held-out readings and its degrees of freedom; None without such readings.
+        """Chi-square of the residuals at the held-out readings, and its degrees of freedom; None without such readings.
 
-        Its covariance is that of the readings plus the full covariance of the compensation.
+        Their covariance is that of the readings plus the full covariance of the compensation.
         """
         if self.held_out is None:
             return None, None
@@ -327,11 +351,11 @@ def run_turntable(
     spec : TurntableTestSpec or MeasuredTurntableSpec
         Specification of the test.
     seed : int
-        Seed of all that is drawn; with the specification it determines everything.
+        Seed of all random numbers; with the specification it determines everything.
     progress : callable, optional
         Called with a text that says what is being done.
     names : sequence of str
-        Names of the fits to make; the network takes nearly all of the time.
+        Names of the fits to make; the neural network takes nearly all of the time.
 
     Raises
     ------
@@ -403,7 +427,7 @@ def rms(value: Array) -> float:
 def run_turntable_test(
     setup: ExperimentSetup[Any], backend: Backend, seed: int, advance: Advance = silent
 ) -> TurntableRun:
-    """Run ``python -m twin.lab turntable``; nothing is traced, so that the backend is not used.
+    """Run ``python -m twin.lab turntable``; no rays are traced, so that the backend is not used.
 
     Raises
     ------
@@ -498,7 +522,10 @@ POINTS: Record[_Points] = Record(
 
 
 def _each(series: CalibrationSeries, values: Any) -> list[Any]:
-    """Return values of a series, (N, repeats) for N readings, as a list per reading, without missing comparisons."""
+    """Return values of a series as a list for each reading, without missing comparisons.
+
+    ``values`` is an array (N, repeats) for N readings.
+    """
     return [row[taken] for row, taken in zip(values, series.taken, strict=True)]
 
 

@@ -1,1 +1,1 @@
-"""The live twin: a web page with sliders for every body, which shows spots and readings as they change."""
+"""The live twin: a web page with sliders for every body that shows spots and estimated changes while they move."""

@@ -1,4 +1,4 @@
-"""``python -m twin.live``: the instrument as a page in the browser."""
+"""Command ``python -m twin.live``: shows an instrument with adjustable motions as a page in the browser."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ EXTRA = (
     "the live twin needs starlette, uvicorn and websockets, which are not installed; install them with "
     "`bash setup.sh --live`"
 )
-"""Error if the optional packages are missing."""
+"""Error message if the optional packages of the live twin are not installed."""
 
 app = program()
 

@@ -1,4 +1,4 @@
-"""Pictures of one camera in a perturbed state: wavefront, spot, MTF, through focus, knife edge on its line CCD."""
+"""Pictures of a camera in a perturbed state: wavefront, spots, MTF, through focus, knife edge on its line CCD."""
 
 from __future__ import annotations
 
@@ -24,12 +24,12 @@ FOCUS = 150e-6
 STEPS = 49
 """Number of defocus values of the through-focus picture."""
 LINE_POSITION = "centre"
-"""Position of the knife edge on the line CCD."""
+"""Name of the position on the line CCD at which the knife edge is imaged."""
 UM = "\N{MICRO SIGN}m"
 
 
 class CameraPictures:
-    """Pictures of an instrument's cameras beside the nominal ones; unchanging parts are cached.
+    """Drawing of an instrument's cameras in perturbed and nominal state; unchanging data are cached.
 
     Parameters
     ----------
@@ -42,7 +42,7 @@ class CameraPictures:
         self._benches: dict[str, tuple[TargetCamera, TargetsSpec]] = {}
 
     def draw(self, view: str, camera: str, field: float, state: State, frames: int, seed: int) -> str:
-        """Return a picture as SVG.
+        """Return a picture of a camera in a state, beside the nominal one, as SVG.
 
         Parameters
         ----------
@@ -51,7 +51,7 @@ class CameraPictures:
         camera : str
             Name of the camera.
         field : float
-            Field along the line, as a share of the half field; a target is always at the centre of the line.
+            Field along the line, as a fraction of the half field; a target is always at the centre of the line.
         state : State
             Body -> motion.
         frames : int
@@ -121,7 +121,7 @@ class CameraPictures:
         curve.legend(fontsize=7)
 
     def _bench(self, camera: str) -> tuple[TargetCamera, TargetsSpec]:
-        """Return the camera ready to image test targets, and the settings of the targets."""
+        """Return the camera prepared for imaging test targets, and the settings of the targets."""
         if camera not in self._benches:
             experiment = self.experiment
             instrument, resolved = experiment.instrument, _with_targets(experiment.resolved)
@@ -131,7 +131,7 @@ class CameraPictures:
 
 
 def _with_targets(resolved: ResolvedJob) -> ResolvedJob:
-    """Return the job with knife edges among its images, and so with the data sheets of its line CCDs.
+    """Return the job with knife-edge targets added to it, and with the data sheets of its line CCDs.
 
     Raises
     ------

@@ -1,8 +1,8 @@
 """Connected pages and the scheduling of their requests: only each page's latest requested state is computed.
 
-A slider sends faster than states can be computed, and a slow connection receives more slowly than they are computed. So
-there is one slot for a page's next state and one for its next answer, and a later one replaces an earlier one. No queue
-grows without limit.
+A slider sends faster than states can be computed, and a slow connection receives more slowly than they are computed.
+Therefore each page has one slot for its next state and one for its next answer, and a later one replaces an earlier
+one. No queue grows without limit.
 """
 
 from __future__ import annotations
@@ -23,13 +23,16 @@ from twin.live.computer import BeforeKey, Computer, ComputerLost, Kind
 MOST_CLIENTS = 8
 """Largest number of connected pages."""
 RATE, BURST = 400.0, 2000
-"""Messages per second that a page may send, and largest burst: four times the rate of the fastest pointer."""
+"""Messages per second that a page may send on average, and largest number at once (burst).
+
+The rate is four times that of the fastest pointer.
+"""
 BAD_MESSAGES = 20
 """Number of invalid messages after which a page is disconnected."""
 MOST_RECORDED = 20_000
 """Largest number of states in a recording; the oldest are dropped."""
 MOST_QUEUED = 32
-"""Largest number of queued texts for a slow connection, besides states and pictures."""
+"""Largest number of text messages queued for a slow connection, in addition to states and pictures."""
 WATCH_INTERVAL = 0.25
 """Interval at which the computing process is checked, in seconds."""
 STOP_TIMEOUT = 10.0
@@ -37,7 +40,7 @@ STOP_TIMEOUT = 10.0
 SEND_TIMEOUT = 20.0
 """Time that a page may take to receive one answer, in seconds."""
 POLICY_VIOLATION, TRY_AGAIN = 1008, 1013
-"""Codes with which a WebSocket is closed."""
+"""Codes with which the server closes a WebSocket: the page violates a rule, or it may try again later."""
 
 
 RESTARTED_TEXT = "{}; it is being restarted, and the knobs are kept"
@@ -45,7 +48,7 @@ STOPPED_TEXT = (
     "the computing process ({pid}) was stopped by a signal; `kill -CONT {pid}` resumes it, otherwise it is "
     "restarted after {seconds:.0f} s; the knobs are kept"
 )
-"""Messages to the pages about the computing process."""
+"""Message to the pages that the computing process was stopped by a signal."""
 
 
 class Disconnected(Exception):
@@ -64,7 +67,7 @@ class Disconnected(Exception):
 
 @dataclass(frozen=True, eq=False)
 class _Request:
-    """Request of a page.
+    """Request of a page to the computing process.
 
     Attributes
     ----------
@@ -80,7 +83,7 @@ class _Request:
 
 @dataclass(eq=False)
 class Client:
-    """One connected page.
+    """One connected page with its open requests and queued answers.
 
     Attributes
     ----------
@@ -93,13 +96,13 @@ class Client:
     factors : Factors | None
         Values of a study's factors that it requests.
     reveal : BlindState | None
-        State whose hidden motions it wants revealed.
+        State whose hidden motions it requests to be revealed.
     shown : AskedState | None
         Latest state computed for it.
     before : BeforeKey | None
         Noise, frames and seed of the reference images that it has.
     blind : int | None
-        Seed of the hidden motions; None if nothing is hidden.
+        Seed of the hidden motions, which the user is to recognise; None if nothing is hidden.
     recorded : deque[tuple[float, AskedState]] | None
         Recorded states with their seconds since the recording began.
     record_began : float
@@ -128,11 +131,11 @@ class Client:
 
     @property
     def busy(self) -> bool:
-        """True if the client has an open request."""
+        """True if the page has a request that is not served yet."""
         return bool(self.state or self.view or self.factors or self.saves or self.reveal)
 
     def next_request(self) -> _Request:
-        """Remove and return its next request; there has to be one."""
+        """Remove and return the page's next request; the page must have one."""
         if self.saves and not (self.factors or self.state or self.reveal):
             return _Request("save", self.saves.popleft())
         kind = next(kind for kind in ("factors", "state", "reveal", "view") if getattr(self, kind) is not None)
@@ -148,7 +151,7 @@ class Client:
             setattr(self, request.kind, request.asked)
 
     def receive(self, text: str | bytes) -> None:
-        """Handle a message of the page.
+        """Handle a message that the page sent.
 
         Raises
         ------
@@ -198,19 +201,19 @@ class Client:
                     self.record_began = 0.0
 
     def _with_hidden(self, state: messages.AskedState) -> messages.AskedState:
-        """Return a state with the motions hidden from the page."""
+        """Return a state together with the motions that are hidden from the page."""
         return state if self.blind is None else _hiding(state, self.blind)
 
     def state_computed(self, state: messages.AskedState) -> None:
-        """Note that a state was computed, and record it if a recording is running."""
+        """Remember a computed state as the one shown, and record it if a recording is running."""
         self.shown = state
         if self.recorded is not None and self.record_began and not isinstance(state, messages.BlindState):
             self.recorded.append((time.monotonic() - self.record_began, state))
 
     def queue_state(self, message: bytes, before: BeforeKey) -> None:
-        """Queue a state to be sent to the page; a later one replaces it.
+        """Queue the message with a computed state to be sent to the page; a later one replaces it.
 
-        ``before`` names the noise, frames and seed of the reference images that it contains.
+        ``before`` identifies the noise, frames and seed of the reference images that it contains.
         """
         self._answer = message, before
         self._to_send.set()
@@ -258,7 +261,7 @@ class Client:
 
 
 def _hiding(state: messages.AskedState, seed: int) -> messages.BlindState:
-    """Return a state together with the seed of the hidden motions."""
+    """Return a request for a state with the seed of the motions to hide."""
     return messages.BlindState.model_validate({**state.model_dump(), "blind": seed})
 
 
@@ -301,7 +304,7 @@ class LiveApi:
             self.clients.remove(client)
 
     def notify(self) -> None:
-        """Wake the scheduler for a new request."""
+        """Wake the scheduler, because there is a new request."""
         self._wake.set()
 
     async def serve_requests(self) -> None:
@@ -365,7 +368,7 @@ class LiveApi:
             self._announce("runs")
 
     def _announce(self, state: str, problem: str = "") -> None:
-        """Inform all present and later pages about the computing process; each change once."""
+        """Inform all present and later pages about the computing process, once for each change of its state."""
         news = {"type": "computing", "state": state, "problem": problem}
         if news == self.process_trouble or (state == "ended" and self.process_trouble.get("state") == "ended"):
             return
@@ -374,7 +377,7 @@ class LiveApi:
             client.queue_json(news)
 
     def _requeue_lost(self, client: Client, request: _Request, problem: str) -> None:
-        """Put back a request during which the process ended, unless the process ended twice during it."""
+        """Put back a request during which the process ended, unless it did so twice for this request."""
         self._announce("ended", RESTARTED_TEXT.format(problem))
         if request.asked is self._suspect_message:
             client.queue_json(
@@ -396,7 +399,10 @@ class LiveApi:
         self._announce("runs")
 
     def _next(self) -> Client | None:
-        """Return the next page that requests a state, or else anything; a served page moves to the end."""
+        """Return the next page to be served: one that requests a state, or else any with a request.
+
+        The page that is served moves to the end of the order.
+        """
         for wants in (lambda c: c.factors or c.state, lambda c: c.busy):
             for client in self.clients:
                 if wants(client):
@@ -406,7 +412,7 @@ class LiveApi:
         return None
 
     async def _build(self, client: Client, asked: messages.Factors) -> None:
-        """Build the instrument with other values of a study's factors, and inform all pages."""
+        """Have the instrument built with other values of a study's factors, and inform all pages."""
         for one in self.clients:
             one.queue_json({"type": "building"})
         answer = await self._ask("factors", asked.values)
@@ -419,7 +425,7 @@ class LiveApi:
             one.queue_json({"type": "hello", **self.computer.opened.greeting})
 
     async def _answer_request(self, client: Client, request: _Request) -> None:
-        """Compute the answer to a request, and queue it."""
+        """Have the computing process answer a request of a page, and queue the answer."""
         asked = request.asked
         match request.kind:
             case "factors":

@@ -1,7 +1,7 @@
-"""Computing process of the live twin, its answers, and the handle by which the server uses it.
+"""Computing process of the live twin, its answers, and the object by which the server uses it.
 
-One process does all computing, so that one page does not take the cores from its own readings. Under overload the
-server requests only the latest state (`twin.live.clients`).
+One process does all computing, so that the pages do not compete for the processor cores. Under overload the server
+requests only the latest state of each page (`twin.live.clients`).
 """
 
 from __future__ import annotations
@@ -33,18 +33,18 @@ from twin.pictures.scene_file import scene_bytes
 from twin.scripting.instrument_twin import InstrumentTwin
 
 MOST_BUILT = 3
-"""Largest number of a study's instruments that stay built."""
+"""Largest number of instruments of a study, with different factors, that are kept in memory."""
 
 
 class RequestHandler:
-    """Built instrument that answers requests.
+    """Built instrument that answers the requests of pages in the computing process.
 
     Parameters
     ----------
     what
         Name of an instrument or camera in the library, or path of a file or run folder, as for `read_source`.
     backend
-        Backend that traces.
+        Array backend of the ray trace.
     advance
         Callback that receives the name of each part of the preparation.
     run
@@ -66,7 +66,7 @@ class RequestHandler:
     def _open(
         self, factors: Mapping[str, float], advance: Callable[[str], None] = lambda part: None
     ) -> tuple[LiveBench, CameraPictures, Opened]:
-        """Return the instrument for these values of a study's factors, and build it if necessary.
+        """Return the instrument for given values of a study's factors, building it if necessary.
 
         Raises
         ------
@@ -99,7 +99,7 @@ class RequestHandler:
         return getattr(self, f"_{kind}")(question)
 
     def _factors(self, factors: Mapping[str, float]) -> Opened | str:
-        """Switch to an instrument with other values of factors; an error is returned as text."""
+        """Switch to an instrument with other values of a study's factors; an error is returned as text."""
         try:
             self.bench, self.pictures, self.opened = self._open(factors)
         except IMPOSSIBLE as error:
@@ -107,7 +107,7 @@ class RequestHandler:
         return self.opened
 
     def _state(self, question: tuple[AskedState, tuple[bool, int, int] | None]) -> bytes:
-        """Return a state's message with its images, and with the reference images if the page lacks them."""
+        """Return the message with a state and its images, and with the reference images if the page lacks them."""
         asked, known = question
         message, after = self.bench.state(asked)
         images = {} if after is None else {"after": after}
@@ -135,11 +135,11 @@ class RequestHandler:
         return json.dumps({"type": "revealed", **self.bench.hidden(asked)})
 
     def _job(self, asked: AskedState) -> str:
-        """Return the message with a job file of a state."""
+        """Return the message with a job file that describes a state."""
         return self._file("job.yaml", lambda: job_text(self.bench, asked))
 
     def _course(self, kept: Sequence[tuple[float, AskedState]]) -> str:
-        """Return the message with a job file of the recorded states as a series over time."""
+        """Return the message with a job file that contains the recorded states as a time series."""
         return self._file("course.yaml", lambda: course_text(self.bench, kept))
 
     def _file(self, name: str, text: Callable[[], str]) -> str:
@@ -156,7 +156,7 @@ Kind = Literal["state", "view", "hidden", "job", "course", "factors"]
 BeforeKey = tuple[bool, int, int]
 Condition = Literal["starts", "runs", "stopped", "ended"]
 EXIT_TIMEOUT = 3.0
-"""Time that the process is given to end by itself, in seconds."""
+"""Time that the process may take to end by itself before it is killed, in seconds."""
 ATTEMPTS = 3
 """Number of attempts to restart the process if it ends during its start."""
 
@@ -166,20 +166,20 @@ class ComputerLost(Exception):
 
 
 class CannotStart(Exception):
-    """Error that the instrument cannot be built; the message is that of a command."""
+    """Error that the instrument cannot be built; the message is the one that a command would print."""
 
 
 class Computer:
-    """Handle of the computing process for an event loop; it answers one request at a time.
+    """Object by which the server's event loop uses the computing process; it answers one request at a time.
 
     Parameters
     ----------
     what
         Name of an instrument or camera in the library, or path of a file or run folder, as for `read_source`.
     backend
-        Backend that traces.
+        Array backend of the ray trace.
     run
-        Number of a study's run.
+        Number of one of a study's runs, from 0; None for its base.
     """
 
     def __init__(self, what: str, backend: str, run: int | None = None) -> None:
@@ -291,7 +291,7 @@ class Computer:
             return answer
 
     def _exchange(self, kind: Kind, question: Any) -> Any:
-        """Send a request and wait for its answer."""
+        """Send a request to the computing process and wait for its answer."""
         assert self._pipe is not None
         self._asked = True
         try:
@@ -317,7 +317,7 @@ class Computer:
 
     @property
     def ending(self) -> str:
-        """Description of how the process ended."""
+        """Description, as text, of how the computing process ended."""
         code = None if self._process is None else self._process.exitcode
         if code is None:
             return "the computing process ended"
@@ -326,7 +326,7 @@ class Computer:
 
     @property
     def pid(self) -> int | None:
-        """Process id; None before the start."""
+        """Process id of the computing process; None before its start."""
         return None if self._process is None else self._process.pid
 
     @property
@@ -338,7 +338,7 @@ class Computer:
         return "starts" if self._starting else "runs" if alive else "ended"
 
     def kill(self) -> None:
-        """Kill the process; whoever waits for an answer gets ComputerLost."""
+        """Kill the process; callers that wait for an answer get ComputerLost."""
         with self._process_lock:
             if self._process is not None:
                 self._process.kill()
@@ -350,7 +350,7 @@ class Computer:
             self.kill()
 
     def stop(self) -> None:
-        """End the process."""
+        """End the computing process."""
         if self._pipe is not None:
             self._pipe.close()
         if self._process is not None:
@@ -361,7 +361,7 @@ class Computer:
 
 
 def _stopped(pid: int) -> bool:
-    """Return whether a process was stopped by a signal (not by a debugger); False where the system does not tell."""
+    """Return whether a process was stopped by a signal (not by a debugger); False if the system cannot tell."""
     try:
         message = Path(f"/proc/{pid}/stat").read_text("utf-8", "replace")
     except OSError:
@@ -407,7 +407,7 @@ def compute(pipe: Connection, what: str, backend: str, run: int | None) -> None:
 
 
 def _end_with(parent: int) -> None:
-    """End this process when the server was killed, even in the middle of a state."""
+    """End this process when the server (process id ``parent``) has been killed, even during a computation."""
 
     def watch() -> None:
         while os.getppid() == parent:

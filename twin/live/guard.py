@@ -8,8 +8,8 @@ the WebSocket before it is accepted, needs the cookie, a Host header of this ser
 uvicorn's own limits do not suffice: ``limit_concurrency`` counts idle connections, so that anybody who opens enough of
 them locks out all others, and ``timeout_keep_alive`` begins only with the first answer. Therefore a connection is
 **unauthenticated** until it shows the token, which a browser does with its first request. Unauthenticated connections
-have places of their own, few for each address, and never take a place of an authenticated one; if their places are
-full, the oldest is closed. The head of every request, its answer and the idle time after it have timeouts.
+have separate limits, in total and for each address, and never displace an authenticated one; if a limit is reached, the
+oldest is closed. The head of every request, its answer and the idle time after it have timeouts.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ HEADERS: Mapping[str, str] = {
 
 
 class BadToken(ValueError):
-    """Token that is too easy to guess."""
+    """Error that the token set by the user is too easy to guess or has forbidden characters."""
 
 
 def new_token(variable: str) -> str:
@@ -76,7 +76,7 @@ def new_token(variable: str) -> str:
 
 @dataclass(frozen=True)
 class Guard:
-    """Access control: what a request has to have in order to be accepted.
+    """Access control: conditions that a request must meet to be accepted.
 
     Attributes
     ----------
@@ -112,7 +112,7 @@ class Guard:
         return f"{self.cookie_name}={self.token}; HttpOnly; SameSite=Strict; Path=/"
 
     def is_token(self, token: str) -> bool:
-        """Return whether a text is the token, in constant time."""
+        """Return whether a text equals the token; the comparison takes the same time for every text."""
         return secrets.compare_digest(token.encode(), self.token.encode())
 
     def has_token_cookie(self, headers: Mapping[str, str]) -> bool:
@@ -193,13 +193,13 @@ ANSWER_TIMEOUT = 60.0
 KEEP_ALIVE = 30.0
 """Idle time between an answer and the next request, in seconds."""
 MOST_UNAUTHENTICATED, MOST_OF_ONE_ADDRESS = 128, 64
-"""Largest number of unauthenticated connections, in all and of one address."""
+"""Largest numbers of connections that have not been authenticated yet: in all, and from one address."""
 MOST_AUTHENTICATED = 64
 """Largest number of authenticated connections without a WebSocket: eight pages of a browser open six each."""
 ACCEPT_BACKLOG = 16
-"""Number of connections accepted at a time: an eighth of the places for unauthenticated ones.
+"""Number of connections accepted at a time: an eighth of the limit for unauthenticated ones.
 
-The data received on open connections are therefore read several times before a new connection can be the one that is
+Data received on open connections are therefore read several times before a new connection can cause one of them to be
 closed.
 """
 QUEUE = 1024
@@ -229,7 +229,7 @@ class Connections:
         return len(self._unauthenticated) + len(self._authenticated)
 
     def protocol(self) -> type[Connection]:
-        """Return the class that uvicorn instantiates for each connection."""
+        """Return the protocol class that uvicorn instantiates for each new connection, bound to this list."""
         return type("BoundConnection", (Connection,), {"all": self})
 
     def register(self, one: Connection, address: str) -> None:
@@ -242,7 +242,7 @@ class Connections:
             self._close_oldest(count.most_common(1)[0][0])
 
     def authenticate(self, one: Connection) -> None:
-        """Count a connection that showed the token as authenticated, and close the oldest one if there are too many."""
+        """Move a connection that showed the token to the authenticated ones; close the oldest if there are too many."""
         if self._unauthenticated.pop(one, None) is None:
             return
         self._authenticated[one] = None
@@ -314,7 +314,7 @@ class Connection(H11Protocol):
         self.cut()
 
     def handle_websocket_upgrade(self, event: Any) -> None:
-        """Stop counting a connection that becomes a WebSocket, or is refused at once."""
+        """Stop counting a connection that becomes a WebSocket, whether it is then accepted or refused."""
         self._set_deadline(None)
         self.all.forget(self)
         super().handle_websocket_upgrade(event)

@@ -1,8 +1,8 @@
 """Knobs of the live twin: adjustable motions of bodies, factors of a study, and the resulting perturbations.
 
-A knob has the name of its motion in scripts and in the tables of a job's series of states (``course``):
-``base/forward/M2 shift z``. Its value is a number in the knob's unit; it has exactly the effect of a job's file that
-contains this number with this unit, to the last bit.
+A knob has the name of its motion in scripts and in the tables of a job's time series (``course``): ``base/forward/M2
+shift z``. Its value is a number in the knob's unit; it has exactly the effect of a job's file that contains this number
+with this unit, to the last bit.
 """
 
 from __future__ import annotations
@@ -59,12 +59,12 @@ KINDS: Mapping[str, _KnobKind] = {
     "temperature": _KnobKind("temperature", "K", 1.0, 1000.0),
     "gradient": _KnobKind("temperature", "mK/m", 50.0, 1_000_000.0),
 }
-"""Kind of knob (rotate, shift, ...) -> its properties. Limits are those of a job's file."""
+"""Kind of knob (rotate, shift, ...) -> its properties. The limits are those that a job's file may have."""
 
 
 @dataclass(frozen=True)
 class Knob:
-    """One adjustable number.
+    """Adjustable number of the page, the amount of one motion of a body.
 
     Attributes
     ----------
@@ -109,7 +109,7 @@ def knob_name(node: str, kind: str, axis: str) -> str:
 
 
 def knobs_of(nodes: Mapping[str, NodeInfo], job: JobSpec) -> dict[str, Knob]:
-    """Return all knobs of an instrument by name, with the values of a job.
+    """Return name -> knob for all adjustable motions of an instrument, with the values of a job.
 
     Parameters
     ----------
@@ -136,7 +136,7 @@ def knobs_of(nodes: Mapping[str, NodeInfo], job: JobSpec) -> dict[str, Knob]:
 
 
 def _job_quantities(what: Mapping[str, Any], kind: str) -> dict[str, Any]:
-    """Return the quantities of one kind in a body's perturbation, by axis, as the job's file has them."""
+    """Return axis -> quantity (text with unit) of one kind in a body's perturbation, as written in the job's file."""
     value = what.get(KINDS[kind].key)
     if value is None:
         return {}
@@ -152,7 +152,10 @@ def _job_quantities(what: Mapping[str, Any], kind: str) -> dict[str, Any]:
 
 
 def _unit(quantities: Iterable[Any], usual: str) -> str:
-    """Return the common unit of all non-zero quantities, so that numbers stay as written; else the usual one."""
+    """Return the unit that all non-zero quantities have in common, or else the usual unit.
+
+    With the common unit, numbers stay as they were written.
+    """
     parts = [split_quantity(q) for q in quantities]
     units = {part[1] for part in parts if part is not None and part[0] != 0}
     return units.pop() if len(units) == 1 else usual
@@ -161,7 +164,9 @@ def _unit(quantities: Iterable[Any], usual: str) -> str:
 def perturbation(
     values: Mapping[str, float], pivots: Mapping[str, str], knobs: Mapping[str, Knob], first: Mapping[str, Any]
 ) -> dict[str, dict[str, Any]]:
-    """Return ``perturb`` of a job's file for values of knobs, for every body that a knob or the job moves.
+    """Return the section ``perturb`` of a job's file for values of knobs.
+
+    It contains every body that a knob or the job moves.
 
     Parameters
     ----------
@@ -172,7 +177,7 @@ def perturbation(
     knobs : Mapping[str, Knob]
         All knobs of the instrument.
     first : Mapping[str, Any]
-        ``perturb`` of the initial job, whose deformations by tables of nodes are kept.
+        Section ``perturb`` of the initial job, whose deformations by tables of nodes are kept.
 
     Raises
     ------
@@ -216,7 +221,7 @@ def _without_knobs(what: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _set_quantities(what: dict[str, Any], kind: str, numbers: Mapping[str, float], unit: str) -> None:
-    """Set the quantities of one kind in a body's perturbation from numbers by axis, with their unit."""
+    """Write the quantities of one kind into a body's perturbation, from axis -> number and a unit."""
 
     def quantity(axis: str) -> str:
         return f"{numbers.get(axis, 0.0)!r} {unit}"
@@ -235,7 +240,7 @@ def _set_quantities(what: dict[str, Any], kind: str, numbers: Mapping[str, float
 
 @dataclass(frozen=True)
 class FactorKnob:
-    """Numeric factor of a study.
+    """Numeric factor of a study that is adjustable on the page.
 
     Attributes
     ----------
@@ -263,12 +268,15 @@ class FactorKnob:
     knobs: Mapping[str, float]
 
     def scalar(self, value: float) -> Any:
-        """Return a value as a study's file writes it."""
+        """Return a value of the factor in the notation of a study's file."""
         number = int(value) if self.whole and value == int(value) else value
         return with_unit(number, self.unit) if self.unit else number
 
     def starting_at(self, scalar: Any) -> FactorKnob:
-        """Return the factor with the value of a run, which a distribution may have drawn from beyond the range."""
+        """Return the factor with the value of a run as its initial value.
+
+        A random value may lie outside the range of the slider, which is then extended.
+        """
         value = _number(scalar, self.unit, self.value)
         return replace(self, value=value, low=min(self.low, value), high=max(self.high, value))
 
@@ -280,14 +288,14 @@ def factor_knobs(setup: StudySetup) -> tuple[FactorKnob, ...]:
 
 
 def base_with_factors(setup: StudySetup, scalars: Mapping[str, Any]) -> Tree:
-    """Return the study's base with given values of factors, and everything that follows from them.
+    """Return the study's base job with given values of factors, including the values that scale with them.
 
     Parameters
     ----------
     setup : StudySetup
         Study with its base job, factors and responses.
     scalars : Mapping[str, Any]
-        Factor -> value as a study's file writes it; the others leave the base unchanged.
+        Factor -> value in the notation of a study's file; the others leave the base unchanged.
 
     Raises
     ------
@@ -300,13 +308,13 @@ def base_with_factors(setup: StudySetup, scalars: Mapping[str, Any]) -> Tree:
 
 
 def _fixed(factor: FactorSpec, scalar: Any) -> FactorSpec:
-    """Return the factor with a single value instead of its distribution."""
+    """Return a factor of a study with a single value instead of its distribution."""
     keys = {"key": factor.key, "keys": factor.keys, "scales": factor.scales}
     return FactorSpec.model_validate({**{k: v for k, v in keys.items() if v}, "values": (scalar,)})
 
 
 def _factor(name: str, factor: FactorSpec, setup: StudySetup) -> FactorKnob | None:
-    """Return the knob of a factor; None if it is not numeric."""
+    """Return the knob for a factor of a study; None if the factor is not numeric."""
     numbers = factor.numbers()
     if not numbers.numeric or not len(numbers):
         return None
@@ -326,7 +334,7 @@ def _factor(name: str, factor: FactorSpec, setup: StudySetup) -> FactorKnob | No
 
 
 def _number(value: Any, unit: str, otherwise: float) -> float:
-    """Return a quantity as a number in a unit."""
+    """Return a quantity as a number in a unit; ``otherwise`` if it is not such a quantity."""
     if isinstance(value, int | float):
         return float(value)
     part = split_quantity(value)
@@ -338,7 +346,7 @@ def _number(value: Any, unit: str, otherwise: float) -> float:
 
 
 def _knobs(keys: tuple[KeyPath, ...], unit: str) -> dict[str, float]:
-    """Return the knobs of a factor's keys; none if any key is not a knob."""
+    """Return knob -> number of its units per unit of a factor, for the factor's keys; empty if any is no knob."""
     out = {}
     for key in keys:
         knob = _knob(key)

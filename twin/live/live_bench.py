@@ -43,7 +43,7 @@ from twin.sensors.area_detector import coarse_warnings
 from twin.study.runs.base_job import PHYSICS
 
 BLIND = 7
-"""Number of the random stream of the hidden motions; those of the monitor and of targets are different."""
+"""Number of the random stream of the hidden motions, different from those of the monitor and of targets."""
 IMPOSSIBLE = (*PHYSICS, ArithmeticError, ValueError)
 """Exceptions that mean that a state is physically impossible."""
 
@@ -55,14 +55,14 @@ IMAGES: Mapping[str, tuple[list[str], str]] = {
     "MTF at Nyquist along the line": (["mtf_along_line", "centre"], ""),
     "MTF at Nyquist along the track": (["mtf_along_track", "centre"], ""),
 }
-"""Quantities of image quality on the page of a camera without a monitor.
+"""Image quality quantities on the page of a camera without a monitor.
 
-Name -> its path in quality.json, and its unit.
+The mapping is from a quantity's name to its path in quality.json and its unit.
 """
 
 
 class LiveBench:
-    """Instrument whose motions are set by knobs (sliders of the page).
+    """Instrument whose motions are set by knobs (sliders of the page) and whose states are computed for the page.
 
     It caches everything that does not depend on the knobs.
 
@@ -89,7 +89,7 @@ class LiveBench:
 
     @cached_property
     def clearances(self) -> Clearances:
-        """Calculator of the distances between bodies that may collide."""
+        """Object that computes the distances between bodies that may collide."""
         return Clearances.of(self.twin.experiment.instrument)
 
     @cached_property
@@ -112,11 +112,14 @@ class LiveBench:
 
     @property
     def monitored(self) -> bool:
-        """True if the instrument has a monitor; without one the page shows the trace and the cameras' image quality."""
+        """True if the instrument has a monitor.
+
+        Without one the page shows true changes by ray trace and the cameras' image quality.
+        """
         return self.twin.experiment.monitored
 
     def warm(self, advance: Callable[[str], None] = lambda part: None) -> None:
-        """Compute everything that does not depend on the knobs, and compile every kernel.
+        """Compute everything that does not depend on the knobs, and compile every kernel, before the first page.
 
         Parameters
         ----------
@@ -141,7 +144,7 @@ class LiveBench:
         self.state(self.initial_state)
 
     def greeting(self) -> dict[str, Any]:
-        """Return the data that a page needs before its first request."""
+        """Return the data that a page needs before its first request: cameras, knobs and settings."""
         twin, experiment = self.twin, self.twin.experiment
         job = twin.resolved.job
         nodes = {
@@ -221,9 +224,7 @@ class LiveBench:
         return moved
 
     def state(self, asked: AskedState) -> tuple[dict[str, Any], np.ndarray | None]:
-        """Compute spots, readings and true changes for the motions that the knobs set.
-
-        Array dimensions: C area CCDs, H rows, W columns.
+        """Compute spots, estimated and true changes for the motions that the knobs set.
 
         Parameters
         ----------
@@ -233,8 +234,8 @@ class LiveBench:
         Returns
         -------
         tuple[dict[str, Any], ndarray | None]
-            Plain data for the page, and the images after the perturbation, uint16 (C, H, W); None without images. An
-            impossible state has ``problem`` instead of readings.
+            Plain data for the page, and the images after the perturbation, uint16 (C, H, W) for C area CCDs of H rows
+            and W columns; None without images. An impossible state has ``problem`` instead of estimates.
         """
         began = time.perf_counter()
         message: dict[str, Any] = {"type": "state", "n": asked.n, "t": asked.t}
@@ -249,7 +250,10 @@ class LiveBench:
         return message, after
 
     def _traced(self, asked: AskedState) -> dict[str, Any]:
-        """Return the data of a state of an instrument without a monitor: truth, image quality and motions."""
+        """Return the page's data for a state of an instrument without a monitor.
+
+        They are true changes, image quality and motions.
+        """
         experiment, state = self.twin.experiment, self.states(asked)
         placed = experiment.instrument.assembly.place([state])
         quality = self._quality(state)
@@ -273,9 +277,9 @@ class LiveBench:
         }
 
     def before(self, asked: AskedState) -> np.ndarray:
-        """Return the images before the perturbation, uint16 (C, H, W); empty without a monitor.
+        """Return the images before the perturbation, uint16 (C, H, W) for C area CCDs; empty without a monitor.
 
-        Array dimensions: C area CCDs, H rows, W columns.
+        H and W are the numbers of rows and columns.
         """
         if not self.monitored:
             return np.zeros((0, 0, 0), np.uint16)
@@ -292,7 +296,7 @@ class LiveBench:
         return {"problem": "this state is impossible", "causes": lines[:6]}
 
     def states(self, asked: AskedState) -> State:
-        """Return the motion of each body: that of the knobs plus that of the job's series at the selected time.
+        """Return the motion of each body: that of the knobs plus that of the job's time series at the selected time.
 
         Raises
         ------
@@ -310,7 +314,7 @@ class LiveBench:
         return experiment.thermal.state(fields, experiment.motions(job, asked.time))
 
     def _hidden(self, asked: AskedState) -> State:
-        """Return the motions hidden from the page in a guessing game, body -> motion; empty without any."""
+        """Return body -> its motion that is hidden from the page, for the user to guess; empty if nothing is hidden."""
         experiment = self.twin.experiment
         if not isinstance(asked, BlindState) or experiment.stated is None:
             return {}
@@ -328,7 +332,7 @@ class LiveBench:
         return stated.draw(np.random.default_rng(stream(asked.blind, BLIND)), 1)[0]
 
     def hidden(self, asked: BlindState) -> dict[str, Any]:
-        """Return the hidden motions of a guessing game, the most significant first, and the resulting true changes."""
+        """Return the motions hidden for the user to guess, most significant first, and the true changes due to them."""
         state = self._hidden(asked)
         if not state:
             return {}
@@ -350,10 +354,10 @@ class LiveBench:
         }
 
     def seed_of(self, asked: int) -> int:
-        """Return the seed meant by a page.
+        """Return the seed that a page's number stands for.
 
         The job's own seed, such as that of a study's run, may exceed the numbers that a page represents exactly. The
-        page then has the lowest bits of that seed, by which it is recognised.
+        page then uses the lowest bits of that seed, and this method recognises them.
         """
         job_seed = self.twin.resolved.job.render.seed
         return job_seed if asked == job_seed & LARGEST_SEED else asked
@@ -362,9 +366,11 @@ class LiveBench:
         return StateReader(self.twin.experiment, frames, self.seed_of(seed), self.twin.resolved.job.analysis.centroid)
 
     def _shown(self, frames: np.ndarray | None, photons: np.ndarray) -> np.ndarray:
-        """Return the image of a state on the page, uint16 (C, H, W): its first frame, or the rounded expected image.
+        """Return the image of a state for the page, uint16 (C, H, W).
 
-        Array dimensions: C area CCDs, H rows, W columns.
+        It is the state's first frame, or the rounded expected image.
+
+        C is the number of area CCDs, H and W the numbers of rows and columns.
         """
         if frames is not None:
             return frames[:, 0]
@@ -373,7 +379,7 @@ class LiveBench:
         return np.rint(np.clip(expected, 0, experiment.detector.max_dn)).astype(np.uint16)
 
     def _run(self, asked: AskedState, hidden: State) -> tuple[RenderRun, np.ndarray, PlacedBodies]:
-        """Compute a state, and return its run, its images and the placed bodies."""
+        """Compute a state as in the main job, and return its results, its images and the placed bodies."""
         experiment = self.twin.experiment
         # the knobs are a guess of the hidden motions, and are not added to them
         state = hidden or self.states(asked)
@@ -400,7 +406,10 @@ class LiveBench:
         return run, after, reading.light.placed
 
     def _state_data(self, run: RenderRun, asked: AskedState, placed: PlacedBodies) -> dict[str, Any]:
-        """Return the data of a state of an instrument with a monitor."""
+        """Return the page's data for a state of an instrument with a monitor.
+
+        They are estimated and true changes, spots and warnings.
+        """
         experiment = self.twin.experiment
         instrument = experiment.instrument
         message: dict[str, Any] = {"readings": stated(run.recovered_dict())}
@@ -426,7 +435,7 @@ class LiveBench:
         return {"spots": reading.recovery.after[0].tolist(), "image": self._shown(None, reading.light.photons[0])}
 
     def _warnings(self, run: RenderRun, light: np.ndarray) -> list[str]:
-        """Return warnings of coarse sampling, saturation and lost light."""
+        """Return warnings about coarse sampling, saturation and lost light."""
         detector, channels = self.twin.experiment.detector, self.twin.experiment.path.channels
         out = list(coarse_warnings(self.twin.resolved))
         saturated = np.ravel(detector.saturated(run.after).pixels)
@@ -439,12 +448,12 @@ class LiveBench:
 
 
 def _elapsed_ms(began: float) -> float:
-    """Return the time since a moment, in milliseconds."""
+    """Return the time since ``began`` (a reading of the clock), in milliseconds."""
     return 1e3 * (time.perf_counter() - began)
 
 
 def _course_data(course: CourseSpec) -> dict[str, Any]:
-    """Return the times of a job's series of states: in seconds, as texts, and the index of the one shown in full."""
+    """Return the times of a job's time series: in seconds, as texts, and the index of the one shown in full."""
     return {"times": list(course.times), "names": list(map(moment, course.times)), "shown": course.shown}
 
 
@@ -471,11 +480,11 @@ GUESSED = (
     "# Saved while motions were hidden: this job holds the guess of the knobs alone, so that twin.render gives the\n"
     "# spots of the guess and not those that were shown.\n"
 )
-"""Comment at the top of a job that was saved while motions were hidden, which it does not contain."""
+"""Comment at the top of a job file that was saved while motions were hidden, which it does not contain."""
 
 
 def job_text(bench: LiveBench, asked: AskedState) -> str:
-    """Return a self-contained job file of one state; of a job with a series of states, that at the selected time.
+    """Return a self-contained job file of one state; for a job with a time series, that at the selected time.
 
     Parameters
     ----------
@@ -498,7 +507,7 @@ def job_text(bench: LiveBench, asked: AskedState) -> str:
 
 
 def course_text(bench: LiveBench, kept: Sequence[tuple[float, AskedState]]) -> str:
-    """Return a job file with the recorded states as a series over time (``course``), timed to the millisecond.
+    """Return a job file with the recorded states as a time series (``course``), timed to the millisecond.
 
     Parameters
     ----------
@@ -510,7 +519,7 @@ def course_text(bench: LiveBench, kept: Sequence[tuple[float, AskedState]]) -> s
     Raises
     ------
     ValueError
-        There are too few states, or something changed that a job's series of states cannot change.
+        There are too few states, or something changed that a job's time series cannot change.
     """
     steps = _limited_times(kept)
     if len(steps) < FEWEST:
@@ -534,7 +543,7 @@ def course_text(bench: LiveBench, kept: Sequence[tuple[float, AskedState]]) -> s
 
 
 def _limited_times(kept: Sequence[tuple[float, AskedState]]) -> list[tuple[float, AskedState]]:
-    """Return states at ascending times in milliseconds, at most as many as a job's series of states may have.
+    """Return states at ascending times in milliseconds, at most as many as a job's time series may have.
 
     The first and the last state are among them.
     """
@@ -554,12 +563,17 @@ def _limited_times(kept: Sequence[tuple[float, AskedState]]) -> list[tuple[float
 def _split(
     states: Sequence[Mapping[str, float]], knobs: Mapping[str, Knob]
 ) -> tuple[dict[str, float], dict[str, list[float]]]:
-    """Return the values of constant knobs, and those of moving knobs at each time.
+    """Separate knobs that change over the recorded states from constant ones.
+
+    Returns
+    -------
+    tuple of dict
+        Constant knob -> its value, and changing knob -> its values at each time.
 
     Raises
     ------
     ValueError
-        A figure moves.
+        The figure of a surface changes, which a job's time series cannot contain.
     """
     names = dict.fromkeys(name for state in states for name in state)
     moving = {}
@@ -585,7 +599,7 @@ def _split(
 def _courses(
     moving: Mapping[str, Sequence[float]], pivots: Mapping[str, str], knobs: Mapping[str, Knob], count: int
 ) -> dict[str, Any]:
-    """Return ``temperature`` and ``motion`` of a job's series of states (``course``) for moving knobs."""
+    """Return the entries ``temperature`` and ``motion`` of a job's time series (``course``) for changing knobs."""
     out: dict[str, dict[str, dict[str, Any]]] = {}
     for name in moving:
         knob = knobs[name]

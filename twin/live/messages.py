@@ -1,4 +1,4 @@
-"""Messages between page and program.
+"""Messages between the page and the program of the live twin.
 
 The page sends JSON texts, each one of `Message`; none of them names a file. The program answers with JSON texts and,
 for a state's images, with one binary message: four bytes (little endian) with the length of a JSON text, the text,
@@ -18,7 +18,7 @@ from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 LARGEST_MESSAGE = 1 << 16
 """Largest size of a message of the page, in bytes."""
 MOST_KNOBS = 400
-"""Largest number of knobs that are not zero."""
+"""Largest number of knobs in a message; only knobs that are not zero are sent."""
 MOST_FRAMES = 64
 """Largest number of frames of an exposure."""
 LARGEST_SEED = 2**53 - 1
@@ -29,13 +29,13 @@ Number = Annotated[float, Field(allow_inf_nan=False)]
 
 
 class _PageMessage(BaseModel):
-    """Message of a page, without additional keys."""
+    """Base class of the messages that a page sends; unknown keys are errors."""
 
     model_config = ConfigDict(extra="forbid", strict=True, frozen=True)
 
 
 class AskedState(_PageMessage):
-    """Request of a state of the knobs.
+    """Request of the page for a state of the knobs.
 
     Attributes
     ----------
@@ -48,13 +48,13 @@ class AskedState(_PageMessage):
     pivots : dict[str, str]
         Body -> name of its pivot.
     noise : bool
-        Frames with noise, instead of the expected image.
+        True for frames with noise, False for the expected image.
     frames : int
         Number of frames of each exposure.
     seed : int
         Seed of the noise.
     time : int | None
-        Index of a time in the job's series of states (``course``); None for the job's single state.
+        Index of a time in the job's time series (``course``); None for the job's single state.
     """
 
     type: Literal["state"] = "state"
@@ -69,7 +69,7 @@ class AskedState(_PageMessage):
 
 
 class BlindState(AskedState):
-    """Request of a state while motions are hidden. The program makes it; it is never read from a page.
+    """Request for a state while motions are hidden; it is made by the program and never read from a page.
 
     Attributes
     ----------
@@ -81,7 +81,7 @@ class BlindState(AskedState):
 
 
 class AskedView(_PageMessage):
-    """Request of a picture of one camera in the latest state.
+    """Request for a picture of one camera in the latest state.
 
     Attributes
     ----------
@@ -94,7 +94,7 @@ class AskedView(_PageMessage):
     camera : str
         Name of the camera.
     field : float
-        Field along the line, as a share of the half field.
+        Field along the line, as a fraction of the half field.
     """
 
     type: Literal["view"] = "view"
@@ -119,12 +119,14 @@ class Factors(_PageMessage):
 
 
 class Blind(_PageMessage):
-    """Request to hide random motions, or to reveal them.
+    """Request to perturb the instrument by hidden random motions, or to reveal them.
+
+    The user of the page is to guess the motions.
 
     Attributes
     ----------
     on : bool
-        Hide (true) or reveal (false).
+        True to hide, False to reveal.
     """
 
     type: Literal["blind"] = "blind"
@@ -137,7 +139,7 @@ class Record(_PageMessage):
     Attributes
     ----------
     on : bool
-        Begin and drop an earlier recording (true), or end (false).
+        True to begin, which drops an earlier recording; False to end.
     """
 
     type: Literal["record"] = "record"
@@ -145,7 +147,7 @@ class Record(_PageMessage):
 
 
 class Save(_PageMessage):
-    """Request of a job file of a state, or of a job with the recorded states as a series over time (``course``).
+    """Request for a job file of a state, or for a job with the recorded states as a time series (``course``).
 
     Attributes
     ----------
@@ -165,7 +167,7 @@ _MESSAGE: TypeAdapter[Message] = TypeAdapter(Annotated[Message, Field(discrimina
 
 
 class BadMessage(ValueError):
-    """Error that a message of a page is not valid."""
+    """Error that a message from a page is not valid."""
 
 
 def read_message(text: str | bytes) -> Message:
@@ -187,16 +189,14 @@ def read_message(text: str | bytes) -> Message:
 
 
 def packed(data: Mapping[str, Any], images: Mapping[str, np.ndarray]) -> bytes:
-    """Return a binary message of the program.
-
-    Array dimensions: C images, H rows, W columns.
+    """Return a binary message of the program with data and images.
 
     Parameters
     ----------
     data : Mapping[str, Any]
         Plain data.
     images : Mapping[str, ndarray]
-        Name -> (C, H, W) image of type uint16.
+        Name -> (C, H, W) array of type uint16: C images of H rows and W columns.
     """
     whole = {**data, "images": {name: list(image.shape) for name, image in images.items()}}
     text = json.dumps(whole, allow_nan=False, separators=(",", ":")).encode()
@@ -207,7 +207,7 @@ def packed(data: Mapping[str, Any], images: Mapping[str, np.ndarray]) -> bytes:
 
 @dataclass(frozen=True, eq=False)
 class Opened:
-    """Instrument that is ready.
+    """Instrument that is ready for the requests of pages.
 
     Attributes
     ----------

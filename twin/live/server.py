@@ -47,7 +47,7 @@ PARTS = {file.name: file for file in (_TWIN / "live" / "page").iterdir()} | {
     "scroll.css": _TWIN / "framework" / "scroll.css",
     "three.min.js": _TWIN / "pictures" / "viewer" / "three.min.js",
 }
-"""All files that can be requested, by name; no path of a request is used as one of the file system."""
+"""Name -> file of everything that can be requested; the path in a request is never used as a file path."""
 
 
 class LiveServer:
@@ -58,11 +58,11 @@ class LiveServer:
     Parameters
     ----------
     computer
-        Handle of the started computing process.
+        Object that represents the started computing process.
     guard
         Access control.
     stay
-        Do not end when the last page is closed.
+        True to go on when the last page is closed.
     """
 
     def __init__(self, computer: Computer, guard: Guard, stay: bool = False) -> None:
@@ -85,7 +85,7 @@ class LiveServer:
 
     @property
     def started(self) -> bool:
-        """True if the server answers."""
+        """True if the server has started to answer requests."""
         return self._uvicorn is not None and self._uvicorn.started
 
     def run(self, listening: socket.socket) -> None:
@@ -134,7 +134,7 @@ class LiveServer:
 
     @contextlib.asynccontextmanager
     async def _lifespan(self, app: Starlette) -> AsyncIterator[None]:
-        """Run the scheduler and the watch of the process while the application runs."""
+        """Run the scheduler of requests and the monitoring of the computing process while the application runs."""
         tasks = [asyncio.create_task(make()) for make in (self.api.serve_requests, self.api.watch_process)]
         for task in tasks:
             task.add_done_callback(self._ended)
@@ -161,7 +161,7 @@ class LiveServer:
         return _file(name) if name in PARTS else PlainTextResponse("not found\n", 404)
 
     async def _session(self, request: Request) -> Response:
-        """Answer a page that lost its connection and wants to return."""
+        """Answer a page that lost its connection and asks whether it may connect again."""
         return JSONResponse({"instrument": self.api.computer.opened.greeting["instrument"], "states": self.api.states})
 
     async def _scene(self, request: Request) -> Response:
@@ -219,7 +219,7 @@ def _file(name: str) -> Response:
 
 
 class Gate:
-    """Middleware that refuses requests by the guard, and adds the headers to every answer.
+    """Middleware that refuses requests which the guard does not accept, and adds security headers to every answer.
 
     Parameters
     ----------
@@ -259,14 +259,14 @@ class Gate:
         await self.app(scope, receive, send if socket_wanted else _with_headers(send))
 
     def _brings_token(self, scope: Scope) -> bool:
-        """Return whether a request for the page has the token in its address."""
+        """Return whether the address in a request for the page contains the token."""
         if scope["path"] != "/":
             return False
         return self.guard.is_token(Request(scope).query_params.get("token", ""))
 
 
 def _with_headers(send: Send) -> Callable[[Message], Awaitable[None]]:
-    """Return a send function that adds the headers to the start of a response."""
+    """Return a send function that adds the security headers to the start of a response."""
 
     async def wrapped(message: Message) -> None:
         if message["type"] == "http.response.start":

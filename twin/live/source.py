@@ -42,12 +42,12 @@ MOST_NAMED = 3
 
 @dataclass(frozen=True, eq=False)
 class Source:
-    """Opened source.
+    """Opened source: the job to be shown on the page, and where it comes from.
 
     Attributes
     ----------
     resolved : ResolvedJob
-        Resolved job with everything that it refers to.
+        Job with the contents of all files that it refers to.
     name : str
         Name of the file or run folder, with the number of a study's run; empty for an instrument of the library.
     about : str
@@ -74,7 +74,7 @@ class Source:
     has_own_seed: bool = False
 
     def with_factors(self, values: Mapping[str, float]) -> ResolvedJob:
-        """Return the job with other values of factors, as a run of the study has it, including dependent values.
+        """Return the job with other values of a study's factors, including the values that scale with them.
 
         Parameters
         ----------
@@ -98,7 +98,7 @@ class Source:
 
 
 def read_source(what: str, run: int | None = None) -> Source:
-    """Read a source of the live twin.
+    """Read a source that the live twin can open.
 
     Parameters
     ----------
@@ -138,7 +138,7 @@ def _of_folder(folder: Path, run: int | None) -> Source:
 
 
 def _no_config(folder: Path, manifest: Manifest | None) -> Issue:
-    """Return the error about a folder without a config.yaml."""
+    """Return the error that a run folder has no config.yaml."""
     if manifest is not None:
         return _nothing_to_show(folder, f"a run folder of {manifest.program}", folder)
     try:
@@ -183,20 +183,20 @@ def _of_file(file: Path, run: int | None, manifest: Manifest | None = None) -> S
 
 
 def _require_no_run(what: str, run: int | None) -> None:
-    """Raise InputError if a run is chosen of a source that is not a study."""
+    """Raise InputError if the number of a run is given for a source that is not a study."""
     if run is not None:
         raise InputError(Issue("--run chooses a run of a study, but this is not a study", what, found=f"--run {run}"))
 
 
 def _run_of(kind: FileKind | None, manifest: Manifest) -> str:
-    """Return the kind of a run folder in words."""
+    """Return a description of what kind of run folder it is, as text."""
     if kind is not None and kind.command.startswith(manifest.program):
         return f"the run folder of {kind.what} ({kind.command})"
     return f"a run folder of {manifest.program}"
 
 
 def _nothing_to_show(place: Path, what: str, folder: Path, data: Any = None) -> Issue:
-    """Return why a run folder cannot be opened, with remedies."""
+    """Return the error that a run folder cannot be opened, with the reason and what to open instead."""
     remedies = []
     if (folder / REPORT).is_file():
         remedies.append(f"its results are in {folder / REPORT}")
@@ -221,7 +221,7 @@ def _is_instrument(file: Path) -> bool:
 
 
 def _of_measurement(file: Path) -> Source:
-    """Return the unperturbed instrument with which frames were measured.
+    """Return the unperturbed instrument with which the frames of a measurement were taken, as a source.
 
     The perturbation is not known; it is what the measurement was to find.
     """
@@ -237,7 +237,7 @@ def _of_measurement(file: Path) -> Source:
 
 
 def _of_orbit(file: Path) -> Source:
-    """Return a monitored orbit as a job with a series of states, which includes its stepwise motions."""
+    """Return a monitored orbit as a job with a time series of states, which includes its stepwise motions."""
     setup = MonitorSetup.read(file)
     if setup.test.course is None:
         problem = "the motions of this orbit are random, so that it has no course to show"
@@ -273,7 +273,7 @@ def _with_motions(setup: MonitorSetup) -> ResolvedJob:
 
 
 def _of_study(file: Path, run: int | None) -> Source:
-    """Return the base of a study, or one of its runs."""
+    """Return the base job of a study, or one of its runs, as a source."""
     setup = resolve_study(file)
     if setup.study.base.command != "render":
         found, allowed = setup.study.base.command, "a study of base: {command: render}"

@@ -1,4 +1,4 @@
-"""Report sections on elementary motions: spot shifts, estimates by all estimators, factors of printed formulas."""
+"""Report sections on elementary motions: spot shifts, estimates by all estimators, factors of the papers' formulas."""
 
 from __future__ import annotations
 
@@ -31,18 +31,19 @@ from twin.main_job.result_sections import IN_PAGE, figure
 from twin.monitor.crosstalk import PRINTED, CameraCrosstalk
 
 WRONG = 0.1
-"""Relative error of an estimate above which it is marked as wrong, if the error also exceeds the limit by
-``UNOBSERVED``.
-"""
+"""Relative error above which an estimate is marked as wrong, if the error also exceeds that of ``UNOBSERVED``."""
 UNOBSERVED = 0.01
-"""Smallest error that is marked, relative to the noise sigma of the run, per unit of motion.
+"""Smallest error of an estimate, per unit of motion, that is marked, in units of the noise sigma of the run.
 
 Below it, even a hundred units of the motion would cause an error no larger than the noise.
 """
 
 
 def motion_section(run: RenderRun, drawn: Mapping[str, str]) -> Section:
-    """Return the section with the spot shifts of each motion and three ways to change the principal distance."""
+    """Return the section with the spot shifts due to each motion, and three ways to change the principal distance.
+
+    ``drawn`` holds the figures of the section by name.
+    """
     caption = (
         "Shift of each spot on its area CCD in µm per unit of each motion (1 µm, 1 arcsec, 1 ppm, or 1 nm rms of a "
         "figure term), of one body alone, to first order; x is along the flight direction, y along the line. Colours "
@@ -140,7 +141,10 @@ def _crosstalk(run: RenderRun, camera: int) -> Table:
 
 
 def _columns(run: RenderRun, table: CameraCrosstalk, parameter: int) -> list[tuple[str, str]]:
-    """Return (heading, estimator) of one parameter; the two printed sets share a column where their formulas agree."""
+    """Return (heading, estimator) of the table columns for one parameter.
+
+    The formulas of the two papers share a column where they agree.
+    """
     single, joint = (table.readings[e][parameter] for e in ("paper_single", "paper_joint"))
     same = np.allclose(single, joint, rtol=1e-9, atol=0.0)
     columns = []
@@ -163,12 +167,15 @@ def _short(label: str) -> str:
 
 
 def is_wrong(reading: float, true: float, floor: float = SAME) -> bool:
-    """Return True if an estimate differs from the true value by more than ``WRONG`` of it and more than ``floor``."""
+    """Return True if an estimate's error exceeds both ``WRONG`` times the true value and ``floor``."""
     return abs(reading - true) > max(WRONG * abs(true), floor)
 
 
 def formula_section(run: RenderRun) -> Section:
-    """Return the section with the factors of the published formulas, two columns per camera, and their explanation."""
+    """Return the section with the scale factors of the papers' formulas and their explanation.
+
+    Its table has two columns for each camera.
+    """
     about = (
         "Each printed formula is evaluated with the traced spot shifts of the motion for which it was derived. A "
         "factor of 1 means that the formula is correct."
@@ -218,7 +225,7 @@ def formula_section(run: RenderRun) -> Section:
 
 
 def _factor_text(run: RenderRun, name: str) -> str:
-    """Return a sentence with the numbers that explain a camera's factors."""
+    """Return a sentence with the numbers that explain the scale factors of the formulas for one camera."""
     geometry, factors = run.experiment.geometry(name), run.crosstalk[name].factors
     f, f_x = geometry.principal_distance_m, geometry.principal_distance_across_m or geometry.principal_distance_m
     by_model = {(factor.estimator, factor.parameter): float(factor.by_model) for factor in factors}

@@ -74,7 +74,10 @@ def _colours(instrument: Instrument) -> dict[str, str]:
 
 
 def _seen(instrument: Instrument, camera: str) -> list[Channel]:
-    """Return the channels that the side view shows: those at +Y, which cover those at -Y, or all if none is at +Y."""
+    """Return the channels of a camera that the side view shows.
+
+    They are those at +Y, which cover those at -Y, or all if none is at +Y.
+    """
     channels = [c for c in instrument.channels if c.camera == camera]
     return [c for c in channels if c.ccd[1] > 0.0] or channels
 
@@ -152,7 +155,7 @@ def _prisms(axes: Axes, instrument: Instrument, paths: LightPaths) -> None:
 
 
 def _outline(solid: Solid, paths: LightPaths) -> np.ndarray:
-    """Return the outline of a convex body in the side view: its corners in order, (n, 2) array of x and z, metres."""
+    """Return the outline of a convex body in the side view: its n corners in order, (n, 2) array of x and z, metres."""
     corners = paths.placed.pose(solid.path).apply(solid_mesh(solid, paths.placed).vertices)[:, [0, 2]]
     return np.asarray(corners[ConvexHull(corners).vertices])
 
@@ -170,7 +173,10 @@ def _focal_plane(axes: Axes, paths: LightPaths, camera: str) -> None:
 
 
 def _widest(ends: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return x and z, in metres, of the ends of the one of a disk's two diameters that is longer in the side view."""
+    """Return the ends (x, z), metres, of that diameter of a disk which looks longer in the side view.
+
+    ``ends`` holds the ends of two perpendicular diameters.
+    """
     pairs = ends.reshape(2, 2, 3)[..., [0, 2]]
     best = int(np.argmax(np.linalg.norm(pairs[:, 1] - pairs[:, 0], axis=-1)))
     return pairs[best, :, 0], pairs[best, :, 1]
@@ -252,7 +258,7 @@ def footprints_svg(instrument: Instrument, paths: LightPaths) -> str:
 
 
 def _style(colour: str, filled: bool) -> dict[str, Any]:
-    """Return the line style of a footprint: filled at +Y, outlined at -Y, since the two footprints may coincide."""
+    """Return the line style of a beam footprint: filled for channels at +Y, outlined at -Y, since two may coincide."""
     return {"fc": colour, "ec": colour, "alpha": 0.5} if filled else {"fill": False, "ec": colour, "lw": 1.4}
 
 

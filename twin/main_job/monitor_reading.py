@@ -73,7 +73,7 @@ class MonitorReading:
 
     @property
     def estimators(self) -> dict[str, Estimator]:
-        """Estimators in the results, by name: all whose requirements (a prior, for instance) are met."""
+        """Name -> estimator in the results, for all whose requirements (a prior, for instance) are met."""
         return applicable(self.cameras, self.disturbances)
 
     @property
@@ -83,20 +83,23 @@ class MonitorReading:
 
     @cached_property
     def table(self) -> ReadingTable:
-        """Table of the changes estimated by all estimators, beside the true changes where these are known."""
+        """Table of the changes estimated by all estimators, with the true changes where these are known."""
         return reading_table(self.recovery, self.cameras, self.truth, self.ground, self.disturbances).at(0)
 
     @cached_property
     def gains(self) -> dict[str, np.ndarray]:
-        """Estimator -> gain matrix, (4 x cameras, 2 x spots): camera parameters (rad or m) per pixel of spot shift."""
+        """Estimator -> its linear map from spot shifts (px) to camera parameters (rad or m).
+
+        Each is a (4 x cameras, 2 x spots) array.
+        """
         return estimator_gains(self.cameras, self.disturbances, self.recovery.shift_covariance[0])
 
     @cached_property
     def doubts(self) -> tuple[str, ...]:
-        """Reasons why sigma does not hold for this measurement, as sentences without full stops.
+        """Reasons why sigma is not valid for this measurement, as sentences without full stops.
 
         They are spots whose shape differs from their calibration, estimates that are not linear in the motions and
-        cannot be relinearised, and spot shifts that contradict the prior.
+        cannot be linearised again, and spot shifts that contradict the prior.
         """
         texts = list(self.earlier_doubts)
         evidence = self.recovery.evidence
@@ -114,12 +117,12 @@ class MonitorReading:
 
     @property
     def contradiction(self) -> tuple[str, ...]:
-        """Sentence that the shifts contradict the prior; empty where they agree with it."""
+        """Sentence that the spot shifts contradict the prior; empty if they agree with it."""
         return contradicted(self.disturbances, self.consistency)
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """Notes on estimates that were relinearised about the estimated state, as sentences without full stops."""
+        """Notes on estimates that were linearised again about the estimated state, as sentences without full stops."""
         return tuple(
             f"the motions read by the {self.estimators[name].title} are too large for a linear estimate "
             f"({self._error_text(name)} against the retraced state): its readings are Gauss-Newton iterates"
@@ -129,14 +132,14 @@ class MonitorReading:
 
     @cached_property
     def unobserved(self) -> tuple[str, ...]:
-        """Warnings of bodies whose motions hardly move the spots but contribute to sigma, without full stops."""
+        """Warnings about bodies whose motions hardly move the spots but contribute to sigma, without full stops."""
         prior, noise = self.disturbances, self.recovery.shift_covariance[0]
         if prior is None or not np.any(noise):
             return ()
         return unobserved_texts(prior, noise, self._quantities, self.gains[self.judged])
 
     def _error_text(self, name: str) -> str:
-        """Return the quantity whose linear estimate differs most from a ray trace of the estimated state, as text.
+        """Return the parameter whose linear estimate differs most from a ray trace of the estimated state, as text.
 
         The text also gives the size of the difference.
         """
@@ -156,9 +159,10 @@ class MonitorReading:
 
     @cached_property
     def from_statement(self) -> dict[str, dict[str, float | None]]:
-        """Group -> key -> share of the posterior's variance due to the prior alone, which remains without image noise.
+        """Group -> key -> fraction of the posterior variance due to the prior alone, which remains without image noise.
 
-        The share is None for a quantity that no motion of the prior changes. Empty without a prior and without noise.
+        The fraction is None for a quantity that no motion of the prior changes. The mapping is empty if there is no
+        prior or if the images have no noise.
         """
         prior, noise = self.disturbances, self.recovery.shift_covariance[0]
         if prior is None or not np.any(noise):
@@ -177,8 +181,8 @@ class MonitorReading:
     def consistency(self) -> Consistency | None:
         """Chi-square test of the shifts against the prior on disturbances.
 
-        None without a prior, and where shifts have no noise: a body that the prior holds fixed would then contradict it
-        by rounding.
+        It is None without a prior, and where shifts have no noise: rounding would then contradict a prior that holds a
+        body fixed.
         """
         if self.disturbances is None or not np.any(self.recovery.shift_covariance):
             return None
@@ -187,7 +191,7 @@ class MonitorReading:
         return consistency(recovery.shift[0], recovery.shift_covariance[0], self.disturbances, candidates, rate)
 
     def any_motions(self, prior: Disturbances) -> dict[str, np.ndarray]:
-        """Return the response of all spots to the motions of each body, including bodies that the prior holds fixed.
+        """Return the spot shifts due to the motions of each body, including bodies that the prior holds fixed.
 
         Parameters
         ----------
@@ -197,7 +201,8 @@ class MonitorReading:
         Returns
         -------
         dict of str to (2 C, M) ndarray
-            Body -> spot shifts of C channels, in pixels per table unit of each of the body's M motions.
+            Body -> shifts of C spots (row and column of each), in pixels per table unit (arcsec, um, ppm) of each of
+            the body's M motions.
         """
         columns: dict[tuple[str, str, int], np.ndarray] = {}
         for name, table in self.crosstalk.items():
@@ -210,14 +215,15 @@ class MonitorReading:
         return {b: np.stack([c for (body, _, _), c in columns.items() if body == b], axis=1) for b in bodies}
 
     def worst_of(self, shifts: np.ndarray, covariance: np.ndarray) -> tuple[int, Consistency] | None:
-        """Return the state of a series whose spot shifts agree least with the prior, and its chi-square test.
+        """Return the time of a series at which the spot shifts agree least with the prior, and its chi-square test.
 
-        The limit is that of the largest value of all times, at the same false-alarm rate. None without a prior.
+        The limit of the test is that of the largest value of all times, at the same false-alarm rate. The result is
+        None without a prior.
 
         Parameters
         ----------
         shifts : (T, 2 C) ndarray
-            Spot shifts of C channels at T times, in pixels.
+            Shifts of C spots (row and column of each) at T times, in pixels.
         covariance : (T, 2 C, 2 C) ndarray
             Covariance of the shifts at each time, in px^2.
         """
@@ -247,7 +253,7 @@ class MonitorReading:
                 yield SelfCheck(f"linear readings of {name} against the retraced state", size, None, "sigma", meaning)
 
     def recovered_dict(self) -> dict[str, Any]:
-        """Return the contents of recovered.json."""
+        """Return the contents of recovered.json: estimated changes, sigmas, spots and tests."""
         groups = self.table.groups()
         spots: dict[str, Any] = {}
         r = self.recovery
@@ -284,7 +290,7 @@ class MonitorReading:
         }
 
     def _stated(self, test: Consistency | None) -> dict[str, Any]:
-        """Return the prior's name and the test of the shifts against it; numbers are None without prior or noise."""
+        """Return the prior's name and the test of the shifts against it, as plain data; None without prior or noise."""
         name = None if self.disturbances is None else self.disturbances.name
         numbers = {key: None if test is None else number(test) for key, number in _TEST_KEYS.items()}
         suspects = [
@@ -340,7 +346,7 @@ def _suspect_text(test: Consistency, prior_bodies: Sequence[str]) -> str:
 
 
 def _fits(what: str, fits: FitStates) -> Iterator[SelfCheck]:
-    """Yield the check of the worst fit among some spots: its chi-square over its limit."""
+    """Yield the check of the worst fit among some spots: its chi-square divided by the limit."""
     ratio = np.fmax(fits.whole / fits.whole_limit, fits.core / fits.core_limit)
     if np.any(np.isfinite(ratio) & (ratio > 0.0)):
         meaning = (
@@ -366,7 +372,7 @@ def prior_check(name: str, test: Consistency) -> SelfCheck:
 
 
 def worst_checks(readings: Iterable[MonitorReading]) -> tuple[SelfCheck, ...]:
-    """Return, for each name of a check, the one with the worst result among several measurements.
+    """Return for each kind of check, by its name, the one with the worst result among several measurements.
 
     Parameters
     ----------
@@ -381,9 +387,12 @@ def worst_checks(readings: Iterable[MonitorReading]) -> tuple[SelfCheck, ...]:
 
 
 SHARE_DECIMALS, OFF_DECIMALS = 3, 1
-"""Decimals of shares, and of linearity errors in sigmas: rounding errors seldom change numbers rounded so."""
+"""Decimals to which fractions of variances, and linearity errors in sigmas, are rounded in results.
+
+Rounding errors of the computation then rarely change a number.
+"""
 READING_DECIMALS = 6
-"""Decimals of an estimated change in files, counted in units of its sigma."""
+"""Number of decimals to which files give an estimated change divided by its sigma."""
 _TEST_KEYS: Mapping[str, Callable[[Consistency], Any]] = {
     "chi_square": lambda test: _to_digits(test.chi_square),
     "chi_square_sigma_noise": lambda test: test.sigma_noise,
@@ -396,7 +405,7 @@ _TEST_KEYS: Mapping[str, Callable[[Consistency], Any]] = {
 }
 """Key in files -> function that takes its number from the chi-square test against the prior."""
 _SIGMA_DIGITS = 8
-"""Significant digits of a sigma and of a chi-square in files."""
+"""Number of significant digits of a sigma and of a chi-square in files."""
 _SIGMAS = ("_sigma", "_sigma_noise", "_rms_m")
 """Endings of the keys in files whose values are standard deviations."""
 
@@ -406,15 +415,15 @@ def _to_digits(value: float) -> float:
 
 
 def stated(readings: Mapping[str, Any]) -> dict[str, Any]:
-    """Round readings for files: each to a millionth of its sigma, the sigmas to eight digits.
+    """Round estimated changes for files: each to a millionth of its sigma, the sigmas to eight digits.
 
     Further digits carry no information and differ between processors, with the order in which linear algebra sums.
 
     Parameters
     ----------
     readings : Mapping[str, Any]
-        Nested readings; the sigma of ``x`` is ``x_sigma_noise`` or ``x_sigma`` beside it, the first that is there.
-        Other numbers are not rounded.
+        Nested estimates; the sigma of ``x`` is ``x_sigma_noise`` or ``x_sigma`` beside it, the first that exists. Other
+        numbers are not rounded.
     """
     out: dict[str, Any] = {}
     for key, value in readings.items():
@@ -447,7 +456,7 @@ _FIT = {
     "core_chi_square_sigma_noise": "core_sigma",
     "sigma_widened": "widening",
 }
-"""Key of a spot in files -> attribute of its fit."""
+"""Key of a spot's goodness of fit in files -> attribute of its fit."""
 
 
 def _spot(position: np.ndarray, sigma: np.ndarray) -> dict[str, float]:

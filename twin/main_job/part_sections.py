@@ -1,4 +1,4 @@
-"""Report sections on image quality, targets, stray light, and deformed or heated bodies, where a job asks for them."""
+"""Report sections on image quality, targets, stray light, and deformed or heated bodies, if a job requests them."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ FREE = "obstruction by bodies is ignored: `obstruction: ignore`"
 
 
 def quality_section(run: JobRun, drawn: Mapping[str, str]) -> Section | None:
-    """Return the section on wavefront errors, focus and MTF of the line CCDs; None if they were not asked for."""
+    """Return the section on wavefront errors, focus and MTF of the line CCDs; None if not requested."""
     quality = run.quality
     if quality is None:
         return None
@@ -123,11 +123,11 @@ def _every_field(quality: ImageQuality) -> Table:
 METHODS = {"edge": "ISO 12233 slanted edge", "bars": "fundamental of tilted bars"}
 TITLES = {"edge": "knife edge", "bars": "bars"}
 _DECIMALS = 4
-"""Decimals of an MTF."""
+"""Number of decimals of an MTF in the tables."""
 
 
 def target_section(run: JobRun, drawn: Mapping[str, str]) -> Section | None:
-    """Return the section with images of targets and the MTF measured in them; None if no targets were asked for."""
+    """Return the section with images of targets and the MTF measured in them; None if not requested."""
     targets = run.targets
     if targets is None:
         return None
@@ -229,7 +229,7 @@ def _mtf_rows(name: str, camera: CameraTargets) -> list[list[Cell]]:
 
 
 def _mtf_cells(key: str, reading: EdgeReading | BarReading) -> tuple[Marked, Marked]:
-    """Return the cells of a measured MTF at Nyquist and of its true value."""
+    """Return the table cells of a measured MTF at Nyquist and of its true value."""
     true = Marked(fixed(reading.true_nyquist, _DECIMALS), "", "truth", f"{key}.true")
     measured = reading.nyquist
     if measured is None:
@@ -240,11 +240,14 @@ def _mtf_cells(key: str, reading: EdgeReading | BarReading) -> tuple[Marked, Mar
 
 
 _STRONGEST = 4
-"""Number of path families listed for each source."""
+"""Number of stray-light path families listed for each source, the strongest first."""
 
 
 def stray_section(run: RenderRun) -> Section | None:
-    """Return the section on stray light in the perturbed state, amounts and path families; None if not asked for."""
+    """Return the section on stray light in the perturbed state, with its path families; None if not requested.
+
+    A path family contains all ghost and scatter paths that meet the same surfaces in the same order.
+    """
     if run.stray is None:
         return None
     after = run.stray.after
@@ -335,7 +338,10 @@ _SHOWN_ANGLES = np.arange(0.0, 90.0, 10.0)
 
 
 def finish_section(run: RenderRun) -> Section | None:
-    """Return the section on measured scatter and coatings at the monitor's wavelength; None if there are none."""
+    """Return the section on measured scatter and coatings of surfaces; None if there are none.
+
+    The values shown are those at the monitor's wavelength.
+    """
     measured = None if run.stray is None else run.stray.measured
     if measured is None or not (measured.scatter or measured.coatings):
         return None
@@ -373,17 +379,17 @@ def finish_section(run: RenderRun) -> Section | None:
 
 
 NAMED = 1e-10
-"""Smallest amplitude of a Zernike term that the report's table shows, in metres RMS."""
+"""Smallest amplitude of a Zernike term of a deformation that the report's table shows, in metres RMS."""
 
 
 def _flat(numbers: Mapping[str, Any], *keys: str) -> list[Cell]:
-    """Return the numbers stored under some keys as table cells; a vector gives one cell for each axis."""
+    """Return the numbers that results hold under some keys as table cells; a vector gives one cell for each axis."""
     values = [numbers[key] for key in keys]
     return [number for value in values for number in (value if isinstance(value, list) else [value])]
 
 
 def deformation_section(run: JobRun) -> Section | None:
-    """Return the section with numbers, Zernike terms and maps of all deformed bodies; None if there are none."""
+    """Return the section with size, Zernike terms and maps of the deformation of bodies; None if there are none."""
     if not run.deformed:
         return None
     from twin.main_job.target_plots import deformation_svg  # what draws takes long to import

@@ -30,7 +30,7 @@ from twin.targets.target_measurement import TargetRun
 
 _DASH = "\N{EM DASH}"
 NUMBER = 7
-"""Width of most numbers in the terminal's table, in characters."""
+"""Width of most number columns in the terminal's table, in characters."""
 _WIDE = 90
 """Smallest terminal width, in characters, at which the table also shows the part of sigma due to noise."""
 
@@ -44,7 +44,7 @@ def run_render(resolved: ResolvedJob, session: Session, frames: int | None, seed
     Parameters
     ----------
     resolved : ResolvedJob
-        The job with all that it refers to.
+        Job with the contents of all files that it refers to.
     session : Session
         Session of the running command.
     frames : int or None
@@ -84,7 +84,7 @@ def _numbers(run: JobRun) -> dict[str, Any]:
 
 
 def _print_result(run: JobRun, console: Console) -> None:
-    """Print the verdict, the result table, remarks and warnings."""
+    """Print the verdict, the table of results, notes and warnings of a run."""
     judgement = judge(run)
     print_verdict(console, judgement.verdict)
     remarks = list(judgement.more)
@@ -164,7 +164,7 @@ def _changes(run: JobRun) -> Table:
 
 
 def _table(run: RenderRun, wide: bool) -> Table:
-    """Return the table of the changes by every estimator beside the truth, with sigma and error.
+    """Return the table of the changes by every estimator beside the true changes, with sigma and error.
 
     Sigma and error are those of the estimator that the verdict uses.
     """

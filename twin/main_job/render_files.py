@@ -1,4 +1,4 @@
-"""Files of a run with its numbers and images, and the tables of nodes and surface finishes that its job names.
+"""Result files of a run, and copies of the tables of nodes and of surface scatter and coatings that its job names.
 
 The run folder keeps a copy of each such table, so that its config.yaml repeats the run without the originals.
 """
@@ -37,7 +37,7 @@ def irradiance_file(run: RenderRun) -> bytes:
 
 
 def write_results(run: JobRun, folder: RunFolder) -> None:
-    """Write everything that a run computed except irradiance.nc.
+    """Write all results of a run except irradiance.nc into its folder.
 
     Parameters
     ----------
@@ -86,12 +86,12 @@ def _write_monitor(run: RenderRun, folder: RunFolder) -> None:
 
 
 def _write_numbers(folder: RunFolder, kind: str, data: Mapping[str, Any]) -> None:
-    """Write ``KIND.json`` with its schema and reference frames."""
+    """Write the JSON file of a kind of results (``KIND.json``), with its schema and reference frames."""
     folder.write_json(f"{kind}.json", described(kind, data))
 
 
 def _spot_facts(run: RenderRun, channel: Channel, note: str) -> FrameFacts:
-    """Return the metadata of frames of a monitor's area CCD."""
+    """Return the metadata for the file of a monitor CCD's frames."""
     camera = f"{channel.camera}, {channel.name} area CCD"
     return FrameFacts(camera, run.experiment.path.pitch, run.experiment.exposure, note=note)
 
@@ -110,7 +110,7 @@ def _write_series(run: RenderRun, series: TimeSeries, folder: RunFolder) -> None
 
 
 def _write_targets(targets: TargetRun, folder: RunFolder) -> None:
-    """Write MTF and frames of targets; previews of a pinhole are stretched to show its faint rings, others are not."""
+    """Write MTF and frames of the targets; previews of pinhole images are stretched to show their faint rings."""
     _write_numbers(folder, "mtf", targets.to_dict())
     for stem, name, frames, facts in targets.images():
         for file, content in frame_files(stem, frames, facts, SPOT_STRETCH if name == "pinhole" else None):
@@ -265,7 +265,7 @@ HEATED_BODY: Record[HeatedBody] = Record(
 
 
 def table_numbers(run: JobRun) -> dict[str, dict[str, Any]]:
-    """Return the contents of deformation.json and temperature.json, by kind; empty for a job without node tables."""
+    """Return the contents of deformation.json and temperature.json; empty for a job without node tables."""
     names = table_names(run.resolved.job)
     numbers_by_kind = {
         "deformation": {path: DEFORMATION(face) for path, face in run.deformed.items()},

@@ -70,7 +70,7 @@ def write_run(run: JobRun, session: Session, picture: bool = False, beside: Seco
     Returns
     -------
     str
-        What could not be drawn and why; empty if all was drawn.
+        Which drawings failed and why; empty if none did.
     """
     if beside is None:
         with SecondProcess(load_drawing) as helper:
@@ -137,7 +137,7 @@ def render_report(
     pictures: Sequence[Path] = (),
     drawn: Mapping[str, Any] | None = None,
 ) -> str:
-    """Return the HTML text of the report.
+    """Return the report of a run as HTML text.
 
     Parameters
     ----------
@@ -233,7 +233,7 @@ def _light(drawn: Mapping[str, str], monitored: bool) -> Section:
 
 
 def _repeat_command(run: JobRun, backend: str, pictures: bool) -> tuple[str, ...]:
-    """Return the words of the command that repeats a run from its folder."""
+    """Return the program name and arguments of the command that repeats a run from its folder."""
     options = ("--seed", str(run.seed), "--frames", str(run.frames), "--backend", backend)
     return (PROGRAM, "config.yaml", *options, *(("--picture",) if pictures else ()))
 
@@ -251,18 +251,26 @@ if TYPE_CHECKING:
     from twin.uncertainty.monitor_limits import MonitorLimits
 
 LIMITS = "limits"
-"""Name of the figure that shows what limits the accuracy of the estimated changes."""
+"""Name of the figure on what limits the accuracy of the estimated changes."""
 SUMMARY, SCENE, IRRADIANCE = "summary", "scene", "irradiance"
-"""Drawings that are files of bytes, not figures of the report: summary.png, scene.glb, irradiance.nc."""
+"""Names of the drawings that are files of their own, not figures of the report.
+
+The files are summary.png, scene.glb and irradiance.nc.
+"""
 APART = (SUMMARY, SCENE, IRRADIANCE)
 LOADED = (SCENE, IRRADIANCE)
-"""Drawings that need libraries which nothing else in a run needs, trimesh and h5netcdf: drawn after `load_drawing`."""
+"""Drawings that need the libraries trimesh and h5netcdf, which nothing else in a run uses.
+
+They are drawn after `load_drawing` has imported the libraries of all other drawings.
+"""
 FILES = {IRRADIANCE: "irradiance.nc", SCENE: "scene.glb", SUMMARY: "summary.png"}
 """Drawing -> file that it is written to."""
 
 
 def begin_drawing(beside: SecondProcess, instrument: Instrument, backend: Backend, state: State) -> None:
     """Start drawing in the second process what does not depend on the measurement, unless it has started already.
+
+    It draws the instrument and its light in the state that is shown.
 
     Parameters
     ----------
@@ -295,7 +303,7 @@ def instrument_drawings(instrument: Instrument, backend: Backend, state: State) 
 
 
 def drawings(run: JobRun) -> dict[str, Callable[[], Any]]:
-    """Return name -> function that draws a results figure of a run; what the figures need is computed now."""
+    """Return name -> function that draws a figure of a run's results; the data for the figures are computed now."""
     targets = run.targets
     out = _of_monitor(run) if isinstance(run, RenderRun) else {}
     if targets is not None:
@@ -309,7 +317,7 @@ def drawings(run: JobRun) -> dict[str, Callable[[], Any]]:
 
 
 def limits_drawing(limits: MonitorLimits | None) -> dict[str, Callable[[], Any]]:
-    """Return name -> function that draws what limits the estimated changes; empty without a prior."""
+    """Return name -> function that draws the contributions to the error variance; empty without a prior."""
     if limits is None:
         return {}
     return _attempts({LIMITS: _drawing("twin.uncertainty.uncertainty_report:limits_svg", limits)})
@@ -336,15 +344,15 @@ def _of_monitor(run: RenderRun) -> dict[str, Callable[[], Any]]:
 
 
 def _drawing(function: str, *given: Any) -> Callable[[], Any]:
-    """Return a call of the function ``module:name``, which is imported only by the process that draws.
+    """Return a function that calls ``module:name`` with the given arguments and imports the module only then.
 
-    The import takes a second.
+    The import takes a second, and only the process that draws needs it.
     """
     return partial(Named(function if "." in function else f"{__package__}.{function}"), *given)
 
 
 def _attempt(name: str, draw: Callable[[], Any]) -> Any:
-    """Return a drawing, or an `Undrawn` with the reason: a failed drawing must not cost the computed results."""
+    """Return a drawing, or an `Undrawn` with the reason if it fails, so that the computed results are not lost."""
     try:
         return draw()
     except Exception as error:
@@ -352,7 +360,7 @@ def _attempt(name: str, draw: Callable[[], Any]) -> Any:
 
 
 def without_failed(drawn: Mapping[str, Any]) -> tuple[dict[str, Any], tuple[str, ...]]:
-    """Replace figures that could not be drawn by a note and drop files that could not be.
+    """Replace figures that could not be drawn by a note, and drop files that could not be drawn.
 
     Returns
     -------

@@ -1,4 +1,4 @@
-"""The main job: perturb the instrument, render and expose images, estimate the changes, compare with the truth."""
+"""The main job: perturb the instrument, render and expose images, estimate the changes, compare with the true ones."""
 
 from __future__ import annotations
 
@@ -65,13 +65,15 @@ QUALITY = "image quality"
 """Progress label of a long part: image quality."""
 
 _FREE_PUPILS = "obstruction: ignore: image quality and targets do not include obstruction by bodies in the beams"
-"""Warning of a job that ignores obstructions of the pupils in image quality and targets."""
+"""Text of the warning that image quality and targets ignore obstructions of the pupils, as the job requests."""
 
 MIN_LIGHT = 0.5
-"""Share of the nominal light on a CCD below which the user is warned: vignetting, or a spot that leaves the CCD."""
+"""Fraction of the nominal light on a CCD below which the user is warned of vignetting or a spot leaving the CCD."""
 
 SHARP = 1.0 / 14.0
-"""Wavefront error, in waves RMS, below which a nominal spot counts as diffraction limited (Marechal: Strehl ratio 0.8).
+"""Wavefront error, in waves RMS, below which a nominal spot counts as diffraction limited.
+
+It is Maréchal's criterion, a Strehl ratio of 0.8.
 """
 
 
@@ -84,7 +86,7 @@ def render_job(
     experiment: MonitorExperiment | None = None,
     placed: Callable[[Instrument, Backend, State], object] | None = None,
 ) -> JobRun:
-    """Run a job: perturb the instrument, render and expose the images, estimate the changes and compare with the truth.
+    """Run a job: perturb the instrument, render and expose images, estimate the changes, compare with the true ones.
 
     For a time series, most of the results describe the single time ``course.detail``. An instrument with a monitor
     gives a `RenderRun`. One without is perturbed and traced, and the images of its cameras are evaluated.
@@ -111,7 +113,7 @@ def render_job(
     Raises
     ------
     InputError
-        A node is unknown, memory does not suffice, or the perturbation is so large that light misses the mirrors or a
+        A body is unknown, memory does not suffice, or the perturbation is so large that light misses the mirrors or a
         spot its CCD.
     """
     frame_count = resolved.frames if frames is None else frames
@@ -209,7 +211,7 @@ def render_job(
 
 
 def require_one_state(resolved: ResolvedJob) -> None:
-    """Raise InputError if a job of an instrument without a monitor asks for what requires one.
+    """Raise InputError if a job of an instrument without a monitor requests results that require one.
 
     Parameters
     ----------
@@ -246,7 +248,7 @@ def _without_monitor(
     Raises
     ------
     InputError
-        The job cannot be run (see `render_job`), or it asks for what requires a monitor.
+        The job cannot be run (see `render_job`), or it requests results that require a monitor.
     """
     require_one_state(resolved)
     job = resolved.job
@@ -284,7 +286,7 @@ def _without_monitor(
 def _images(
     experiment: MonitorExperiment, resolved: ResolvedJob, state: State, seed: int, advance: Advance
 ) -> tuple[TargetRun | None, ImageQuality | None]:
-    """Render targets and compute image quality of the cameras, where the job asks for them.
+    """Render targets and compute image quality of the cameras, if the job requests them.
 
     Raises
     ------
@@ -322,7 +324,7 @@ def _image_warnings(
 
 
 class _Stages:
-    """Progress reports when each of STAGES begins and ends."""
+    """Reporter of the progress, which is called when each of STAGES begins and ends."""
 
     def __init__(self, advance: Advance) -> None:
         self._advance, self._now = advance, ""
@@ -376,7 +378,10 @@ def _stray_warnings(experiment: MonitorExperiment, stray: StrayPair) -> Iterator
 
 @contextmanager
 def _lost_by_motions(resolved: ResolvedJob, *errors: type[Exception]) -> Iterator[None]:
-    """Raise InputError at the key ``perturb`` where the motions cause one of the given errors (a context manager)."""
+    """Report errors of the given types as InputError at the key ``perturb`` (a context manager).
+
+    It encloses computations in which such an error means that the job's motions are too large.
+    """
     try:
         yield
     except errors as error:
@@ -412,7 +417,7 @@ def _no_spots(experiment: MonitorExperiment, reason: str) -> InputError:
 
 
 def _mounted_facets(experiment: MonitorExperiment) -> str:
-    """Return the facet orientations with which the monitor of an instrument as built would work, as text."""
+    """Return advice on how to mount the facets of an instrument as built so that its monitor works, as text."""
     instrument, advice = experiment.instrument, "bodies closer to their design positions"
     try:
         rotations = facet_alignment(instrument, experiment.backend)
@@ -426,7 +431,10 @@ def _mounted_facets(experiment: MonitorExperiment) -> str:
 
 
 def _unmeasured(experiment: MonitorExperiment, before: np.ndarray, error: SpotError, focus: SpotFocus) -> InputError:
-    """Return the error of a spot that cannot be measured; it blames the instrument if the spots before fail too."""
+    """Return the error of a spot that cannot be measured.
+
+    It says that the instrument is the cause if the spots before the change cannot be measured either.
+    """
     channels, resolved = experiment.path.channels, experiment.resolved
 
     def told(error: SpotError) -> str:
@@ -442,7 +450,7 @@ def _unmeasured(experiment: MonitorExperiment, before: np.ndarray, error: SpotEr
 
 
 def _blurred(experiment: MonitorExperiment, focus: SpotFocus) -> tuple[str, ...]:
-    """Return a warning for each camera whose spots are out of focus as designed, which is probably a mistake."""
+    """Return a warning for each camera whose spots are out of focus in the design, which is probably a mistake."""
     warnings = []
     for name in experiment.instrument.cameras:
         indices = [i for i, channel in enumerate(experiment.path.channels) if channel.camera == name]
@@ -463,7 +471,7 @@ def _blurred(experiment: MonitorExperiment, focus: SpotFocus) -> tuple[str, ...]
 def _warnings(
     experiment: MonitorExperiment, nominal: np.ndarray, photons: np.ndarray, before: np.ndarray, after: np.ndarray
 ) -> tuple[str, ...]:
-    """Return warnings about saturation and lost light."""
+    """Return warnings about saturated pixels and lost light in the monitor's images."""
     warnings = []
     channels = experiment.path.channels
     for name, recorded in (("before", before), ("after", after)):

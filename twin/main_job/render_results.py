@@ -1,4 +1,4 @@
-"""Results of one render run, and their JSON forms (the contents of truth.json and recovered.json)."""
+"""Results of one run of the main job, and their JSON forms (the contents of truth.json and recovered.json)."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ class StrayPair:
     measured: MeasuredFinishes | None = None
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the contents of stray.json."""
+        """Return the contents of stray.json: stray light before and after the perturbation."""
         taken = [{"body": o.body, "beam": o.beam, "share": o.share, "used": o.used} for o in self.obstructions]
         out = {"before": self.before.to_dict(), "after": self.after.to_dict(), "obstructions": taken}
         return out if self.measured is None else {**out, "finishes": self.measured.to_dict()}
@@ -58,7 +58,7 @@ class JobRun:
     Attributes
     ----------
     resolved : ResolvedJob
-        Job with everything it names.
+        Job with the contents of all files that it names.
     experiment : MonitorExperiment
         Instrument, with the calibration of its monitor if it has one.
     state : State
@@ -70,9 +70,9 @@ class JobRun:
     warnings : tuple of str
         Warnings to the user.
     targets : TargetRun or None
-        Test targets on the line CCDs, None if not asked for.
+        Test targets on the line CCDs, None if not requested.
     quality : ImageQuality or None
-        Image quality of the nominal and the perturbed state, None if not asked for.
+        Image quality of the nominal and the perturbed state, None if not requested.
     """
 
     resolved: ResolvedJob
@@ -86,7 +86,7 @@ class JobRun:
     quality: ImageQuality | None = None
 
     def truth_dict(self) -> dict[str, Any]:
-        """Return the contents of truth.json."""
+        """Return the contents of truth.json: the true changes of the cameras, with nominal values."""
         out: dict[str, Any] = {"cameras": {}}
         for group, parameter, value in self.true_changes():
             target = out if group in (ANGLE_GROUP, GROUND_GROUP) else out["cameras"]
@@ -109,7 +109,7 @@ class JobRun:
         return out
 
     def _with_nominal(self, out: dict[str, Any]) -> dict[str, Any]:
-        """Add the nominal principal distances and angle to the true changes."""
+        """Return true changes as plain data, with the nominal principal distances and angle added."""
         for name, group in out["cameras"].items():
             group["principal_distance_mm"] = 1e3 * float(self.truth.principal_distance[name])
         if ANGLE_GROUP in out:
@@ -118,17 +118,17 @@ class JobRun:
 
     @property
     def deformed(self) -> Mapping[str, NodalDeformation]:
-        """Body -> deformation by its table of displaced nodes."""
+        """Body -> its deformation by a table of displaced nodes; empty without such tables."""
         return self.experiment.deformed(self.resolved.job)
 
     @property
     def heated(self) -> Mapping[str, HeatedBody]:
-        """Body -> temperature field by its table of nodes."""
+        """Body -> its temperature field by a table of nodes; empty without such tables."""
         return self.experiment.heated(self.resolved.job)
 
     @property
     def checks(self) -> tuple[SelfCheck, ...]:
-        """Checks that were made during the run."""
+        """Checks of the computation that were made during the run, for its manifest."""
         return ()
 
 
@@ -151,7 +151,7 @@ class RenderRun(JobRun):
         All times of the job's time series, None if it has none; the other attributes then describe the time that it
         shows.
     stray : StrayPair or None
-        Ghosts and stray light, None if not asked for.
+        Ghosts and stray light, None if not requested.
     """
 
     photons_before: np.ndarray
@@ -164,7 +164,7 @@ class RenderRun(JobRun):
     stray: StrayPair | None = None
 
     def truth_dict(self) -> dict[str, Any]:
-        """Return the contents of truth.json."""
+        """Return the contents of truth.json: the true changes of the cameras, with nominal values."""
         return self._with_nominal(self.reading.table.true())
 
     @cached_property
@@ -188,7 +188,7 @@ class RenderRun(JobRun):
 
     @property
     def estimators(self) -> dict[str, Estimator]:
-        """Estimators in the results, by name."""
+        """Name -> estimator, for all estimators in the results."""
         return self.reading.estimators
 
     @property
@@ -198,19 +198,22 @@ class RenderRun(JobRun):
 
     @property
     def gains(self) -> dict[str, np.ndarray]:
-        """Estimator -> gain matrix, (4 x cameras, 2 x spots): camera parameters (rad or m) per pixel of spot shift."""
+        """Estimator -> its linear map from spot shifts (px) to camera parameters (rad or m).
+
+        Each is a (4 x cameras, 2 x spots) array.
+        """
         return self.reading.gains
 
     @property
     def sigma_holds(self) -> bool:
-        """True if no measurement contradicts the sigmas, at any time of a time series."""
+        """True if no measurement contradicts the assumptions of the sigmas, at any time of a time series."""
         return self.reading.sigma_holds if self.series is None else bool(np.all(self.series.sigma_holds))
 
     @cached_property
     def worst_of_course(self) -> tuple[int, Consistency] | None:
-        """Index of the time of a series whose spot shifts agree least with the prior, and its chi-square test.
+        """Index of the time of a series at which the spot shifts agree least with the prior, and its chi-square test.
 
-        None without a time series or a prior. The limit is that of the largest value of all times.
+        It is None without a time series or a prior. The limit of the test is that of the largest value of all times.
         """
         series = self.series
         return None if series is None else self.reading.worst_of(series.shift, series.shift_covariance)
@@ -241,5 +244,5 @@ class RenderRun(JobRun):
         return tuple(out)
 
     def recovered_dict(self) -> dict[str, Any]:
-        """Return the contents of recovered.json."""
+        """Return the contents of recovered.json: estimated changes, sigmas, spots and tests."""
         return self.reading.recovered_dict()

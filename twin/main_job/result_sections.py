@@ -1,4 +1,4 @@
-"""Report sections on set-up, result, time series, spots and residuals of the main job."""
+"""Report sections on set-up, results, time series, spots, and the errors of the estimates of the main job."""
 
 from __future__ import annotations
 
@@ -48,7 +48,23 @@ _ANGLE_TITLE = "Angle between the cameras"
 def figure(
     drawn: Mapping[str, str], name: str, caption: str, title: str = "", full: Table | None = None, count: int = 0
 ) -> SvgFigure:
-    """Return a drawing of the run as a figure of the page, the ``count``-th of its kind."""
+    """Return a drawing of the run as a figure of the report page.
+
+    Parameters
+    ----------
+    drawn : Mapping[str, str]
+        Name -> <svg> element of each drawing.
+    name : str
+        Name of the drawing.
+    caption : str
+        Text below the figure.
+    title : str
+        Title of the figure.
+    full : Table or None
+        Table with all numbers of the figure.
+    count : int
+        Number of this figure among several of its kind.
+    """
     file_name = name.partition(" ")[0] + f"-{count}" * (" " in name)
     return SvgFigure(file_name, title, caption, drawn[name], within=IN_PAGE, full=full)
 
@@ -116,7 +132,10 @@ def _label(reading: Reading) -> Marked:
 
 
 def _all_digits(run: RenderRun, name: str, table: ReadingTable, over: bool) -> Table:
-    """Return a table of all changes: truth, and each estimator's value (or RMS error), sigma and noise sigma."""
+    """Return a table of all changes with all digits: true value, and each estimator's value, sigma and noise sigma.
+
+    If ``over`` is set, the table is over a time series and holds RMS errors instead of values.
+    """
     heads = ["camera", "parameter", "unit", "true rms" if over else "true"]
     heads += _value_and_sigma(run, " error rms" if over else "")
     rows: list[list[Cell]] = []
@@ -130,7 +149,7 @@ def _all_digits(run: RenderRun, name: str, table: ReadingTable, over: bool) -> T
 
 
 def _value_and_sigma(run: RenderRun, label: str) -> list[str]:
-    """Return column heads for value, total sigma and noise sigma of each estimator."""
+    """Return the column names for value, total sigma and noise sigma of each estimator."""
     labels = (label, " sigma", " sigma noise")
     return [f"{estimator.title}{what}" for estimator in run.estimators.values() for what in labels]
 
@@ -217,7 +236,7 @@ def _range(values: np.ndarray, places: int) -> str:
 
 
 def _worst(run: RenderRun, series: TimeSeries) -> str:
-    """Return a sentence with the largest error in alpha of the estimator that the verdict uses.
+    """Return a sentence with the largest error in d_alpha of the estimator that the verdict uses.
 
     It names the camera, the size, the time and the true change.
     """
@@ -353,7 +372,7 @@ def _with_sigma(value: float, sigma: float, sign: bool = False) -> str:
 
 
 def residual_section(run: RenderRun, drawn: Mapping[str, str]) -> Section:
-    """Return the section with the errors of all estimators and the part of them that the crosstalk table explains.
+    """Return the section with the errors of all estimators and how much of them the crosstalk table explains.
 
     The unexplained part of the error of the estimator that the verdict uses is compared with the noise alone.
     """
@@ -411,7 +430,7 @@ ZERO_CELSIUS = 273.15
 
 
 def facts(run: JobRun) -> tuple[tuple[str, str], ...]:
-    """Return the facts about set-up and assumptions, as pairs of title and text."""
+    """Return the facts about the set-up and assumptions of a run, as pairs of title and text."""
     resolved, instrument = run.resolved, run.experiment.instrument
     spec, has_prior = resolved.instrument, run.experiment.stated is not None
     instrument_fact = ("Instrument", f"{spec.name}: {spec.description}" if spec.description else spec.name)
@@ -466,7 +485,7 @@ def facts(run: JobRun) -> tuple[tuple[str, str], ...]:
 
 
 def _all(values: list[float]) -> str:
-    """Return the distinct values among those of all channels, as text: ``50``, or ``34, 24``."""
+    """Return the distinct values in a list of all channels' values, as text: ``50``, or ``34, 24``."""
     return ", ".join(dict.fromkeys(plain(value) for value in values))
 
 
@@ -480,7 +499,7 @@ def _fields(degrees: list[float]) -> str:
 
 
 def setup_section(run: JobRun) -> Section:
-    """Return the section with the cameras and with the prior on disturbances, cause by cause."""
+    """Return the section with a table of the cameras and one of the prior on disturbances, cause by cause."""
     spec, instrument = run.resolved.instrument, run.experiment.instrument
     rows: list[list[Cell]] = []
     for name, model in instrument.cameras.items():
@@ -551,7 +570,7 @@ def _prior_table(run: JobRun) -> Table:
 
 
 def done_table(run: JobRun) -> Table:
-    """Return the table of the motions and temperatures that the job gives to each body at the time shown.
+    """Return the table of the motions and temperatures that the job applies to each body at the time shown.
 
     Bodies that only move because another body carries them are omitted.
     """
@@ -581,7 +600,7 @@ def done_table(run: JobRun) -> Table:
 
 
 def _shown(run: JobRun) -> int | None:
-    """Return the index of the time of a time series that is shown; None for a single state."""
+    """Return the index of the time of a time series that is shown in full; None for a single state."""
     return run.series.shown if isinstance(run, RenderRun) and run.series is not None else None
 
 

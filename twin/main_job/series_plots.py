@@ -19,13 +19,14 @@ from twin.monitor.reading_table import Reading
 from twin.monitor.time_series import TimeSeries
 
 COLOURS = (svg.BLUE, svg.VERMILION, svg.GREEN, svg.ORANGE, svg.SKY, svg.PURPLE, svg.INK, svg.GREY)
-"""Colours of the nodes; after the last, they repeat with the next line style."""
+"""Colours of the curves, one per body; after the last, they repeat with the next line style."""
 STYLES = ("-", "--", ":")
-"""Line styles: the first for the first nodes, the others for nodes whose colour is already in use."""
+"""Line styles: the first for the first bodies, the others for bodies whose colour is already in use."""
 _BESIDE = 0.12
-"""Horizontal distance between the markers of two estimators at the same time, as a share of the time step."""
+"""Horizontal distance between the markers of two estimators at the same time, as a fraction of the time step."""
 UNITS = ((2.0 * 86400.0, 86400.0, "d"), (6.0 * 3600.0, 3600.0, "h"), (180.0, 60.0, "min"), (0.0, 1.0, "s"))
-"""Time units: shortest duration of a series, in seconds, drawn in the unit; the unit in seconds; its name."""
+"""Time units of the axis: (shortest duration of a series drawn in the unit, in seconds; the unit in seconds; its name).
+"""
 
 
 def time_unit(times: np.ndarray) -> tuple[float, str]:
@@ -47,10 +48,10 @@ def _time_axis(series: TimeSeries) -> tuple[np.ndarray, str]:
 
 
 def temperatures_svg(series: TimeSeries) -> str:
-    """Draw the temperatures and motions over time that the job prescribes.
+    """Draw the temperatures and motions over time that the job specifies.
 
-    Panels show the change at the origin and the gradient along each axis of every node, and below them rotation and
-    shift.
+    Panels show the change at the origin and the gradient along each axis of every body's temperature, and below them
+    rotation and shift.
     """
     with svg.look("temperatures"):
         time, label = _time_axis(series)
@@ -111,7 +112,7 @@ def parameters_svg(series: TimeSeries, names: dict[str, str]) -> str:
 def smoothed_svg(series: TimeSeries) -> str:
     """Draw errors of the smoothed changes with their total sigma, at the times of the series and between them.
 
-    The band of sigma narrows at each measurement and widens between two. Errors are known at the measured times only.
+    The band of sigma narrows at each measurement and widens between two. Errors are known only at the measured times.
 
     Parameters
     ----------

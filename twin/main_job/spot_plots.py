@@ -25,10 +25,10 @@ from twin.main_job.verdict import limited
 from twin.monitor.crosstalk import CameraCrosstalk
 
 STRETCH = 150.0
-"""The asinh stretch is linear up to this fraction (1/STRETCH) of the peak."""
+"""Ratio of the peak to the level up to which the asinh stretch of images is linear."""
 _LEGEND: dict[str, Any] = {"frameon": True, "facecolor": "black", "edgecolor": "none", "framealpha": 0.7}
 _LEAST_CORE = 7.0
-"""Smallest half-width of the window on the core, in pixels."""
+"""Smallest half-width, in pixels, of the image section that shows the core of a spot."""
 
 
 def mean_images(run: RenderRun) -> tuple[np.ndarray, np.ndarray]:
@@ -37,14 +37,14 @@ def mean_images(run: RenderRun) -> tuple[np.ndarray, np.ndarray]:
 
 
 def stretch(images: np.ndarray) -> Normalize:
-    """Return the common asinh stretch of images from the background to the peak."""
+    """Return the asinh stretch of grey values that several images have in common, from background to peak."""
     low, high = float(np.percentile(images, 5)), float(images.max())
     high = max(high, low + 1.0)
     return AsinhNorm(linear_width=(high - low) / STRETCH, vmin=low, vmax=high)
 
 
 def cross(axes: Axes, at: np.ndarray, colour: str, size: float, label: str | None = None) -> None:
-    """Draw a cross with an open middle, so that the core stays visible; data coordinates are pixels."""
+    """Draw a cross with an open middle at a pixel position, so that the core of the spot stays visible."""
     (row, column), inner = at, 0.3 * size
     xs, ys = [], []
     for dx, dy in ((1, 0), (-1, 0), (0, 1), (0, -1)):
@@ -61,7 +61,7 @@ def core_window(before: np.ndarray, after: np.ndarray, radius: float) -> tuple[f
 
 
 def airy_radius(run: RenderRun) -> float:
-    """Return the radius, in pixels, of the first dark ring of diffraction at the return face of the prism."""
+    """Return the radius, in pixels, of the first dark ring of a spot, whose light the prism's return face limits."""
     path = run.experiment.path
     camera = next(iter(run.experiment.instrument.cameras.values()))
     focal = float(camera.first_order.principal_distance[0])
@@ -134,7 +134,7 @@ def _draw(run: RenderRun, camera: str) -> Figure:
 
 
 def _dn_ticks(norm: Normalize) -> list[float]:
-    """Return round numbers within the stretch, at most three per decade."""
+    """Return round grey values (DN) within the range of the stretch for the colour bar, at most three per decade."""
     assert norm.vmin is not None
     assert norm.vmax is not None
     candidates = [float(m * 10**k) for k in range(1, 8) for m in (1, 2, 5)]
@@ -149,7 +149,7 @@ _MARKS = (
 
 
 def marks(names: Iterable[str]) -> dict[str, tuple[str, str]]:
-    """Return estimator -> marker and colour, which differ in shape and colour for up to eight estimators.
+    """Return estimator -> (marker, colour) for plots; both differ for up to eight estimators.
 
     Parameters
     ----------
@@ -161,7 +161,7 @@ def marks(names: Iterable[str]) -> dict[str, tuple[str, str]]:
 
 
 def residuals_svg(run: RenderRun) -> str:
-    """Draw the errors of all estimators in sigmas, a panel for each camera, the angle and the ground."""
+    """Draw the errors of all estimators divided by their sigmas, a panel for each camera, the angle and the ground."""
     names = {name: estimator.title for name, estimator in run.estimators.items()}
     panels: dict[str, dict[str, dict[str, float | None]]] = {}
     for same in run.reading.table.by_change():
@@ -212,17 +212,20 @@ def _panel(axes: Axes, title: str, panel: dict[str, dict[str, float | None]], na
 
 
 ROW = 0.168
-"""Height of a row of the motion map, in inches."""
+"""Height of one motion's row in the map of spot shifts, in inches."""
 _DECADES = 3
-"""Number of decades in the logarithmic part of the colour scale, below the largest number."""
+"""Number of decades below the largest number that the colour scale shows logarithmically."""
 _MOST_LEVEL = 4
-"""Largest number of column names that fit horizontally side by side."""
+"""Largest number of column names that are written horizontally side by side; more are rotated."""
 _STRONG = 0.55
-"""Depth of a cell's colour, from 0 to 1, above which the number in it is written in white."""
+"""Colour intensity of a cell, from 0 to 1, above which the number in it is written in white."""
 
 
 def motion_map_svg(run: RenderRun) -> str:
-    """Draw the spot shifts, in micrometres per unit of motion: one line per motion, one panel per camera."""
+    """Draw the spot shifts in micrometres per unit of motion as a coloured table.
+
+    Each motion has a row, each camera a panel.
+    """
     pitch = 1e6 * run.experiment.path.pitch
     tables = list(run.crosstalk.items())
     largest = max(float(np.abs(table.spot_shift).max()) for _, table in tables) * pitch
@@ -264,15 +267,15 @@ def _motion_panel(axes: Axes, values: np.ndarray, names: Sequence[str], norm: Sy
 WIDTH, DPI = 14.0, 100
 """Width of the picture in inches, and dots per inch: 1400 px wide."""
 NOTE, LONGEST_NOTE = 0.85, 150
-"""Height of a note's line, in rows of the table, and number of characters that fit in the width."""
+"""Height of a line of notes below the table, in heights of a table row, and number of characters per line."""
 FIRST = 0.22
-"""Right edge of the column of true values, as a share of the picture's width."""
+"""Right edge of the column of true values, as a fraction of the picture's width."""
 REACH = 2.2
-"""Half-width of the spot images, beyond the two spot centres, in Airy radii."""
+"""Margin of the spot images around the two spot centres (before and after), in Airy radii."""
 
 
 def summary_png(run: RenderRun) -> bytes:
-    """Return the summary picture as PNG."""
+    """Return the picture that summarises a run, its spots and recovered changes, as PNG."""
     with svg.look("summary"):
         return svg.to_png(_drawn_summary(run), DPI)
 
@@ -314,7 +317,7 @@ def _drawn_summary(run: RenderRun) -> Figure:
 
 
 def _notes(run: RenderRun) -> list[str]:
-    """Return the lines below the table: what sigma includes, and the meaning of the signs in the table."""
+    """Return the lines below the summary's table: what sigma includes, and what the signs in the table mean."""
     limit = f" {sentence(limited(run))}" if limited(run) else ""
     texts = f"{assumed(run.reading)}.", f"± is one σ; ● within {FAR:g} σ of the truth, ▲ beyond.{limit}"
     return [line for text in texts for line in wrap(text, LONGEST_NOTE)]
@@ -329,7 +332,7 @@ def _scale_bar(axes: Axes, run: RenderRun, column: float, row: float, half: floa
 
 
 def _table(figure: Figure, table: Table, top: float, run: RenderRun, notes: Sequence[str]) -> None:
-    """Draw recovered and true changes as text on a grid of lines, with notes below."""
+    """Draw the table of recovered and true changes into the summary picture, with notes below."""
     axes = figure.add_axes((0.0, 0.0, 1.0, top), xlim=(0.0, 1.0))
     axes.set_axis_off()
     count = 1 + len(table.bands) + len(table.rows)

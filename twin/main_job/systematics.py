@@ -1,4 +1,4 @@
-"""Systematic errors of the estimators from crosstalk tables, and what the sigmas include, and what limits them."""
+"""Systematic errors of the estimators, predicted from crosstalk tables; what sigmas include and what limits them."""
 
 from __future__ import annotations
 
@@ -27,13 +27,14 @@ from twin.monitor.time_series import SmoothedCourse
 from twin.uncertainty.monitor_limits import short_text, unit_text
 
 _FAMILY = 4
-"""Number of the first motions of a crosstalk table that the estimators of paper 001 assume to be the only ones."""
+"""Number of motions of a camera that the estimators of paper 001 (Wang et al. 2018) assume; they come first in a
+crosstalk table."""
 SHOWN = 1e-3
-"""Smallest amount of a motion, in its table unit, that is reported."""
+"""Smallest amount of a motion, in its table unit (arcsec, um, ppm or nm), that is reported."""
 
 
 HEAT = "temperatures (expansion, bending, change of index)"
-"""Name of the effects of temperatures, which have no motion of their own in a crosstalk table."""
+"""Text for the effects of temperatures, which have no motion of their own in a crosstalk table."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,9 +44,9 @@ class Systematics:
     Attributes
     ----------
     bias : dict of str to (P,) ndarray
-        Estimator -> estimate minus truth, to first order, of each of the camera's P changes, in its unit.
+        Estimator -> estimate minus true change, to first order, of each of the camera's P changes, in its unit.
     outside : tuple of str
-        Motions of this camera that the estimators of paper 001 do not assume, as text with amounts.
+        Motions of this camera that the estimators of paper 001 (Wang et al. 2018) do not assume, as text with amounts.
     parts : dict of str to (P,) ndarray
         Motion, as text with its amount -> its contribution to the bias of the estimator that the verdict uses; motions
         of other cameras are included where that estimator uses all spots together.
@@ -77,7 +78,10 @@ def systematics(run: RenderRun, camera: str) -> Systematics:
 
 
 def _parts(run: RenderRun, camera: str, amounts: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Return motion -> error that it causes, for motions that the estimator of the verdict does not model."""
+    """Return motion -> error that it causes, for motions that the verdict's estimator does not model.
+
+    ``amounts`` holds the amounts of the motions in the run's state.
+    """
     names = list(run.crosstalk)
     k = names.index(camera)
     gain = rows_of(run.reading.cameras[camera]) @ run.gains[run.judged][4 * k : 4 * k + 4]
@@ -107,7 +111,7 @@ def _motion_text(motion: ElementaryMotion, amount: float) -> str:
 
 
 def _amount(run: RenderRun, elementary: ElementaryMotion) -> float:
-    """Return the amount of an elementary motion in the run's state, in table units.
+    """Return the amount of an elementary motion in the run's state, in its table unit (arcsec, um, ppm or nm).
 
     Different pivots of rotation are accounted for to first order.
     """
@@ -122,14 +126,17 @@ def _amount(run: RenderRun, elementary: ElementaryMotion) -> float:
 
 
 def _shift_at(run: RenderRun, body: str, motion: Motion, pivot: str) -> np.ndarray:
-    """Return the shift, in metres, that describes the same motion about a different pivot, to first order."""
+    """Return the shift, in metres, with which a body's rotation about another pivot is the same motion.
+
+    It is computed to first order.
+    """
     pivots = next(b for b in run.experiment.instrument.assembly.tree.bodies if b.path == body).pivots
     arm = np.array(pivots[motion.pivot]) - np.array(pivots[pivot])
     return np.asarray(np.array(motion.shift) - np.cross(motion.rotate, arm) - motion.scale * arm)
 
 
 def _uncovered(run: RenderRun, camera: str, table: CameraCrosstalk) -> tuple[str, ...]:
-    """Return the bodies that moved and affect this camera, but are not in the crosstalk table."""
+    """Return the bodies that moved and affect this camera, but whose motions are not in the crosstalk table."""
     camera_body = f"{BASE}/{camera}"
     bodies = {motion.body for motion in table.motions}
     uncovered = []
@@ -165,15 +172,15 @@ def joined(names: Sequence[str]) -> str:
 UNNOTICED_SIGMAS = 4.0
 """Smallest error of an estimate, in sigmas, for which a warning says that the spots do not show it.
 
-A motion drawn from the prior itself causes as much in one of 20 000 runs.
+A random motion from the prior itself causes as much in one of 20 000 runs.
 """
 
 
 def unobserved_perturbations(run: RenderRun) -> tuple[str, ...]:
     """Return a warning for each perturbed body that falsifies estimates without moving the spots noticeably.
 
-    The effect of that body's perturbation alone on spots and cameras is traced and compared with the estimate from
-    these spots.
+    The effect of that body's perturbation alone on spots and cameras is traced; the change of the camera is compared
+    with the estimate from these spots.
 
     Parameters
     ----------
@@ -222,16 +229,28 @@ def unobserved_perturbations(run: RenderRun) -> tuple[str, ...]:
 
 
 def _sigmas(rows: np.ndarray, prior: Disturbances | None, noise: np.ndarray, gain: np.ndarray) -> np.ndarray:
-    """Return the (Q,) standard deviations of the estimates of Q quantities, due to noise and the prior."""
+    """Return the standard deviations of the estimates of Q quantities, (Q,), due to noise and the prior.
+
+    Parameters
+    ----------
+    rows : ndarray
+        Coefficients of the Q quantities on the parameters of all cameras.
+    prior : Disturbances or None
+        Prior; None if there is none.
+    noise : ndarray
+        Covariance of the spot shifts, px^2.
+    gain : ndarray
+        Linear map of the estimator from spot shifts to camera parameters.
+    """
     if prior is not None:
         return split(rows, prior, noise, gain).sigma
     return np.sqrt(np.einsum("qd,de,qe->q", rows @ gain, noise, rows @ gain))
 
 
 _NOISE_ALONE = "There is no prior on disturbances: σ contains the noise of the images only"
-"""Sentence, without a full stop, for runs without a prior."""
+"""Sentence, without a full stop, which says for runs without a prior that sigma contains only the noise."""
 NOISE = "the noise of the images"
-"""Name of the part of the variance that more frames reduce: the noise of the images."""
+"""Name, among the contributions to the variance, of the noise of the images, which more frames reduce."""
 
 
 def assumed(reading: MonitorReading) -> str:
@@ -248,7 +267,7 @@ def assumed(reading: MonitorReading) -> str:
 
 
 def _prior_share_text(reading: MonitorReading) -> str:
-    """Return the range of the shares of the posterior's variances that are due to the prior, as text."""
+    """Return which fractions of the posterior variances are due to the prior, as a range in text."""
     shares = [share for group in reading.from_statement.values() for share in group.values() if share is not None]
     if not shares:
         return ""
@@ -269,7 +288,10 @@ def contradiction(run: RenderRun) -> tuple[str, ...]:
 
 
 def doubted(run: RenderRun) -> tuple[str, ...]:
-    """Return warnings of spots unlike their calibration and of nonlinear estimates, for a series at its worst time."""
+    """Return warnings about spots unlike their calibration and about nonlinear estimates.
+
+    For a time series they are those of its worst time.
+    """
     if run.series is None:
         return (*run.reading.doubts, *run.reading.notes)
     return run.series.doubts(["/".join(channel) for channel in run.reading.channels])
@@ -318,14 +340,14 @@ def _series_agrees(together: SmoothedCourse, times: np.ndarray) -> str:
 
 
 def combination(reading: MonitorReading, group: str, key: str) -> np.ndarray:
-    """Return the factors that form a change from all cameras' parameters, to first order, and its unit in SI.
+    """Return the coefficients of a change on the parameters of all cameras, (4 x cameras,), and its unit in SI.
 
-    The factors are a (4 x cameras,) array.
+    The change is a linear combination of the parameters, to first order.
 
     Parameters
     ----------
     reading : MonitorReading
-        Reading of the instrument.
+        Estimated changes of the instrument.
     group : str
         Camera of the change, or the group of a quantity of two cameras.
     key : str
@@ -336,12 +358,12 @@ def combination(reading: MonitorReading, group: str, key: str) -> np.ndarray:
 
 
 def limits(reading: MonitorReading, change: Reading) -> tuple[str, float]:
-    """Return the largest source of a change's error variance (a body, or NOISE) and its share.
+    """Return the largest source of a change's error variance (a body, or NOISE) and its fraction of the variance.
 
     Parameters
     ----------
     reading : MonitorReading
-        Reading of the instrument, with a prior.
+        Estimated changes of the instrument, with a prior.
     change : Reading
         The change, as estimated by the estimator that the verdict uses.
     """
@@ -357,5 +379,5 @@ def limits(reading: MonitorReading, change: Reading) -> tuple[str, float]:
 
 
 def share_text(share: float) -> str:
-    """Return a share in per cent, as text for sentences."""
+    """Return a fraction as text in per cent, for sentences."""
     return f"{plain(round(100.0 * share), 3)} %"

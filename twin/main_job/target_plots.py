@@ -37,7 +37,7 @@ MARKS = {"before": "o", "after": "D"}
 BAND = 2.0
 """Half-width of the uncertainty band about zero in the panels of MTF differences, in sigmas."""
 _LEAST_SPAN = 4.0
-"""Smallest half-height of the panels of MTF differences, in thousandths."""
+"""Smallest half-height of the panels of MTF differences, in units of 0.001."""
 EVERY = 2
 """Number of spatial frequencies from one marker of the measured MTF to the next."""
 _IMAGE_NAMES = {
@@ -55,7 +55,7 @@ Other targets have their own names; uniform fields are not shown.
 _CROPS = {"knife_edge_along": 40, "knife_edge_track": 40, "pinhole": 24}
 """Target -> side of the part of its image that is shown, in pixels; images without an entry are shown whole."""
 STRETCH = 100.0
-"""The pinhole's stretch is linear up to this fraction (1/STRETCH) of the peak."""
+"""Ratio of the peak to the level up to which the stretch of a pinhole's image is linear."""
 
 
 def curves_svg(name: str, camera: CameraTargets) -> str:
@@ -112,7 +112,7 @@ def _curve(axes: Axes, when: str, edge: EdgeReading) -> None:
 
 
 def _difference(axes: Axes, when: str, edge: EdgeReading) -> None:
-    """Draw measured minus true MTF, in thousandths."""
+    """Draw measured minus true MTF over spatial frequency, in units of 0.001."""
     measured = edge.measured
     if measured is None:
         return
@@ -138,7 +138,7 @@ def _norm(target: str, image: np.ndarray) -> Normalize:
 
 
 def images_svg(name: str, camera: CameraTargets) -> str:
-    """Draw mean images, a row for each target, with before and after side by side for each position in the field."""
+    """Draw mean images: a row for each target, columns for the positions in the field, each before and after."""
     columns = [(place, when) for place in camera.places for when in COLOURS]
     names = [name for name in next(iter(camera.places.values())).before.frames if name in {*_IMAGE_NAMES, *TARGETS}]
     with look(f"targets-{name}"):
@@ -165,7 +165,10 @@ _RIM = np.exp(2j * np.pi * np.arange(181) / 180)
 
 
 def pupils_svg(quality: ImageQuality) -> str:
-    """Draw pupils, a row per camera and a column per field position: nominal shadows filled, perturbed outlined."""
+    """Draw pupils with the shadows in them: a row per camera, a column per field position.
+
+    Shadows of the nominal state are filled, those of the perturbed state outlined.
+    """
     where = {place: quality.fields.index(field) for place, field in PLACES.items()}
     with look("pupils"):
         figure = new_figure(0.6 + 2.9 * len(quality.cameras))
@@ -202,10 +205,10 @@ _PIXELS = 220
 
 
 def deformation_svg(faces: Mapping[str, NodalDeformation]) -> str:
-    """Draw maps of the change of sag at the nodes, three for each body.
+    """Draw maps of the change of sag at the nodes of a table, three for each body.
 
-    They show the change itself, the rest after the Zernike terms are subtracted, and the rest after the interpolating
-    grid is subtracted as well.
+    They show the change itself, what remains after the Zernike terms are subtracted, and what remains after the
+    interpolating grid is subtracted as well.
     """
     with look("deformation"):
         figure = new_figure(3.3 * len(faces))
@@ -216,7 +219,7 @@ def deformation_svg(faces: Mapping[str, NodalDeformation]) -> str:
 
 
 def _deformation(figure: Figure, axes: Any, path: str, face: NodalDeformation) -> None:
-    """Draw the maps of one body; each node colours its cell of the aperture."""
+    """Draw the maps of one body's deformation; each node of its table colours its cell of the aperture."""
     inside = face.weight > 0.0
     points = face.places[inside]
     low, high = points.min(axis=0), points.max(axis=0)

@@ -1,4 +1,4 @@
-"""Verdict of a run in sentences computed from its numbers, and warnings of estimates that mislead."""
+"""Verdict of a run in sentences computed from its numbers, and warnings about misleading estimates."""
 
 from __future__ import annotations
 
@@ -38,18 +38,21 @@ from twin.monitor.time_series import TimeSeries
 FALSE_ALARM = 1e-3
 """Probability that noise and disturbances of the prior alone cause any warning of a wrong estimate in a run."""
 _EXPLAINED = 0.2
-"""Share of an error up to which it may stay unexplained by the first-order crosstalk and still counts as explained."""
+"""Fraction of an error that first-order crosstalk may leave unexplained if the error still counts as explained."""
 _SOFTER = 0.05
-"""Smallest relative loss of MTF at Nyquist that is reported."""
+"""Smallest relative loss of MTF at the Nyquist frequency that is reported."""
 MOST_FRAMES = 10_000
-"""Largest number of frames that is recommended."""
+"""Largest number of frames per state that the verdict recommends."""
 _DIMMED = 0.5
-"""Share of its nominal light below which a spot is reported as dimmed."""
+"""Fraction of its nominal light below which a spot is reported as dimmed."""
 
 
 @dataclass(frozen=True)
 class Judgement:
-    """Verdict of a run in at most two sentences, the text that follows, and all warnings, wrong estimates last."""
+    """Verdict of a run in at most two sentences, the text that follows, and all warnings.
+
+    Warnings about wrong estimates come last.
+    """
 
     verdict: str
     more: tuple[str, ...]
@@ -57,12 +60,15 @@ class Judgement:
 
 
 def readings(run: RenderRun, estimator: str) -> tuple[Reading, ...]:
-    """Return all changes by an estimator: cameras, angle and ground errors; over a time series, RMS values."""
+    """Return all changes estimated by an estimator: of cameras, of the angle between two, and on the ground.
+
+    For a time series they are RMS values over its times.
+    """
     return run.series.readings.rms.of(estimator) if run.series else run.reading.table.of(estimator)
 
 
 def judge(run: JobRun) -> Judgement:
-    """Return the verdict of a run from its estimates, sigmas, truth and crosstalk.
+    """Return the verdict of a run, from its estimates, sigmas, true changes and crosstalk.
 
     Without a monitor, the verdict is based on the true changes and the images.
     """
@@ -89,7 +95,7 @@ def judge(run: JobRun) -> Judgement:
 
 
 def _changed(run: JobRun) -> tuple[str, str]:
-    """Return what the perturbation does to geometry and images of an instrument without a monitor, as two texts."""
+    """Return two texts on how the perturbation changes geometry and images of an instrument without a monitor."""
     moved = any(map(_moves, run.state.values()))
     cameras = len(run.truth.cameras) > 1
     parts = [
@@ -157,7 +163,7 @@ def _title(run: RenderRun) -> str:
 
 
 def _within(run: RenderRun, rows: tuple[Reading, ...], reference: str, prefix: str = "") -> str:
-    """Return ``all 12 readings ... are within 3 σ of the truth``, with the basis of σ."""
+    """Return a text such as ``all 12 readings ... are within 3 σ of the truth``, with what σ is based on."""
     prior = run.experiment.disturbances
     basis = "noise alone" if prior is None else f"noise and disturbances {prior.name}"
     return f"all {len(rows)} readings of the {_title(run)} are within {FAR:g} σ of {reference} ({prefix}σ: {basis})"
@@ -187,7 +193,7 @@ def _are(what: list[Reading]) -> str:
 
 
 def _changes(rows: tuple[Reading, ...]) -> list[Reading]:
-    """Return the changes without the errors on the ground, which follow from them."""
+    """Return the changes of cameras and angle, without the errors on the ground, which follow from them."""
     return [r for r in rows if r.group != GROUND_GROUP]
 
 
@@ -217,23 +223,23 @@ def _recovered(run: RenderRun, rows: tuple[Reading, ...]) -> tuple[str, ...]:
 
 
 def _frames(run: RenderRun, rows: tuple[Reading, ...]) -> str:
-    """Return whether more frames help, as text; they lower only the noise."""
+    """Return a sentence on whether more frames would improve the accuracy; they lower only the noise."""
     if any(r.noise**2 > 0.5 * r.sigma**2 for r in _changes(rows)):
         return "; more frames or more light would reveal smaller changes"
     return "; more frames do not lower this limit"
 
 
 def _needed(run: RenderRun, clearest: Reading) -> str:
-    """Return the number of frames that would reveal a change, as text; empty if none would."""
+    """Return a text with the number of frames that would make a change detectable; empty if none would."""
     allowed = (clearest.true / FAR) ** 2 - (clearest.sigma**2 - clearest.noise**2)
     need = math.ceil(run.frames * clearest.noise**2 / allowed) if allowed > 0.0 else math.inf
     return f"about {need} frames would reveal the clearest change" if need <= MOST_FRAMES else ""
 
 
 def limited(run: RenderRun) -> str:
-    """Return the body that limits the accuracy of a pair's angle, or else of the worst change, as text.
+    """Return the body that limits the accuracy of the angle between two cameras, as text.
 
-    Empty without a prior.
+    Without an angle it is the body that limits the least accurate change. The text is empty without a prior.
     """
     if _noise_only(run):
         return ""
@@ -270,7 +276,7 @@ def _score(rows: tuple[Reading, ...], wrong: list[Reading], suffix: str = "") ->
 
 
 def _misread_reason(run: RenderRun) -> str:
-    """Return why an estimator gives wrong changes for a motion, as text."""
+    """Return a sentence on why an estimator reports wrong changes for the motion of this run."""
     if run.estimators[run.judged].stated:
         return "larger than the prior expects"
     return f"outside the family of the {_title(run)}"
@@ -324,7 +330,7 @@ NAMED = 4
 
 
 def _largest(parts: Mapping[str, float]) -> str:
-    """Return the motions with the largest contributions, as text."""
+    """Return the motions with the largest contributions to an error, as text."""
     return joined(sorted(parts, key=lambda text: -abs(parts[text]))[:NAMED])
 
 
@@ -350,9 +356,9 @@ def _series_verdict(
 
 
 def _contradicted_course(run: RenderRun) -> str:
-    """Return the first sentence of the verdict for a time series that contradicts its prior; else empty.
+    """Return the first sentence of the verdict if a time series contradicts its prior; else an empty text.
 
-    It has the largest error of the filtered and smoothed changes.
+    The sentence gives the largest error of the filtered and smoothed changes.
     """
     series = run.series
     if series is None or series.smoothed is None or series.smoothed.consistency.agrees:
@@ -405,12 +411,12 @@ def _blurred(run: RenderRun) -> str:
 
 
 def alarm_limit(count: int) -> float:
-    """Return the limit, in sigmas, that any of ``count`` normal errors exceeds with at most FALSE_ALARM probability."""
+    """Return the limit, in sigmas, that none of ``count`` normal errors exceeds, up to a probability of FALSE_ALARM."""
     return -float(ndtri(0.5 * FALSE_ALARM / count))
 
 
 def _beyond_prior(run: RenderRun, rows: tuple[Reading, ...], warned: tuple[str, ...]) -> tuple[str, ...]:
-    """Return a warning where estimates are wrong beyond chance because the job moves more than its prior expects.
+    """Return a warning if estimates are wrong beyond chance since the job moves bodies more than its prior expects.
 
     In a real measurement this would go unnoticed. Bodies that have a warning already are omitted.
     """

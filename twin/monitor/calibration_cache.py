@@ -59,7 +59,7 @@ _written = 0
 
 
 class _UnnamedError(TypeError):
-    """Error raised for an input that cannot be digested into a name, so that the result is not cached."""
+    """Error raised for an input of a computation that has no checksum, so that the result cannot be cached."""
 
 
 def cache_folder() -> Path | None:
@@ -84,8 +84,8 @@ def cache_folder() -> Path | None:
 def recomputed() -> Iterator[None]:
     """Switch the cache off inside a ``with`` block or decorated function, also for processes that it starts.
 
-    It serves checks of results, and code that replaces a function or constant of the program at run time, since names
-    of entries do not include that.
+    Use it for checks that must compute a result afresh, and for code that replaces a function or constant of the
+    program at run time: the names of the entries do not depend on such a replacement.
     """
     before = os.environ.get(VARIABLE)
     os.environ[VARIABLE] = OFF
@@ -194,7 +194,7 @@ class CacheEntry:
 
 
 class _Writer(pickle.Pickler):
-    """Pickler that writes references instead of the backend and the specifications."""
+    """Pickler of cache entries that writes references instead of the backend and the specifications."""
 
     def __init__(self, file: io.BytesIO, entry: CacheEntry) -> None:
         super().__init__(file, pickle.HIGHEST_PROTOCOL)
@@ -241,7 +241,7 @@ _ARRAYS = {
 
 
 def _of_program(module: str) -> bool:
-    """Return True if a module belongs to this program."""
+    """Return True if a module, given by its name, is part of this program."""
     return module.removeprefix(provenance.BEFORE).partition(".")[0] in provenance.SOURCES
 
 
@@ -294,7 +294,7 @@ def _remove_oldest(folder: Path) -> None:
 
 @cache
 def _machine() -> str:
-    """Return program, packages and processor as text; the last bits of every number depend on them."""
+    """Return program, packages and processor as one text, since the last bits of computed numbers depend on them."""
     here = provenance.Provenance.here().model_dump(mode="json", exclude={"blas", "system"})
     # the library that computes calibrations, of those that happen to be loaded
     loaded = [loaded_library for loaded_library in threadpool_info() if "numpy" in loaded_library["filepath"]]
@@ -319,7 +319,7 @@ def _digest(*inputs: Any) -> str | None:
 
 
 def _words(value: Any) -> Iterator[str]:
-    """Yield words that identify a value exactly: different values have different words."""
+    """Yield texts that identify a value exactly: two different values never give the same sequence of texts."""
     if value is None or isinstance(value, bool | int | float | complex | bytes):
         yield f"{type(value).__name__} {value!r}"
     elif isinstance(value, str) and not isinstance(value, Enum):

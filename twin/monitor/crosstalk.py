@@ -1,6 +1,8 @@
 """Response of every estimator to elementary motions of bodies, compared with the true change of the camera.
 
-It gives the factors of the printed formulas and the crosstalk: readings of one parameter that changes of another cause.
+An estimator computes the changes of a camera's parameters from the shifts of the monitor's spots. This module gives the
+scale factors of the formulas printed in paper 001 (Wang et al. 2018), and the crosstalk: the change that an estimator
+reports for one parameter although another cause moved the spots.
 """
 
 from __future__ import annotations
@@ -23,7 +25,7 @@ from twin.monitor.motions import ElementaryMotion, line_family, other_motions
 from twin.monitor.truth import truth_jacobian
 
 _SEEN_WITHIN = 0.1
-"""Relative error of a reading up to which the text says that the change is observed."""
+"""Largest relative error of an estimate for which the report says that the monitor observes the change."""
 
 PRINTED = {("paper_single", k): f"eq. ({number})" for k, number in enumerate((3, 2, 5, 7))}
 PRINTED |= {("paper_joint", k): "Table 1, joint" for k in range(4)}
@@ -31,21 +33,21 @@ PRINTED |= {("paper_joint", k): "Table 1, joint" for k in range(4)}
 
 @dataclass(frozen=True)
 class FormulaFactor:
-    """Ratio of a printed formula's reading to the expected one, for the motion for which it was derived.
+    """Ratio of a printed formula's estimate to the expected change, for the motion it was derived for.
 
     Attributes
     ----------
     formula : str
-        Number of the equation or table in the paper.
+        Number of the equation or table in paper 001 (Wang et al. 2018).
     estimator, parameter : str
-        Names of both in the results.
+        Names of the estimator and of the camera parameter in the results.
     motion : str
         Label of the motion.
     by_model : float
-        Reading / change in the paper's own model (thin lens: shift/f, rotation, scale * f).
+        Estimate divided by the change in the paper's own model (thin lens: shift/f, rotation, scale * f).
     by_truth : float
-        Reading / traced change of the real camera; it differs from ``by_model`` by the camera's anamorphism and
-        distortion.
+        Estimate divided by the traced change of the real camera; it differs from ``by_model`` due to the camera's
+        anamorphism and distortion.
     """
 
     formula: str
@@ -58,28 +60,28 @@ class FormulaFactor:
 
 @dataclass(frozen=True, eq=False)
 class CameraCrosstalk:
-    """First-order response of one camera's monitor to each of M elementary motions.
+    """First-order response of one camera's monitor to each of M elementary motions of its bodies.
 
-    All values are per unit of the motion in tables: arcsec, um or ppm.
+    All values are per unit of the motion in tables: arcsec (rotation), um (shift) or ppm (expansion).
 
-    Dimensions: n spots, P camera parameters.
+    Dimensions: n spots, M motions, P camera parameters.
 
     Attributes
     ----------
     motions : tuple of ElementaryMotion
-        Motions, beginning with the four for which the paper derives its formulas.
+        Motions, beginning with the four for which paper 001 (Wang et al. 2018) derives its formulas.
     spot_shift : (2 n, M) ndarray
-        Shifts of the spots, in pixels: row and column of one spot after the other.
+        Shifts of the spots, in pixels: row and column of the first spot, then of the second, and so on.
     true : (P, M) ndarray
-        True change of each camera parameter, in its unit.
+        True change of each camera parameter, in the parameter's unit.
     readings : mapping of str to (P, M) ndarray
-        Estimator -> its readings of these changes.
+        Estimator -> its estimates of these changes.
     factors : tuple of FormulaFactor
-        Factors of the printed formulas.
+        Scale factors of the formulas printed in that paper.
     observability : ObservabilityReport
         Combinations of the motions that the spots can and cannot separate.
     channels : tuple of str
-        Names of the camera's channels.
+        Names of the camera's channels (one spot each).
     """
 
     motions: tuple[ElementaryMotion, ...]
@@ -92,11 +94,11 @@ class CameraCrosstalk:
 
     @property
     def coordinates(self) -> tuple[str, ...]:
-        """Names of the rows of ``spot_shift``, ``left y`` and so on: rows count along y, columns along x."""
+        """Labels of the spot coordinates in ``spot_shift``, "left y", "left x" and so on: image rows count along y."""
         return tuple(f"{channel} {axis}" for channel in self.channels for axis in ("y", "x"))
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the response as plain data for the file crosstalk.json."""
+        """Return the response to elementary motions as plain data for the file crosstalk.json."""
         rows, keys = [], [parameter.key for parameter in parameters.CAMERA_PARAMETERS.values()]
         for k, motion in enumerate(self.motions):
             rows.append(
@@ -117,7 +119,7 @@ class CameraCrosstalk:
         }
 
     def principal_distance_statements(self) -> tuple[str, ...]:
-        """Return sentences on how changes of focus, spacing and size are read as changes of the principal distance."""
+        """Return sentences on how changes of focus, spacing and size appear as changes of the principal distance."""
         out = []
         for k, motion in enumerate(self.motions):
             along_axis = motion.kind == "shift" and motion.axis == 2 and motion.body.count("/") == 2
@@ -143,7 +145,7 @@ class CameraCrosstalk:
 def estimator_gains(
     cameras: Mapping[str, CameraCalibration], prior: Disturbances | None, covariance: np.ndarray | None = None
 ) -> dict[str, np.ndarray]:
-    """Return for each estimator the linear matrix from spot shifts (px) to camera parameters (rad, m).
+    """Return for each estimator the linear map from spot shifts (px) to camera parameters (rad, m), its gain.
 
     Parameters
     ----------
@@ -152,7 +154,7 @@ def estimator_gains(
     prior : Disturbances | None
         Prior of the disturbances; None if there is none.
     covariance : (2 x spots, 2 x spots) ndarray | None
-        Covariance of the spots' shifts, in px^2, which weights them; None for no noise.
+        Covariance of the spots' shifts, in px^2, by which they are weighted; None if they have no noise.
 
     Returns
     -------
@@ -169,19 +171,18 @@ def estimator_gains(
 def crosstalk(experiment: MonitorExperiment, covariance: np.ndarray) -> dict[str, CameraCrosstalk]:
     """Compute the crosstalk table of every camera, for noise-free spots.
 
-    Dimensions: C spots.
-
     Parameters
     ----------
     experiment : MonitorExperiment
         Experiment with the instrument.
     covariance : (2 C, 2 C) ndarray
-        Covariance of the shifts of all spots, in px^2, which determines what combinations they can separate.
+        Covariance of the shifts of all C spots (row and column of each), in px^2. It determines which combinations of
+        motions the spots can separate.
 
     Returns
     -------
     dict of str to CameraCrosstalk
-        Table by camera.
+        Crosstalk table of each camera, by its name.
     """
     instrument = experiment.instrument
     sets = {name: (*line_family(name), *other_motions(instrument, name)) for name in instrument.cameras}

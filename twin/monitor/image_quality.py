@@ -5,11 +5,11 @@ chief ray of the pixel is traced back to the scene, and the beam from that direc
 is the left end of the line (+Y'), -1 the right one.
 
 Wavefront errors are rms over the stop's area. The reference sphere is centred on the pixel, where the chief ray
-arrives, with the radius of the nominal exit pupil; piston and tilt are removed. Best focus is where the rms is least
-along the light, with the exact phase sqrt(1 - u^2 - v^2) of a shift. The MTF is that of the traced pupil, polychromatic
-if the camera describes a band, multiplied by those of the pixel and of the other parts of the band's line CCD. Light
-blocked by prisms and other bodies of the instrument (``scenes.models.shadow``) is missing in both, unless obstruction
-is ignored.
+arrives, with the radius of the nominal exit pupil; piston and tilt are removed. Best focus is where the rms is smallest
+along the light; the phase of a shift is exact, proportional to sqrt(1 - u^2 - v^2) for direction cosines u and v. The
+MTF is that of the traced pupil, polychromatic if the camera describes a band, multiplied by those of the pixel and of
+the other parts of the band's line CCD. Light blocked by prisms and other bodies of the instrument
+(``scenes.models.shadow``) is missing in both, unless obstruction is ignored.
 """
 
 from __future__ import annotations
@@ -57,17 +57,17 @@ CUT_MEAN_DEGREE = 14
 
 
 class PupilMean:
-    """Mean of nodal values over the unobstructed part of each stop.
+    """Mean over the unobstructed part of each stop, from values at the nodes of a quadrature.
 
-    Polynomials continue the values into the shadows, whose contribution is subtracted. They also replace rays in the
-    shadow of edges, which may pass far outside the rims of lenses.
+    Polynomials continue the values into the shadows of bodies, and the contribution of the shadows is subtracted. They
+    also replace rays in the shadow of edges, which may pass far outside the rims of lenses.
 
     Parameters
     ----------
     nodes
-        N nodes of the stop.
+        N quadrature nodes of the stop.
     shadows
-        Shadows of bodies in the B stops (one for each beam); None for free beams.
+        Shadows of bodies in the B stops (one for each beam); None if no body is in the beams.
     free
         True for the illuminated nodes of each stop, (B, N); None if rays in the shadows can be used as well.
     """
@@ -91,18 +91,14 @@ class PupilMean:
         self._added = products(points.real, points.imag, degree)
 
     def __call__(self, values: np.ndarray) -> np.ndarray:
-        """Return the mean (B,) over each stop of values at the nodes, prepared by ``flat``.
-
-        Dimensions: B beams.
-        """
+        """Return the mean over the stop of each of B beams, (B,), from the node values that ``flat`` returned."""
         return np.asarray(np.sum(values * self._share, axis=-1))
 
     def flat(self, values: np.ndarray) -> np.ndarray:
-        """Return values at the nodes of each stop (B, N) without their piston and tilt.
+        """Return values at the nodes of each stop, (B, N), without their mean (piston) and linear part (tilt).
 
-        The result (B, N + Q) has additional nodes in the shadows.
-
-        Dimensions: B beams, N nodes of the stop, Q nodes in the shadows.
+        Q additional nodes in the shadows are appended, so the result is (B, N + Q), for B beams and N nodes of the
+        stop.
         """
         values = values - values[:, :1]
         if self._added is not None:
@@ -123,58 +119,64 @@ _SOME = 1e-3
 
 
 FIELDS = (1.0, 0.7, 0.0, -0.7, -1.0)
-"""Field points, as fractions of half the line, left end first."""
+"""Field points along the line CCD, as fractions of half its length: +1 is its left end (+Y'), -1 its right end."""
 
 PLACES = {"left": 1.0, "centre": 0.0, "right": -1.0}
-"""Fields with names in the results."""
+"""Field points that result files name: name -> position, as a fraction of half the line's length."""
 
 WAVELENGTH = 650e-9
 """Wavelength that is the unit of wavefront errors, in metres."""
 
 RINGS = 7
-"""Rings of the quadrature over the stop: exact for squares of wavefronts up to order 13."""
+"""Number of rings of the quadrature over the stop: exact for squares of wavefronts up to polynomial order 13."""
 
 MOST_BLUR = 10.0
-"""Wavefront error above which no MTF is computed for a vignetted pupil, in waves rms."""
+"""Wavefront error, in waves rms, above which the MTF of a vignetted pupil is not computed."""
 
 _DARKEST = 0.99
-"""Largest fraction of the light that bodies in the beam may block; with more no image quality is given."""
+"""Largest fraction of the light that bodies in the beam may block; above it, no image quality is given."""
 
 COLOURS = 5
-"""Number of Gauss wavelengths of a band: four are accurate to 1e-7 except near cut-offs inside the band, where the MTF
-vanishes.
+"""Number of wavelengths of a Gauss quadrature over a band.
+
+Four are accurate to 1e-7 except near cut-offs inside the band, where the MTF vanishes.
 """
 
 _ROUNDING = 1e-5
-"""Tolerance of fractions outside 0 to 1, and of an error at best focus above that on the line CCD, in waves."""
+"""Rounding tolerance of the physical checks.
+
+A blocked fraction may lie outside 0 to 1 by this amount. A wavefront error at best focus may exceed that on the line
+CCD by this fraction plus this many waves.
+"""
 
 _MTF_ROUNDING = 1e-3
 """Amount by which a computed MTF may lie outside 0 to 1 because of rounding."""
 
 _MOST_WAVES = 1e6
-"""Wavefront error above which a value is not that of an image, in waves rms."""
+"""Largest plausible wavefront error, in waves rms; a larger one means that the result is wrong."""
 
 _FEW, _APART = quadrature.even_disk(500), 0.02
-"""Points of the stop for a check of the area of shadows against their outlines, and the allowed difference."""
+"""Points of the stop, and allowed difference of fractions of the stop, for a check of the light that bodies block.
+
+The fraction from outlines of shadows is compared with that of the points that are blocked.
+"""
 
 AT_ONCE = 40
-"""States traced in one launch, to limit memory: 40 take 60 MB."""
+"""Number of states (perturbed instruments) traced in one launch, to limit memory: 40 take 60 MB."""
 
 
 @dataclass(frozen=True, eq=False)
 class PupilOutline:
-    """Outline of the pupil as seen from the image, in units of its mean radius.
+    """Outline of the pupil as seen from the image, and of the shadows in it, in units of the pupil's mean radius.
 
     The coordinate x is along the line CCD (Y'), y along the track (X').
-
-    Dimensions: K polygons, V vertices.
 
     Attributes
     ----------
     axes : (2, 2) ndarray
         Linear map from the unit circle to the edge of the pupil.
     pieces : (K, V, 2) ndarray
-        Polygons of the shadow in the pupil.
+        Shadows in the pupil, as K polygons of V vertices (x, y).
     """
 
     axes: np.ndarray
@@ -249,35 +251,35 @@ class ImageQuality:
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """Warnings about unknown values, with their reasons."""
+        """Warnings about image quality values that could not be computed, with the reasons."""
         return tuple(
             f"image quality of {name}: {reason}" for name, c in self.cameras.items() for reason in c.reasons if reason
         )
 
     def state(self, number: int) -> dict[str, CameraState]:
-        """Return camera -> its image quality in the state of that number, for files of results."""
+        """Return camera -> its image quality in the state with index ``number``, for result files."""
         positions = {position: self.fields.index(field) for position, field in PLACES.items() if field in self.fields}
         return {name: CameraState(camera, number, positions) for name, camera in self.cameras.items()}
 
 
 @dataclass(frozen=True, eq=False)
 class CameraState:
-    """Image quality of one camera in one state of the instrument, at the fields that have names in files."""
+    """Image quality of one camera in one state of the instrument, at the field points that result files name."""
 
     camera: CameraQuality
     number: int
     places: Mapping[str, int]
 
     def named(self, values: np.ndarray) -> dict[str, float | None]:
-        """Return name of the field -> value in this state, from values (S, F) of all states and fields.
+        """Return name of the field point -> value in this state.
 
-        Dimensions: S states, F fields.
+        ``values`` holds the values in S states at F field points, (S, F).
         """
         return {position: _known(values[self.number, k]) for position, k in self.places.items()}
 
 
 def _known(value: float | np.floating[Any]) -> float | None:
-    """Return a finite number unchanged, and None for NaN or infinity."""
+    """Return a finite number unchanged, and None for NaN or infinity, which JSON cannot hold."""
     return float(value) if np.isfinite(value) else None
 
 
@@ -296,11 +298,14 @@ AT_FIELDS: Record[CameraQuality] = Record(
     Quantity("mtf_along_track", lambda c: c.mtf_along_track, "at Nyquist", "MTF at Nyquist along the track", 4),
     Quantity("light_lost", lambda c: c.light_lost, _TAKEN, "light blocked by bodies in the beam", 2, shown="percent"),
 )
-"""Quantities of image quality that are given at every field; files, reports and scripts follow this list."""
+"""Image quality quantities that are computed at every field point, with their keys, labels and units.
+
+Result files, reports and scripts all take the quantities from this list.
+"""
 
 
 def _at_places(quantity: Quantity[CameraQuality]) -> Quantity[CameraState]:
-    """Return a quantity of all fields and states as the quantity at the named fields in one state."""
+    """Return a quantity for one state at the named field points, made from that for all states and field points."""
     return Quantity(
         quantity.key,
         lambda camera_state: camera_state.named(quantity.of(camera_state.camera)),
@@ -415,14 +420,14 @@ def quality_dicts(
 
 
 _COLUMNS = ("light_lost", "wfe", "wfe_refocused", "defocus", "mtf_along_line", "mtf_along_track")
-"""Names of the arrays of ``CameraQuality`` that are computed together; new ones go at the end."""
+"""Names of the arrays of ``CameraQuality`` that are computed together, in their order; new ones go at the end."""
 
 
 @dataclass(frozen=True, eq=False)
 class _Traced:
-    """Traced beams of B images, each for one state and one field.
+    """Traced beams of B images, each for one state and one field point.
 
-    Dimensions: N nodes of the stop.
+    Dimensions: B images, N nodes of the stop.
 
     Attributes
     ----------
@@ -433,7 +438,7 @@ class _Traced:
     origin : (B, 1, 3) ndarray
         Image points on the line CCD.
     shadows : shadow.Shadows | None
-        Shadows in the beams; None for free beams.
+        Shadows in the beams; None if no body is in them.
     outlines : StopOutlines | None
         Outlines of edges and bodies on the stops; None for a camera whose surfaces have no edges.
     free : (B, N) ndarray | None
@@ -452,7 +457,7 @@ class _Traced:
 
 
 class _CameraBench:
-    """Computation of one camera's image quality, with the data that do not depend on the state."""
+    """Computation of one camera's image quality; it holds the data that do not depend on the state."""
 
     def __init__(
         self,
@@ -494,7 +499,22 @@ class _CameraBench:
         self.assembly = instrument.assembly
 
     def fill(self, states: list[State], which: np.ndarray, out: np.ndarray, reasons: list[str]) -> None:
-        """Compute the image quality of some states; if the light of one is lost, compute both halves separately."""
+        """Compute the image quality of some states and write it to ``out`` and ``reasons``.
+
+        If the light of one state is lost, so that the joint ray trace fails, the states are divided into two halves
+        that are computed separately.
+
+        Parameters
+        ----------
+        states : list of State
+            States (perturbed instruments) to compute.
+        which : ndarray of int
+            Indices of these states in ``out`` and ``reasons``.
+        out : ndarray
+            Array for the results, changed in place.
+        reasons : list of str
+            For each state, why its values are unknown, changed in place.
+        """
         try:
             traced = self._trace([states[s] for s in which])
         except (AimError, BeamMissedError, UnphysicalError) as error:
@@ -524,9 +544,11 @@ class _CameraBench:
                     )
 
     def bodies(self, count: int) -> dict[str, np.ndarray]:
-        """Return each body in a beam -> fraction that it blocks, (S, F); NaN where the light is lost.
+        """Return each body in a beam -> fraction of the stop's area that it blocks, (S, F).
 
-        Dimensions: S states, F fields.
+        The fraction is NaN where the light is lost.
+
+        Dimensions: S states, F field points.
         """
         out: dict[str, np.ndarray] = {}
         known = np.full((count, len(self.points)), np.nan)
@@ -586,9 +608,7 @@ class _CameraBench:
     def _numbers(self, traced: _Traced, which: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return the values of the beams, the fraction of each that is cut off, and whether its MTF is unknown.
 
-        The values (V, B) are those named in _COLUMNS.
-
-        Dimensions: V quantities, B beams.
+        The values are an array (V, B) for the V quantities named in ``_COLUMNS`` and B beams.
         """
         rays, shadows, free = traced.rays, traced.shadows, traced.free
         radius = float(self.model.first_order.exit_pupil_distance[0])
@@ -632,21 +652,24 @@ class _CameraBench:
     def _pupils(
         self, traced: _Traced, rays: ImagingRays, illuminated: np.ndarray, colour: float
     ) -> tuple[PupilStack, np.ndarray, tuple[np.ndarray, np.ndarray]]:
-        """Return the pupils of some beams at a wavelength, whether each is smooth, and the rays' direction cosines.
-
-        Dimensions: B beams, N nodes of the stop.
+        """Return the pupil functions of beams at a wavelength, their smoothness, and the rays' direction cosines.
 
         Parameters
         ----------
+        traced : _Traced
+            Traced beams.
+        rays : ImagingRays
+            Rays of these beams at the wavelength.
         illuminated : (B,) ndarray of int
-            Indices of the beams.
+            Indices of the B beams to use.
         colour : float
             Wavelength, in metres.
 
         Returns
         -------
         tuple
-            Pupils, smoothness (B,), and direction cosines (u, v), (B, N) each.
+            Pupil functions, True for each smooth one (B,), and direction cosines (u, v), (B, N) each for N nodes of the
+            stop.
         """
         # the image's first axis runs along the line, Y', the second along the track, X'
         # per length of the nominal CCD, in which the pixels keep their pitch
@@ -663,13 +686,15 @@ class _CameraBench:
         return pupils, pupils.residual <= WORST_RESIDUAL * colour, (u, v)
 
     def _in_colours(self, traced: _Traced, illuminated: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the transfer functions of beams through lenses, from the rays of each wavelength.
+        """Return the polychromatic transfer functions of beams through lenses, from rays traced at each wavelength.
 
-        They are complex (B, M), with the mask (B,) of the known ones, as from ``_transfer``.
+        All wavelengths refer to one image point, so that lateral colour blurs the image.
 
-        All wavelengths refer to one image point, so that lateral colour blurs.
-
-        Dimensions: B beams, M frequencies.
+        Returns
+        -------
+        tuple of ndarray
+            Complex transfer function (B, M) of B beams at the Nyquist frequency in M directions (along line and track),
+            and a mask (B,), True where it is known.
         """
         total, known = np.zeros((len(illuminated), len(self.frequency)), complex), np.ones(len(illuminated), bool)
         for colour, weight in zip(self.colours, self.weights / np.sum(self.weights), strict=True):
@@ -688,11 +713,15 @@ class _CameraBench:
         colours: np.ndarray,
         weights: np.ndarray,
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Return the optical transfer functions of beams, complex (B, M), and whether each is known, (B,).
+        """Return the optical transfer functions of beams, and whether each could be computed.
 
         Pupils that are partly cut off (vignetted) are integrated line by line.
 
-        Dimensions: B beams, M frequencies.
+        Returns
+        -------
+        tuple of ndarray
+            Complex transfer function (B, M) of B beams at the Nyquist frequency in M directions (along line and track),
+            and a mask (B,), True where it is known.
         """
         known = np.ones(len(pupils.centre), bool)
         if traced.outlines is None or traced.free is None:
@@ -713,14 +742,16 @@ class _CameraBench:
         return total, known
 
     def _hold(self, values: np.ndarray, dark: np.ndarray, shadows: shadow.Shadows | None) -> None:
-        """Check the values (V, B) named in _COLUMNS against physical limits.
+        """Raise UnphysicalError if a computed value is physically impossible; the message names camera and quantity.
 
-        Dimensions: V quantities, B beams.
-
-        Raises
-        ------
-        UnphysicalError
-            A value is impossible; the message names the camera and the quantity.
+        Parameters
+        ----------
+        values : (V, B) ndarray
+            V quantities, named in ``_COLUMNS``, of B beams.
+        dark : (B,) ndarray
+            Fraction of each beam that is blocked.
+        shadows : shadow.Shadows | None
+            Shadows of bodies in the beams; None if there are none.
         """
         # a vignetted or almost blocked beam has a reason instead of numbers
         judged = (dark == 0.0) & (values[0] <= _DARKEST)
@@ -747,7 +778,7 @@ class _CameraBench:
         )
 
     def _note(self, pupils: PupilStack, illuminated: np.ndarray, which: np.ndarray) -> None:
-        """Store the outlines of the pupils of states with all fields illuminated."""
+        """Store the outlines of the pupils of the states in which light reaches all field points."""
         count = len(self.points)
         size = np.sqrt(np.abs(np.linalg.det(pupils.axes)))[:, None, None]
         axes = pupils.axes / size

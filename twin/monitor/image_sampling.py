@@ -1,11 +1,11 @@
 """Sampling of the monitor's pupil for an image, and checks of the computed images.
 
 The field on a pixel is an integral over the aperture; its phase varies the faster, the farther the pixel is from the
-point where the rays arrive. The nodes are therefore chosen by the largest such distance among all pixels and traced
-rays, which includes aperture, extent of the image and aberration. They form a ladder of classes, so that many states
-share one set of nodes.
+point where the rays arrive. The quadrature nodes are therefore chosen by the largest such distance among all pixels and
+traced rays, which includes aperture, extent of the image and aberration. There is a series of ever finer quadratures
+(classes of nodes), so that many states share one set of nodes.
 
-Every image is checked. A second rule, with other radii and other arms, has to give the same values at some pixels; it
+Every image is checked. A second quadrature, with other radii and angles, has to give the same values at some pixels; it
 does not if the wavefront is too rough for the nodes, or if an edge cuts the beam. The light on the CCD has to equal
 that of the rays that fall on it, within what diffraction may carry across the CCD's edge.
 """
@@ -23,34 +23,34 @@ from optics.waves.diffraction import Grid, PupilField, at_intersections
 from twin.framework.provenance import SelfCheck
 
 SPOT_RANGES = (0.25, 0.5, 0.8)
-"""Fractions of the CCD's half size up to which sharp spots may be off its centre, one for each class of nodes.
+"""Largest distances of sharp spots from the CCD's centre, as fractions of its half size, one per class of nodes.
 
-The farther off a spot, the farther its farthest pixel, and the more nodes over the pupil it needs. The estimators
-refuse spots beyond the last fraction.
+A class is a set of quadrature nodes over the pupil. The farther a spot is off centre, the farther its farthest pixel,
+and the more nodes it needs. The estimators refuse spots beyond the last fraction.
 """
 
 _BLUR_STEP = 1.25
-"""Ratio of one class to the next beyond ``SPOT_RANGES``, for blurred spots."""
+"""Ratio of the largest ray distance of one class of pupil nodes to that of the class before it, for blurred spots."""
 
 MOST_PHASE = 400.0
-"""Largest phase of the last class of pupil nodes, in radians from the centre to the edge of the pupil.
+"""Largest phase from the centre to the edge of the pupil, in radians, that the finest class of nodes allows.
 
 It needs 42 000 nodes. A spot that needs more is spread over some hundred times the area of a CCD.
 """
 
 BLUR_PHASE = 1.5
-"""Weight of a blur's phase, relative to that of a tilt as steep as the blur's steepest ray.
+"""Factor by which the phase of an aberration counts more than that of a tilt with the same steepest ray.
 
-A tilt varies along one direction; astigmatism and trefoil vary two and three times around the pupil, and their
-harmonics decay correspondingly later (compared with 72 800 nodes: 3e-6 of the peak for trefoil, less for all other
-terms to Z37).
+It determines how many pupil nodes a blurred spot needs. A tilt varies along one direction; astigmatism and trefoil vary
+two and three times around the pupil, and the harmonics that a quadrature must integrate decay correspondingly later
+(error of this factor, compared with 72 800 nodes: 3e-6 of the peak for trefoil, less for all other terms to Z37).
 """
 
 _SHARP_PHASE = 1.0
-"""Phase due to blur that the margins of ``quadrature.disk_for`` already include, in radians."""
+"""Phase due to blur, in radians, that the number of nodes from ``quadrature.disk_for`` already allows for."""
 
 _WIDER_BEAM = 1.001
-"""Relative growth of the beam's aperture that needs no additional nodes."""
+"""Largest ratio of a beam's aperture to the nominal one that needs no additional nodes."""
 
 GOOD = 1e-4
 """Difference of an image between two quadratures, relative to its peak, above which more nodes are used."""
@@ -91,14 +91,12 @@ class ImageChecks:
     light: float = 0.0
 
     def add(self, difference: np.ndarray, light: np.ndarray) -> None:
-        """Add the checks of further images.
-
-        Dimensions: B images.
+        """Add the checks of B further images.
 
         Parameters
         ----------
         difference : (B,) ndarray
-            Differences of each image between two quadratures, relative to its peak.
+            Difference of each image between two quadratures, relative to its peak.
         light : (B,) ndarray
             Light beyond the allowed range, as a fraction of the channel's light: positive for an excess, negative for a
             deficit.
@@ -108,7 +106,7 @@ class ImageChecks:
         self.light = max(self.light, float(np.max(np.abs(light), initial=0.0)))
 
     def self_checks(self) -> tuple[SelfCheck, ...]:
-        """Return the checks for a manifest; none if no image was made."""
+        """Return the checks in the form of a run's manifest; an empty tuple if no image was made."""
         if not self.images:
             return ()
         refused = f"{self.images} images; images beyond the limit are refused"
@@ -120,17 +118,18 @@ class ImageChecks:
 
 
 class UncertainImageError(BeamMissedError):
-    """Image of the monitor that cannot be computed to within ``WRONG`` of its peak."""
+    """Error that an image of the monitor cannot be computed to within ``WRONG`` of its peak."""
 
 
 @dataclass(frozen=True)
 class NodeClasses:
-    """Ladder of pupil quadratures (classes of nodes), from sharp spots near a CCD's centre to the most blurred ones.
+    """Series of ever finer pupil quadratures (classes of nodes), from sharp centred spots to the most blurred ones.
 
     Attributes
     ----------
     phase_per_pixel : float
-        Phase from the centre to the edge of the nominal pupil, in radians per pixel.
+        Phase difference between the centre and the edge of the nominal pupil for a point one pixel off the spot, in
+        radians per pixel.
     half : tuple of float
         Half size of the CCD (rows, columns), in pixels.
     """
@@ -140,7 +139,7 @@ class NodeClasses:
 
     @property
     def reached(self) -> np.ndarray:
-        """Largest distance of rays from the centre that each class allows, in half diagonals of the CCD."""
+        """Largest distance of a pixel from a ray's arrival point for each class, in half diagonals of the CCD."""
         most = MOST_PHASE / (self.phase_per_pixel * float(np.hypot(*self.half)))
         steps = 1.0 + SPOT_RANGES[-1]
         out = [1.0 + share for share in SPOT_RANGES]
@@ -155,24 +154,26 @@ class NodeClasses:
 
     @property
     def sharp_count(self) -> int:
-        """Number of nodes for sharp spots anywhere in the last of ``SPOT_RANGES``, which every instrument uses."""
+        """Number of pupil nodes for a sharp spot as far off the CCD's centre as the last of ``SPOT_RANGES`` allows."""
         rings, arms = quadrature.disk_size(self.phase(len(SPOT_RANGES) - 1))
         return rings * arms
 
     def nodes(self, number: int) -> PupilNodes:
-        """Return the nodes over the pupil of a class, given by its number."""
+        """Return the quadrature nodes over the pupil of the class with index ``number``."""
         return quadrature.disk_for(self.phase(number))
 
     def second_nodes(self, number: int) -> PupilNodes:
-        """Return the nodes of a second quadrature over the pupil, which checks the images of a class."""
+        """Return the nodes of a second quadrature over the pupil, used to check the images of a class."""
         return quadrature.second_disk_for(self.phase(number))
 
     def class_of(
         self, position: np.ndarray, margin: int = 0, blur: np.ndarray | float = 0.0, widening: np.ndarray | float = 1.0
     ) -> np.ndarray:
-        """Return the first class that suffices for all spots of each state; the number of classes if none does.
+        """Return the first class of nodes that suffices for all spots of each state.
 
-        Dimensions: C columns, S states.
+        If none suffices, the result is the number of classes.
+
+        Dimensions: C channels (one spot each), S states.
 
         Parameters
         ----------
@@ -181,14 +182,14 @@ class NodeClasses:
         margin : int
             Extra pixels rendered on every side of the CCD.
         blur : (C, S) ndarray | float
-            Distance of the farthest rays from there, in pixels.
+            Distance of the farthest rays from the spot's centre, in pixels.
         widening : (C, S) ndarray | float
             Apertures of the beams, relative to the nominal one.
 
         Returns
         -------
         (S,) ndarray of int
-            Class of each state.
+            Index of each state's class.
         """
         half = np.array(self.half)
         wide = np.where(np.asarray(widening) > _WIDER_BEAM, widening, 1.0)
@@ -236,20 +237,18 @@ def energy_excess(
 
     It is positive for an excess and negative for a deficit.
 
-    Dimensions: B images, N rays.
-
     Parameters
     ----------
     light : (B,) ndarray
-        Light on the image, as a fraction of the channel's.
+        Light on each of B images, as a fraction of the channel's light.
     position : (B, N, 2) ndarray
-        Positions of the rays from the centre of the image, (row, column) in pixels.
+        Positions of N rays from the centre of the image, (row, column) in pixels.
     share : (B, N) ndarray
-        Light of each ray, 0 for a lost one.
+        Fraction of the channel's light that each ray carries, 0 for a lost ray.
     half : (2,) ndarray
         Half size of the image (rows, columns), in pixels.
     wings : (B,) ndarray
-        Distance that diffraction reaches, in pixels.
+        Distance over which diffraction may carry light across the edge, in pixels.
     """
     outside = np.max(np.abs(position) - half, axis=-1)
     most = np.sum(share * (outside < wings[:, None]), axis=-1) + LOST

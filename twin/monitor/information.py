@@ -1,9 +1,9 @@
-"""Information of a monitor's light on camera parameters: posterior covariance from derivatives and noise.
+"""Fisher information of the monitor's spots on the camera parameters: posterior covariance from derivatives and noise.
 
-The amounts x ~ N(0, C) of M motions, in standard deviations with correlations C, move the spots by A x and change the
-cameras' parameters by B x. Spots with noise R hold the Fisher information A' R^-1 A on them. The posterior covariance
-of the cameras' parameters is B (C^-1 + A' R^-1 A)^-1 B', which equals B C B' - B C A' (A C A' + R)^-1 A C B' also for
-singular C.
+The amounts x ~ N(0, C) of M motions, in standard deviations with correlation matrix C, move the spots by A x and change
+the cameras' parameters by B x; A and B are the Jacobians. Spots with noise covariance R give x the Fisher information
+A' R^-1 A. The posterior covariance of the cameras' parameters is B (C^-1 + A' R^-1 A)^-1 B', which equals B C B' - B C
+A' (A C A' + R)^-1 A C B' also for singular C.
 """
 
 from __future__ import annotations
@@ -31,26 +31,26 @@ from twin.monitor.truth import ground_geometry
 from twin.sensors.area_detector import EmvaDetector
 
 NOISE = "noise"
-"""Name, among the causes of variance, of the noise of the images."""
+"""Name of the images' noise among the causes of an estimate's variance."""
 _SLOPE = 2  # pixels more on every side of an image, for its slopes
 _PARAMETERS = 4
 
 
 @dataclass(frozen=True, eq=False)
 class Information:
-    """Information of a layout's spots about its cameras.
+    """Fisher information of a monitor layout's spots about its cameras.
 
-    Dimensions: C spots.
+    Dimensions: C spots, D = 2 C spot coordinates (row and column), K cameras.
 
     Attributes
     ----------
     disturbances : Disturbances
-        Prior with its derivatives: D spot coordinates, K cameras.
+        Prior of the motions, with their derivatives of the spot coordinates and of the cameras' parameters.
     noise : (D, D) ndarray
-        Covariance of the shifts due to the noise of the images before and after, in px^2.
+        Covariance of the spot shifts due to the noise of the images before and after the change, in px^2.
     quantities : mapping of str to (n, 4 K) ndarray
-        Name -> n rows of coefficients on the parameters of all cameras; the quantity's variance is the mean of the
-        variances of these linear combinations.
+        Name of a quantity -> n linear combinations of the parameters of all cameras, as rows of coefficients; the
+        quantity's variance is the mean of the variances of these combinations.
     brightest : (C,) ndarray
         Expected signal of every spot's brightest pixel, as a fraction of saturation.
     """
@@ -62,7 +62,7 @@ class Information:
 
     @cached_property
     def gain(self) -> np.ndarray:
-        """Matrix from spot shifts to camera parameters with the smallest variance, (4 K, D), in rad and m per pixel.
+        """Matrix from spot shifts to camera parameters with the smallest variance, (4 K, D), in rad or m per pixel.
 
         Dimensions: K cameras, D spot coordinates (row and column of every spot).
         """
@@ -70,7 +70,7 @@ class Information:
 
     @cached_property
     def splits(self) -> Mapping[str, Split]:
-        """Quantity -> contributions of each motion to its variance, in SI units squared."""
+        """Name of each quantity -> the contribution of each motion to its variance, in SI units squared."""
         return {name: split(rows, self.disturbances, self.noise, self.gain) for name, rows in self.quantities.items()}
 
     def sigma(self, name: str) -> float:
@@ -82,14 +82,18 @@ class Information:
         return float(np.sqrt(np.mean(self.splits[name].sigma_before ** 2)))
 
     def slopes(self, name: str) -> tuple[np.ndarray, np.ndarray]:
-        """Return the derivatives of a quantity's posterior sigma with respect to A, (D, M), and to R, (D, D).
+        """Return the derivatives of a quantity's posterior sigma with respect to the spot Jacobian and to the noise.
 
-        A are the spot shifts (px) per standard deviation of each motion and R is the noise covariance of the spots
-        (px^2); the derivatives are in the quantity's SI unit per px and per px^2. The gain has the smallest variance,
-        so its own change does not contribute: with w = gain' row, the variance changes by 2 w' dA C (A' w - B' row) +
-        w' dR w.
+        The posterior-variance-minimizing gain does not contribute by its own change. With w = gain' q for a row q of
+        the quantity's coefficients, spot Jacobian A, camera Jacobian B, correlations C of the motions and noise
+        covariance R, the variance changes by 2 w' dA C (A' w - B' q) + w' dR w.
 
-        Dimensions: D spot coordinates (row and column of every spot), M motions.
+        Returns
+        -------
+        tuple of ndarray
+            Derivative with respect to A (spot shifts in px per standard deviation of each motion), (D, M), and to R
+            (covariance of the spot noise, px^2), (D, D), in the quantity's SI unit per px and per px^2, for D spot
+            coordinates (row and column of every spot) and M motions.
         """
         prior, rows = self.disturbances, self.quantities[name]
         weights = rows @ self.gain
@@ -98,7 +102,11 @@ class Information:
         return 2.0 * weights.T @ residual / scale, weights.T @ weights / scale
 
     def shares(self, name: str, measured: bool = True) -> dict[str, float]:
-        """Return cause -> its contribution to the variance of a quantity, in SI units squared; causes are independent.
+        """Return cause -> its contribution to the variance of a quantity, in SI units squared.
+
+        A cause is a motion of the prior, or the noise of the images.
+
+        The causes are independent, so that the contributions sum to the variance.
 
         Parameters
         ----------
@@ -130,24 +138,24 @@ def information_of(
     same_shape: bool = False,
     single: bool = True,
 ) -> list[Information]:
-    """Return the information of an instrument's spots, for each prior.
+    """Return the Fisher information of an instrument's monitor spots, one for each prior of the motions.
 
     Parameters
     ----------
     instrument : Instrument
         Instrument.
     prior : sequence of DisturbancesSpec
-        Disturbances files.
+        Disturbances files, each of which specifies a prior of the motions.
     detector : EmvaDetector
         Model of the area CCDs.
     backend : Backend
         Backend of the ray trace.
     ground : GroundGeometry | None
-        Ground geometry of a pair, which adds the height to the quantities.
+        Ground geometry of a stereo pair, which adds the height to the quantities.
     same_shape : bool
-        True to assume the same noise for spots of one camera and one beam width.
+        True to assume the same noise for spots of one camera with the same beam width.
     single : bool
-        True for images in single precision, as elsewhere; False (double) if they are differentiated.
+        True to compute images in single precision, as elsewhere; False (double) if they are differentiated.
 
     Raises
     ------
@@ -173,7 +181,7 @@ def quantity_rows(instrument: Instrument, ground: GroundGeometry | None) -> dict
     The quantities are d_alpha, d_beta, d_gamma (rad) and d_f (m) of every camera, as ``camera/d_alpha``; the
     intersection angle of the first two cameras (rad); and the height (m) at the line's centre.
 
-    Dimensions: n rows of coefficients, K cameras.
+    Dimensions: n linear combinations, over which the quantity's variance is averaged; K cameras with 4 parameters each.
     """
     names = list(instrument.cameras)
     unit = np.eye(_PARAMETERS * len(names))
@@ -192,7 +200,9 @@ def quantity_rows(instrument: Instrument, ground: GroundGeometry | None) -> dict
 
 
 def ground_of(instrument: Instrument) -> GroundGeometry | None:
-    """Return the ground geometry of a pair of known altitude, for the focal lengths along its lines; otherwise None.
+    """Return the ground geometry of a stereo pair of known altitude; None for other instruments.
+
+    It is computed for the focal lengths along the pair's line CCDs.
 
     Raises
     ------
@@ -206,7 +216,7 @@ def ground_of(instrument: Instrument) -> GroundGeometry | None:
 def spot_noise(
     path: MonitorPath, detector: EmvaDetector, same_shape: bool = False, single: bool = True
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the noise covariance of all spot shifts, and how full each spot's brightest pixel is.
+    """Return the noise covariance of all spot shifts, and the signal of each spot's brightest pixel.
 
     The covariance of each spot is twice (images before and after) the Cramer-Rao bound of any unbiased fit of its
     image, with the light of its channel and the instrument's number of frames.
@@ -220,9 +230,9 @@ def spot_noise(
     detector : EmvaDetector
         Model of the area CCDs.
     same_shape : bool
-        True to assume the same shape, but not the same light, for spots of one camera and one beam width.
+        True to assume the same shape, but not the same light, for spots of one camera with the same beam width.
     single : bool
-        True for images in single precision.
+        True to compute the images in single precision.
 
     Returns
     -------

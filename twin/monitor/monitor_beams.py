@@ -1,7 +1,8 @@
 """Beams of the monitor from every pinhole through the camera and back to the area CCD, and their rays.
 
-A beam is limited by the return face's aperture. Rays are aimed at quadrature nodes of that aperture in every state, so
-that its edge is exact; at the CCD each ray is a plane wave. The face is assumed to be evenly illuminated.
+A beam is limited by the aperture of the return face, the mirror surface that sends the light back. Rays are aimed at
+quadrature nodes of that aperture in every state, so that its edge is exact; at the CCD each ray is a plane wave. The
+face is assumed to be evenly illuminated.
 """
 
 from __future__ import annotations
@@ -30,20 +31,22 @@ from twin.monitor.image_sampling import UncertainImageError
 
 @dataclass(frozen=True, eq=False)
 class AimedRays:
-    """Rays from the pinholes, aimed at the nodes, for C channels x S states (all states of a channel together).
+    """Rays from the pinholes, aimed at the aperture's nodes, for C channels x S states.
 
-    Dimensions: N nodes of the aperture.
+    All states of a channel follow one another along the first axis.
+
+    Dimensions: N quadrature nodes of the return face's aperture.
 
     Attributes
     ----------
     position, direction : (C*S, N, 3) ndarray
-        Launch points and unit directions in the world frame.
+        Launch points (metres) and unit directions in the world frame.
     axes : (C*S, 1, 2, 3) ndarray
-        Two axes perpendicular to each channel's beam, along which the aim parameters count.
+        Two unit vectors perpendicular to each channel's beam.
     parameters : (C*S, N, 2) ndarray
-        Aim parameters: components along these axes by which a ray's direction is chosen.
+        Aim parameters: components of a ray's direction along these two vectors.
     jacobian : (C*S, N, 2, 2) ndarray
-        Derivatives of the point where each ray hits the return face with respect to its aim parameters.
+        Derivatives of the point where each ray hits the return face with respect to its aim parameters, in metres.
     """
 
     position: np.ndarray
@@ -57,18 +60,19 @@ class AimedRays:
 class CoarseTrace:
     """Trace with a few rays that finds the spots of C channels in S states (all states of a channel together).
 
-    Dimensions: T Zernike terms.
+    Dimensions: C channels, S states, T Zernike terms.
 
     Attributes
     ----------
     fan : RayFan
         Rays from the pinholes.
     outgoing, back : SystemBatch
-        Systems from the pinholes to the return face, and on to the CCDs.
+        Optical systems from the pinholes to the return face, and from there to the CCDs.
     uploaded : UploadedSystems
-        Systems ``back`` on the device.
+        Systems ``back`` on the computing device.
     aim_change : (2, C*S, T) ndarray
-        Change of the aim parameters relative to the nominal instrument, as Zernike terms on the face.
+        Change of the two aim parameters (ray direction) relative to the nominal instrument, as coefficients of Zernike
+        terms on the return face.
     centre : (C, S, 2) ndarray
         Centres of the spots, (row, column) in pixels from the CCD's centre.
     blur : (C, S) ndarray
@@ -149,34 +153,38 @@ leaves a residual below 1e-7 for smooth surfaces; figures of prisms and mirrors 
 """
 
 SMOOTH = 1e-6
-"""Largest neglected residual of the map from aperture to direction, relative to the beam's aperture.
+"""Largest residual of the map from aperture to ray direction that is neglected, relative to the beam's aperture.
 
 It corresponds to an error of 5e-5 in the density of rays.
 """
 
 TOO_ROUGH = 2e-5
-"""Residual of the map from aperture to direction, relative to the aperture, above which an image is refused.
+"""Residual of the map from aperture to ray direction, relative to the beam's aperture, above which an image is refused.
 
-It corresponds to an error of 1e-3 in the density of rays, and is what all Zernike terms leave.
+It is the residual after a fit of all Zernike terms, and corresponds to an error of 1e-3 in the density of rays.
 """
 
 _COARSE_RINGS = 6
 """Number of rings of the quadrature over the aperture for means, exact for polynomials up to degree 23."""
 
 _SCOUT_RINGS = 4
-"""Rings of the rays that are aimed in every state to find how the launch directions of the others change."""
+"""Number of rings of the few rays that are aimed first in each state, to predict the launch directions of all others.
+"""
 
 AIM_TOLERANCE = 1e-9
-"""Largest distance of a ray from its aperture node, in metres: it shifts a quadrature node, not the ray's own path, by
-4e-8 of the radius.
+"""Largest distance of a ray from the aperture node that it is aimed at, in metres.
+
+It displaces the node by 4e-8 of the aperture's radius, but does not falsify the ray's own path.
 """
 
 _CLOSE_TOLERANCE = 0.01 * AIM_TOLERANCE
-"""Tolerance for the rays from which those of other states are predicted, in metres."""
+"""Aim tolerance, in metres, for the nominal rays, from which the rays of other states are predicted."""
 
 
 class MonitorBeams:
     """Ray trace of the monitor channels of one instrument.
+
+    A channel is the light of one pinhole: through the camera to the return face and back to an area CCD.
 
     Parameters
     ----------
@@ -185,9 +193,9 @@ class MonitorBeams:
     backend
         Backend of the ray trace.
     nodes
-        Pupil quadrature, for all states.
+        Quadrature over the return face's aperture, the same for all states.
     cameras
-        Cameras whose channels are traced; None for all. Values of a channel do not depend on the other channels.
+        Cameras whose channels are traced; None for all cameras. Values of a channel do not depend on the others.
     """
 
     def __init__(
@@ -206,7 +214,7 @@ class MonitorBeams:
 
     @property
     def nodes(self) -> PupilNodes:
-        """Nodes and weights of the quadrature over the aperture."""
+        """Nodes and weights of the quadrature over the return face's aperture."""
         assert self._nodes is not None
         return self._nodes
 
@@ -223,36 +231,37 @@ class MonitorBeams:
 
     @cached_property
     def coarse(self) -> MonitorBeams:
-        """Beams with few nodes: enough for means over the aperture, which are integrals of a smooth function."""
+        """Beams of the same instrument with few nodes: enough for means over the aperture of smooth functions."""
         return self._with(quadrature.disk(_COARSE_RINGS))
 
     @cached_property
     def scout(self) -> MonitorBeams:
-        """Beams with the fewest nodes: enough for the change of a smooth function over the aperture."""
+        """Beams of the same instrument with the fewest nodes, for the change of a smooth function over the aperture."""
         return self._with(quadrature.disk(_SCOUT_RINGS))
 
     @cached_property
     def _smooth(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Matrices of a Zernike series on the nodes, for functions over the aperture that are smooth.
+        """Matrices of a Zernike series at the nodes, for functions over the aperture that are smooth.
 
-        The first gives the T terms from values on the N nodes, (T, N); the others give the values and their derivatives
-        with respect to x and y from the terms, (N, T) each.
+        The first gives the coefficients of T Zernike terms from the values at N nodes, (T, N); the others give the
+        values and their derivatives with respect to x and y from the coefficients, (N, T) each.
         """
         return self._series(MAP_TERMS)
 
     @cached_property
     def _rough(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Matrices of a Zernike series on the nodes, for functions over the aperture with fine structure.
+        """Matrices of a Zernike series at the nodes, for functions over the aperture with fine structure.
 
-        They are the terms from values, and values, x derivatives and y derivatives from terms.
+        They give, in this order, the Zernike coefficients from the values, and the values, x derivatives and y
+        derivatives from the coefficients.
         """
         return self._series(ROUGH_TERMS)
 
     def _series(self, terms: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Return the matrices of a Zernike series with a given number of terms.
 
-        The first gives the terms from values on the nodes; the others give the values and their derivatives with
-        respect to x and y from the terms.
+        The first gives the coefficients from values at the nodes; the others give the values and their derivatives with
+        respect to x and y from the coefficients.
         """
         x, y = self.nodes.x, self.nodes.y
         basis = zernike.basis(terms, x, y)
@@ -262,11 +271,9 @@ class MonitorBeams:
         return solve, basis, dx, dy
 
     def area_ratio(self, u: np.ndarray, v: np.ndarray) -> np.ndarray:
-        """Return the local ratio of areas of maps (x, y) -> (u, v) from the unit disk, at the nodes, (..., N).
+        """Return the local ratio of areas of maps (x, y) -> (u, v) of the unit disk, at N nodes, (..., N).
 
-        It is the determinant of the derivatives of u and v with respect to x and y.
-
-        Dimensions: N nodes of the aperture.
+        It is the determinant of the derivatives of u and v (such as direction cosines) with respect to x and y.
 
         Raises
         ------
@@ -286,7 +293,7 @@ class MonitorBeams:
         return out
 
     def _outgoing(self, placed: PlacedBodies, states: Sequence[State]) -> tuple[RayFan, SystemBatch]:
-        """Return the rays from each pinhole toward the optics, and the systems up to the return face."""
+        """Return the rays launched from each pinhole, and the optical systems from there to the return face."""
         position, direction = [], []
         for channel in self.channels:
             position.append(placed.translation[:, placed.index[channel.reticle_body]])
@@ -299,7 +306,7 @@ class MonitorBeams:
 
     @cached_property
     def target(self) -> np.ndarray:
-        """Points on the return faces that the rays are aimed at, (C, N, 2), in metres of the nominal size.
+        """Points on the return faces that the rays are aimed at, (C, N, 2), in metres of the nominal (unexpanded) face.
 
         Dimensions: C channels, N nodes of the aperture.
         """
@@ -427,9 +434,9 @@ class MonitorBeams:
         return rays
 
     def _where_lost(self, channel: Channel, state: State, position: np.ndarray, direction: np.ndarray) -> str:
-        """Return the element and the body at which the last of a channel's rays (N, 3) are lost.
+        """Return the names of the element and of the body at which the last of a channel's N rays are lost.
 
-        Dimensions: N nodes of the aperture.
+        ``position`` and ``direction`` are the launch points and directions of the rays, (N, 3).
         """
         names = self.instrument.assembly.sequences[f"{channel.key}/monitor"]
         steps = surviving_rays(self.backend, self.instrument.assembly, names, position, direction, state)
@@ -498,23 +505,25 @@ class MonitorBeams:
         return SpotFocus(error / self.wavelength, defocus)
 
     def grid(self, axis: int, margin: int = 0) -> Grid:
-        """Return the pixel centres of the rows (0) or columns (1), in nominal metres from the CCD's centre."""
+        """Return the pixel centres of the rows (axis 0) or columns (axis 1), in nominal metres from the CCD's centre.
+
+        ``margin`` adds that many pixels on both sides.
+        """
         n = self.shape[axis]
         return Grid(-(0.5 * (n - 1) + margin) * self.pitch, self.pitch, n + 2 * margin)
 
     def axis(self, axis: int) -> np.ndarray:
-        """Return the detector coordinates of all rows (0) or columns (1), in metres from the CCD's centre."""
+        """Return the coordinates of all rows (axis 0) or columns (axis 1), in metres from the CCD's centre."""
         return self.grid(axis).points()
 
 
 def _area_ratio(
     u: np.ndarray, v: np.ndarray, series: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the local ratio of areas of maps (x, y) -> (u, v), (..., N), and the series' relative residual, (...).
+    """Return the local area ratio of maps (x, y) -> (u, v), (..., N), and the fits' relative residual, (...).
 
-    The ratio is the determinant of the derivatives of u and v with respect to x and y, from a Zernike series.
-
-    Dimensions: N nodes of the aperture.
+    The ratio is the determinant of the derivatives of u and v with respect to x and y, from a Zernike series fitted to
+    the values at N nodes of the aperture.
     """
     solve, basis, dx, dy = series
     a, b = product(u, solve.T), product(v, solve.T)

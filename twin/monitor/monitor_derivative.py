@@ -1,15 +1,16 @@
 """Derivatives of the monitor's spots with respect to motions of bodies, and the motion models of the estimators.
 
-A spot is the mean of its rays at the area CCD. In reverse mode, two backward passes (row and column) through the
-monitor's sequence give its derivative with respect to the numbers of every surface and to the launch direction of each
-ray. That direction is such that the ray hits its node of the return face, hit(direction, numbers) = node. By the
-implicit function theorem the passes therefore continue through the sequence from pinhole to return face with the
-weights
+A spot's position is the mean of its rays on the area CCD. In reverse mode, two backward passes (row and column) through
+the monitor's sequence of surfaces give its derivative with respect to the parameters of every surface (position,
+orientation, shape) and to the launch direction of each ray. That direction is such that the ray hits its node of the
+return face: hit(direction, parameters) = node. By the implicit function theorem the passes therefore continue through
+the sequence from pinhole to return face with the weights
 
-    w = -(d hit / d direction)^-T  dS / d direction.
+    w = -(d hit / d direction)^-T  dS / d direction
 
-The numbers of the surfaces follow the motions by the complex step in the rigid-body tree. The cost hardly depends on
-the number of motions; forward mode traces all rays once for each of them.
+for the spot position S. How the surfaces' parameters depend on the motions is found by the complex step in the
+rigid-body tree. The cost hardly depends on the number of motions, whereas forward mode traces all rays once for each of
+them.
 
 Estimators that retrace states use the exact spot shifts and camera changes of the motions that they estimate.
 """
@@ -47,7 +48,7 @@ from twin.monitor.truth import LineSight, trace_truth, truth_jacobian
 
 
 def _size_steps(placed: PlacedBodies, bodies: Sequence[str]) -> np.ndarray:
-    """Return the derivative of the sizes of C bodies with respect to the step of each of M states, (C, M)."""
+    """Return the derivatives of the sizes of C bodies with respect to the amplitude of each of M motions, (C, M)."""
     return np.stack([placed.scale[:, placed.index[body]].imag for body in bodies]) / COMPLEX_STEP
 
 
@@ -86,7 +87,7 @@ def ray_tangents(path: MonitorBeams, motions: Sequence[ElementaryMotion]) -> tup
 
 
 def _of_one_structure(path: MonitorBeams, states: list[State]) -> list[State]:
-    """Return states with the same structure, so that the derivatives with respect to all motions share one kernel.
+    """Return states that all have the same numerical structure, so that one compiled kernel serves all motions.
 
     The first state gets the highest figure term of every mirror, with amplitude 0.
     """
@@ -105,14 +106,14 @@ def hit_slopes(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the derivative of the points where rays hit the last element with respect to their launch directions.
 
-    Dimensions: N nodes of the aperture.
+    Dimensions: B systems, N rays of each.
 
     Parameters
     ----------
     backend : Backend
         Backend of the ray trace.
     systems : SystemBatch
-        B systems that carry no derivative.
+        B optical systems that carry no derivative.
     position : (B, N, 3) ndarray
         Launch points in the world frame, in metres.
     direction : (B, N, 3) ndarray
@@ -121,8 +122,8 @@ def hit_slopes(
     Returns
     -------
     tuple of ndarray
-        Two unit vectors perpendicular to each direction, (B, N, 2, 3), and d(hit x, y)/d(rotation toward each), (B, N,
-        2, 2), in metres per radian.
+        Two unit vectors perpendicular to each direction, (B, N, 2, 3), and the derivatives of the hit point (x, y) with
+        respect to a rotation of the direction toward each, (B, N, 2, 2), in metres per radian.
     """
     axes = transverse_axes(direction, np.broadcast_to([0.0, 1.0, 0.0], direction.shape))
     launch, unit = np.repeat(position, 2, axis=1), np.repeat(direction, 2, axis=1)
@@ -158,15 +159,13 @@ def spot_jacobian(path: MonitorBeams, motions: Sequence[ElementaryMotion]) -> np
 
 
 CHUNK = 1 << 17
-"""Rays of all channels together that are traced back at once: they need about 0.3 GB."""
+"""Number of rays, of all channels together, that are traced back at once: they need about 0.3 GB."""
 
 
 def spot_gradient(
     path: MonitorBeams, motions: Sequence[ElementaryMotion], about: State | None = None, chunk: int = CHUNK
 ) -> np.ndarray:
     """Return the derivative of every spot's position with respect to elementary motions, by reverse differentiation.
-
-    Dimensions: C channels (one spot each).
 
     Parameters
     ----------
@@ -175,20 +174,20 @@ def spot_gradient(
     motions : sequence of ElementaryMotion
         M elementary motions.
     about : State | None
-        State at which to differentiate; None for the unperturbed instrument. A motion is added to the component of that
-        name: the rotation vector's, the shift's, the scale's or the figure's.
+        State at which to differentiate; None for the unperturbed instrument. Each motion is added to the same component
+        of that state: of the rotation vector, shift, scale or figure.
     chunk : int
-        Rays of all channels together that are traced back at once, to limit memory.
+        Number of rays, of all channels together, that are traced back at once, to limit memory.
 
     Returns
     -------
     (C, 2, M) ndarray
-        Row and column, in pixels per radian, metre or unit.
+        Derivatives of row and column for C channels (one spot each) and M motions, in pixels per radian, metre or unit.
 
     Raises
     ------
     ValueError
-        A motion has another pivot than the state's motion of that body.
+        A motion's pivot differs from that of the state's motion of the same body.
     AimError
         In the state ``about`` a beam does not reach its return face.
     """
@@ -250,19 +249,17 @@ def spot_gradient(
 
 
 _Tangents = list[dict[Path, np.ndarray]]
-"""For each element of one sequence, number's path -> its derivative with respect to M motions, (C, M).
+"""For each surface of a sequence, path of a parameter -> its derivative with respect to M motions, (C, M).
 
 C is the number of channels; derivatives that are all zero are omitted.
-
-Dimensions: C channels (one spot each).
 """
 
 
 def _dot(tangents: _Tangents, slopes: Sequence[Mapping[Path, np.ndarray]]) -> np.ndarray:
     """Return the derivatives of spots with respect to motions, (C, 2, M), by the chain rule.
 
-    It is the sum over the surfaces' numbers of the derivative of the spot with respect to a number, (C, 2), times that
-    of the number with respect to the motions.
+    It is the sum over the surfaces' parameters of the derivative of the spot (row, column) with respect to a parameter,
+    (C, 2), times that of the parameter with respect to the motions, (C, M).
 
     Dimensions: C channels (one spot each), M motions.
     """
@@ -282,7 +279,10 @@ def _numbers(
     placed: PlacedBodies,
     steps: Sequence[tuple[str, str, int]],
 ) -> tuple[SystemBatch, _Tangents]:
-    """Return the numbers of a sequence of all channels, each twice (for row and column), and their derivatives."""
+    """Return a sequence's systems, each channel twice (for row and column), and the derivatives of their parameters.
+
+    The derivatives are those of the surfaces' parameters with respect to the motions.
+    """
     assembly = path.instrument.assembly
     names = [f"{channel.key}/{sequence}" for channel in path.channels]
     systems = assemble(assembly, names, [middle])
@@ -310,7 +310,7 @@ def _named(motion: ElementaryMotion, about: State) -> State:
 
 
 def _union(states: Sequence[State], about: State) -> State:
-    """Return ``about`` with every figure term of any state, so that all have the same structure."""
+    """Return the state ``about`` with every figure term of any of the states, so that all have the same structure."""
     figures: dict[str, dict[int, float]] = {}
     for state in states:
         for body, motion in state.items():
@@ -320,9 +320,9 @@ def _union(states: Sequence[State], about: State) -> State:
 
 
 def _aimed(path: MonitorBeams, about: State) -> tuple[np.ndarray, np.ndarray]:
-    """Return launch points and directions (C, N, 3) of the rays that hit the nodes of the return faces in the state.
+    """Return launch points and directions of the rays that hit the nodes of the return faces in a state.
 
-    Dimensions: C channels (one spot each), N nodes of the aperture.
+    Both arrays are (C, N, 3) for C channels (one spot each) and N nodes of the aperture.
     """
     nominal = path.nominal
     start = np.broadcast_to(nominal.position, nominal.direction.shape)
@@ -339,8 +339,9 @@ def _aimed(path: MonitorBeams, about: State) -> tuple[np.ndarray, np.ndarray]:
 
 
 STEPS = {"temperature": 0.1, "gradient": 0.1, "index_gradient": 1e-6, "radius": 1e-5, "conic": 1e-5, "index": 1e-6}
-"""Half steps of the central differences, in SI units: spots move by some tenths of a pixel, where they are linear to
-1e-6.
+"""Kind of motion -> half step of its central difference, in SI units.
+
+Spots move by some tenths of a pixel, over which they are linear to 1e-6.
 """
 
 
@@ -406,12 +407,12 @@ def _elementary(component: Component) -> ElementaryMotion:
 
 
 def single_states(components: Sequence[Component], amounts: np.ndarray, thermal: ThermalModel) -> list[State]:
-    """Return M states, each with the amount of one component.
+    """Return M states, in each of which one component of the prior has a given amount.
 
     Parameters
     ----------
     components : sequence of Component
-        M components.
+        M components (motions or temperatures of bodies).
     amounts : (M,) ndarray
         Amounts, in SI units.
     thermal : ThermalModel
@@ -430,11 +431,13 @@ def single_states(components: Sequence[Component], amounts: np.ndarray, thermal:
 def _by_differences(
     components: Sequence[Component], path: MonitorPath, thermal: ThermalModel, instrument: Instrument, backend: Backend
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return derivatives of spots (2 C, M), px, and camera parameters (4 K, M), by central differences.
+    """Return the derivatives of spots and camera parameters with respect to motions, by central differences.
 
-    They are per SI unit of each component.
-
-    Dimensions: C channels (one spot each), M motions, K cameras.
+    Returns
+    -------
+    tuple of ndarray
+        Derivatives of the spot coordinates, (2 C, M), in px, and of the camera parameters, (4 K, M), in rad and m, per
+        SI unit of each motion, for C channels (one spot each), M motions and K cameras.
     """
     steps = np.array([STEPS[c.kind] for c in components])
     # all bodies have their own temperature in every state, as in drawn states, so that none inherits one
@@ -448,13 +451,14 @@ def _by_differences(
 
 
 SMALL: Mapping[str, float] = {"rotate": 1e-6, "shift": 1e-6, "scale": 1e-6, "figure": 1e-8}
-"""Step of each kind of motion, in SI units, for the difference of two derivatives with the same steps."""
+"""Kind of motion -> step of its one-sided difference, in SI units, where two derivatives with equal steps are compared.
+"""
 
 
 def derivative_changes(
     prior: DisturbancePrior, path: MonitorPath, sight: LineSight, thermal: ThermalModel, built: Sequence[State]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return how the derivatives of spots and cameras differ between instruments as built and as designed.
+    """Return how the derivatives of spots and camera parameters of instruments as built differ from the design's.
 
     The derivatives are with respect to the motions of the prior. Both are one-sided differences of exact traces with
     the same steps, so that their truncation errors cancel.
@@ -475,8 +479,8 @@ def derivative_changes(
     Returns
     -------
     tuple of ndarray
-        Differences for spots, (Z, D, M), in pixels, and for parameters, (Z, 4 K, M), per standard deviation of each
-        motion.
+        Differences for spots, (Z, D, M), in pixels, and for parameters, (Z, 4 K, M), in rad and m, per standard
+        deviation of each motion.
 
     Raises
     ------
@@ -497,6 +501,7 @@ def derivative_changes(
     cameras_of_singles = [affected_cameras(single) for single in singles]
 
     def slopes(about: State, which: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return one-sided differences of spots and camera parameters about a state, per unit of each motion."""
         states = [about, *(compose(singles[m], about, bodies) for m in which.tolist())]
         spots = np.moveaxis(path.coarse_trace(states).centre, 1, 2).reshape(-1, len(states))
         truth = sight.truth(states)
@@ -517,7 +522,7 @@ def derivative_changes(
 
 
 def _law(law: TimeLawSpec) -> TimeLaw:
-    """Return the time law that the analysis uses for a time law in a disturbances file."""
+    """Convert a time law of a disturbances file to the class that the analysis uses."""
     return TimeLaw(
         law.kind == "white",
         law.drift,
@@ -534,9 +539,9 @@ def _law(law: TimeLawSpec) -> TimeLaw:
 NEAR = 3.0
 """Shift of a spot, in pixels, up to which the motions of the prior are treated as linear.
 
-The leading nonlinear term is a product of two motions: the shift by one of them times the angle of the other, which is
-its shift over the distance of the spots, some 10 000 px. For 3 px that is 1e-3 px, the noise of a spot, while sigmas of
-a prior are tens of times larger; the few motions of `model` are traced again in every state.
+The leading nonlinear term is a product of two motions: the spot shift due to one times the angle of the other, which is
+its own shift divided by the distance of the spots, some 10 000 px. For 3 px that is 1e-3 px, the noise of a spot, while
+sigmas of a prior are tens of times larger; the few motions of the estimator `model` are traced again in every state.
 """
 LOST = (PhysicalError, ArithmeticError)
 """Exceptions that mean that a state cannot be traced."""
@@ -550,10 +555,9 @@ def motion_models(
     prior: DisturbancePrior | None,
     disturbances: Disturbances | None,
 ) -> dict[str, MotionModel]:
-    """Return for each estimator that is checked by a ray trace the motions that it assumes.
+    """Return for each estimator whose result is checked by a ray trace the motions that it assumes.
 
-    The models are the four motions of each camera that paper 001 considers (line families), and the motions of the
-    prior.
+    The motions are either the four of each camera that paper 001 (Wang et al. 2018) considers, or those of the prior.
 
     Parameters
     ----------
@@ -589,7 +593,7 @@ def motion_models(
 
 
 def _prior_states(prior: DisturbancePrior, thermal: ThermalModel, amounts: np.ndarray) -> list[State]:
-    """Return the states of the instrument that amounts of the prior's motions make.
+    """Return the states of the instrument that result from given amounts of the prior's motions.
 
     The amounts (S, P) of P motions in S states are in prior standard deviations.
     """
@@ -597,7 +601,7 @@ def _prior_states(prior: DisturbancePrior, thermal: ThermalModel, amounts: np.nd
 
 
 def _of_families(cameras: Mapping[str, CameraCalibration], trace: Callable[[Sequence[State]], Retraced]) -> MotionModel:
-    """Return the model of the four motions of each camera for which paper 001 derives its formulas."""
+    """Return the model of the four motions of each camera in the formulas of paper 001 (Wang et al. 2018)."""
     families = {name: line_family(name) for name in cameras}
     spot_slices, count = _spots_of(cameras), sum(map(len, families.values()))
     spots, parameters = np.zeros((spot_slices[-1].stop, count)), np.zeros((4 * len(cameras), count))
@@ -615,9 +619,9 @@ def _spots_of(cameras: Mapping[str, CameraCalibration]) -> list[slice]:
 
 
 def _family_amounts(cameras: Mapping[str, CameraCalibration], noise: np.ndarray) -> np.ndarray:
-    """Return the matrix from spot shifts (px) to the amounts of the cameras' own four motions, (S, P, D).
+    """Return the matrix from spot shifts (px) to the amounts of each camera's own four motions, (S, P, D).
 
-    ``noise`` holds the covariances of the shifts, (S, D, D), in px^2.
+    It is the weighted least-squares solution; ``noise`` holds the covariances of the shifts, (S, D, D), in px^2.
 
     Dimensions: S states, P motions, D spot coordinates (row and column of every spot).
     """
@@ -632,9 +636,9 @@ def _family_amounts(cameras: Mapping[str, CameraCalibration], noise: np.ndarray)
 
 
 def _together(motions: Sequence[ElementaryMotion], amounts: np.ndarray) -> list[State]:
-    """Return the states of the instrument that amounts of elementary motions make.
+    """Return the states of the instrument that result from given amounts of elementary motions.
 
-    The amounts (S, P) of P motions in S states are in SI units; all motions of a body have one pivot.
+    The amounts (S, P) of P motions in S states are in SI units; all motions of a body have the same pivot.
     """
     states: list[State] = []
     for row in amounts.tolist():

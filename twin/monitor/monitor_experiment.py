@@ -1,4 +1,4 @@
-"""Monitoring experiment: perturb the instrument, render images of its area CCDs, and recover the perturbation."""
+"""Monitoring experiment: perturb the instrument, render images of its area CCDs, and estimate the perturbation."""
 
 from __future__ import annotations
 
@@ -65,20 +65,22 @@ _CALIBRATED = (
     "calibration",
     "ground",
 )
-"""Attributes of an experiment that depend on its instrument and detectors only, and are cached on disk."""
+"""Attributes of an experiment that depend only on its instrument and detectors; they are cached on disk."""
 
 
 @shows("resolved.instrument.name", "resolved.instrument.cameras")
 class MonitorExperiment:
-    """Instrument with its detectors and nominal calibration; derived data are computed once, on demand.
+    """Experiment with an instrument, its detectors and nominal calibration.
 
-    An instrument without a monitor has states, their truth and the cameras' images; attributes about spots raise
-    InputError.
+    Derived data are computed once, on demand.
+
+    For an instrument without a monitor, only states, their true changes and the cameras' images are available;
+    attributes about spots raise InputError.
 
     Parameters
     ----------
     resolved
-        Job with everything it names; its perturbation is not used here.
+        Job together with all files that it names; its perturbation is not used here.
     backend
         Backend of the ray trace.
     free_beams
@@ -126,7 +128,7 @@ class MonitorExperiment:
 
     @cached_property
     def detector(self) -> EmvaDetector:
-        """Model of the area CCDs by their data sheet."""
+        """Model of the area CCDs, with the numbers of their data sheet."""
         return EmvaDetector.from_sheet(self.resolved.area_detector, self.exposure)
 
     @cached_property
@@ -136,7 +138,7 @@ class MonitorExperiment:
         return MonitorPath(self.instrument, self.backend)
 
     def _require_sampled(self) -> None:
-        """Raise InputError if the pixels do not sample the spots."""
+        """Raise InputError if the pixels are too coarse to sample the spots."""
         try:
             self.path.response  # noqa: B018 - fitted before anything is traced
         except UnsampledImageError as error:
@@ -147,13 +149,20 @@ class MonitorExperiment:
     def size(self, frames: int = 1, times: int = 0, pictures: int = 0) -> MonitorSize:
         """Return the numbers from which the memory of a job is estimated.
 
-        The arguments are the numbers of frames of each state, of times, and of pixels of other images.
+        Parameters
+        ----------
+        frames : int
+            Number of frames of each state.
+        times : int
+            Number of times of a time series of states; 0 if there is none.
+        pictures : int
+            Number of pixels of all other images.
         """
         phase = self.path.node_classes.phase_per_pixel
         return MonitorSize(len(self.path.channels), *self.path.shape, phase, frames, times, pictures)
 
     def stating(self, resolved: ResolvedJob) -> MonitorExperiment:
-        """Return an experiment on the same instrument with the prior of another job, sharing all that is computed.
+        """Return an experiment on the same instrument with the prior of another job, sharing all computed data.
 
         Parameters
         ----------
@@ -184,12 +193,10 @@ class MonitorExperiment:
 
     @cached_property
     def wide_photons(self) -> np.ndarray:
-        """Expected photons of the unperturbed instrument with the template's margin m, (C, rows + 2m, columns + 2m).
+        """Expected photons of the unperturbed instrument's spots with a margin around each CCD, in double precision.
 
-        They are in double precision: rounding to single precision adds noise that the template's factors would have to
-        follow.
-
-        Dimensions: C channels.
+        The array is (C, rows + 2 m, columns + 2 m) for C channels and a margin of m = ``TEMPLATE_MARGIN`` pixels.
+        Rounding to single precision would add noise that the fit of a spot's template would have to follow.
         """
         return self.path.expected_photons([{}], margin=TEMPLATE_MARGIN, single=False)[0]
 
@@ -216,9 +223,9 @@ class MonitorExperiment:
         return job_state(job, self.thermal, progress, self.motions(job), self.heated(job))
 
     def motions(self, job: JobSpec, time: int | None = None) -> State:
-        """Return the state that a job describes at a time, without its temperatures (``fields``).
+        """Return the state that a job describes at a time, without the temperatures of the bodies (see ``fields``).
 
-        The motions of the job are added to the deformations of bodies from tables of nodes.
+        Rigid and figure motions from the job are added to the deformations of bodies from tables of nodes.
 
         Raises
         ------
@@ -228,7 +235,7 @@ class MonitorExperiment:
         return on_deformed(self.instrument, self.deformed(job), motions_of(job, time), self.heated(job))
 
     def fields(self, job: JobSpec, time: int | None = None) -> dict[str, Temperature]:
-        """Return body -> linear temperature field of a job at time number ``time``, including those of tables.
+        """Return body -> its linear temperature field at the time with index ``time``, including those of tables.
 
         Raises
         ------
@@ -238,7 +245,9 @@ class MonitorExperiment:
         return with_heat(job.fields(time), self.heated(job))
 
     def heated(self, job: JobSpec) -> Mapping[str, HeatedBody]:
-        """Return body -> its table of temperatures; results are stored, since many states may share them.
+        """Return body -> its table of temperatures from the job's files.
+
+        The tables are read once, since many states may share them.
 
         Raises
         ------
@@ -257,7 +266,9 @@ class MonitorExperiment:
         return out
 
     def deformed(self, job: JobSpec) -> Mapping[str, NodalDeformation]:
-        """Return body -> its deformation from a table of nodes; results are stored, since many states may share them.
+        """Return body -> its deformation from a table of nodes in the job's files.
+
+        The tables are read once, since many states may share them.
 
         Raises
         ------
@@ -284,7 +295,7 @@ class MonitorExperiment:
 
     @cached_property
     def nominal_focus(self) -> SpotFocus:
-        """Sharpness of the unperturbed instrument's spots.
+        """Sharpness of the unperturbed instrument's spots: wavefront error and defocus of each.
 
         Raises
         ------
@@ -308,7 +319,10 @@ class MonitorExperiment:
 
     @cached_property
     def _truth_by_family(self) -> dict[str, np.ndarray]:
-        """Camera -> true change of its four parameters, (4, 4), per unit of each of the four motions of paper 001."""
+        """Camera -> true change of its four parameters, (4, 4), per unit of each of four motions.
+
+        They are the motions for which paper 001 (Wang et al. 2018) derives its formulas.
+        """
         names = list(self.instrument.cameras)
         motions = [motion for name in names for motion in line_family(name)]
         jacobians = truth_jacobian(self.instrument, self.backend, motions)
@@ -316,7 +330,10 @@ class MonitorExperiment:
 
     @cached_property
     def cameras(self) -> dict[str, CameraCalibration]:
-        """Camera -> its calibration without images: geometry, and Jacobians of spots and parameters."""
+        """Camera -> its calibration without images: geometry, and Jacobians of spots and parameters.
+
+        The Jacobians are with respect to the four motions that paper 001 (Wang et al. 2018) considers.
+        """
         families = {name: line_family(name) for name in self.instrument.cameras}
         spots = spot_jacobian(self.path, [motion for family in families.values() for motion in family])
         cameras = {}
@@ -350,7 +367,7 @@ class MonitorExperiment:
 
     @cached_property
     def ground(self) -> GroundGeometry | None:
-        """Ground geometry of a pair of known altitude; None for other instruments.
+        """Ground geometry of a stereo pair of known altitude; None for other instruments.
 
         Raises
         ------
@@ -388,7 +405,7 @@ class MonitorExperiment:
 
     @cached_property
     def motion_models(self) -> Mapping[str, MotionModel]:
-        """Estimator -> the motions that it assumes, by which its results are checked with a ray trace.
+        """Estimator -> the motions that it assumes; a ray trace of these motions checks its results.
 
         InputError is raised if the prior names a body that does not exist or cannot move in this way.
         """
@@ -396,7 +413,7 @@ class MonitorExperiment:
         return motion_models(self.path, self.sight, self.cameras, self.thermal, prior, known)
 
     def geometry(self, camera: str) -> MonitorGeometry:
-        """Return the calibrated numbers that the formulas of paper 001 use for one camera.
+        """Return the calibrated numbers that the formulas of paper 001 (Wang et al. 2018) use for one camera.
 
         They are principal distance, plate scale, distortion, distance of the area CCDs and pixel pitch. The papers
         leave alpha and beta of their cos^2 undefined; they are taken as the field angles of the area CCDs.
@@ -423,7 +440,7 @@ class MonitorExperiment:
     def pattern(self, seed: int | Sequence[int]) -> FixedPattern:
         """Return the fixed pattern (response and offset of every pixel) of all area CCDs, (C, rows, columns).
 
-        It is the same before and after. Several seeds give (seeds, C, rows, columns).
+        It is the same in the images before and after the change. Several seeds give (seeds, C, rows, columns).
 
         Dimensions: C channels.
         """
@@ -436,7 +453,7 @@ class MonitorExperiment:
         return pattern
 
     def _drawn_pattern(self, seed: int | tuple[int, ...]) -> FixedPattern:
-        """Draw at random the response (PRNU) and offset (DSNU) of every pixel of all area CCDs."""
+        """Return the random response (PRNU) and offset (DSNU) of every pixel of all area CCDs, determined by a seed."""
         if isinstance(seed, tuple):
             patterns = [self._drawn_pattern(pattern) for pattern in seed]
             return FixedPattern(
@@ -481,8 +498,8 @@ class MonitorExperiment:
         frames : int
             Number of frames per state.
         seed : int | sequence of int
-            Seed of the CCDs and the noise, or one for each state. State number first + s draws from its own stream, so
-            that its frames do not depend on how a series is divided.
+            Seed of the CCDs' fixed pattern and of the noise, or one for each state. Each state has its own random
+            stream, numbered ``first`` + its index, so that its frames do not depend on how a series is divided.
         first : int | (S,) ndarray
             Number of the first state, or of each state.
         """

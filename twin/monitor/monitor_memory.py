@@ -1,8 +1,8 @@
 """Memory of a monitor's images and their measurement, estimated before anything is rendered.
 
-Each pixel of a spot, each traced ray and each recorded frame takes a fixed number of bytes. Their numbers follow from
-the instrument alone; of its optics only the aperture of the returned beam matters, with which the nodes of the pupil
-grow as the square of the CCD's diagonal.
+Each pixel of a spot, each traced ray and each recorded frame takes a fixed number of bytes. How many there are follows
+from the instrument alone; of its optics only the aperture of the returned beam matters: with it and with the square of
+the CCD's diagonal grows the number of pupil nodes.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ LARGEST_FRAMES = 200_000_000
 
 
 def largest_piece(each: int) -> int:
-    """Return the number of states of a series that are rendered at once, so that memory is limited.
+    """Return how many states of a series may be rendered at once without exceeding the memory limit.
 
     Parameters
     ----------
@@ -56,22 +56,22 @@ def pieces(count: int, each: int) -> Iterator[slice]:
 
 
 DRAWN = 410e6
-"""Memory that drawing figures and writing files of a job takes, in bytes; for small jobs it is most of the memory."""
+"""Memory for drawing figures and writing files of a job, in bytes; for small jobs it is most of the memory."""
 _PIXEL = 380.0
 """Bytes per pixel of a spot's image during the measurement and the analysis of its limits: photons 24, fixed pattern
 16, mean frames and maps of the fits before and after 64, images and maps of a state of the prior 85, the current fit
 190.
 """
 _RAY = 600.0
-"""Bytes per traced ray, with its derivatives, aiming data and pupil polynomials at its node."""
+"""Bytes per traced ray, including its derivatives, aim parameters and Zernike polynomials at its pupil node."""
 GREY = 2.0
 """Bytes per pixel of a recorded frame."""
 _OF_COURSE = 6.0
-"""Bytes per pixel and time of a course (time series of states): single-precision photons and a first frame."""
+"""Bytes per pixel and time of a time series of states: single-precision photons and a first frame."""
 WRITTEN = 60.0
-"""Bytes per pixel of a spot's image for drawing and writing: photons, their file, means."""
+"""Bytes per pixel of a spot's image for drawing and writing: photons, their file, and means over frames."""
 _OF_STATE = 24.0
-"""Bytes per pixel of each state rendered at once: photons, and the effect of their noise on the spot."""
+"""Bytes per pixel of each state rendered at once: its photons, and the effect of their noise on the spot's position."""
 
 
 @dataclass(frozen=True)
@@ -81,17 +81,18 @@ class MonitorSize:
     Attributes
     ----------
     spots : int
-        Number of channels of all cameras.
+        Number of channels (one spot each) of all cameras.
     rows, columns : int
         Size of an area CCD, in pixels.
     phase : float
-        Phase from the centre to the edge of the pupil, in radians per pixel.
+        Phase difference between the centre and the edge of the pupil for a point one pixel off the spot, in radians per
+        pixel.
     frames : int
         Number of frames of each state.
     times : int
-        Number of times of a course (time series of states), 0 if there is none.
+        Number of times of a time series of states, 0 if there is none.
     pictures : int
-        Pixels of the frames of all other images.
+        Number of pixels of the frames of all other images.
     """
 
     spots: int
@@ -104,7 +105,7 @@ class MonitorSize:
 
     @classmethod
     def stated(cls, resolved: ResolvedJob, frames: int, times: int = 0, pictures: int = 0) -> MonitorSize:
-        """Return the size as given by an instrument's files, before the instrument is built.
+        """Return the size that an instrument's files specify, before the instrument is built.
 
         Parameters
         ----------
@@ -113,9 +114,9 @@ class MonitorSize:
         frames : int
             Number of frames of each state.
         times : int
-            Number of times of a course (time series of states), 0 if there is none.
+            Number of times of a time series of states, 0 if there is none.
         pictures : int
-            Pixels of the frames of all other images.
+            Number of pixels of the frames of all other images.
 
         Raises
         ------
@@ -195,7 +196,7 @@ def require_memory(resolved: ResolvedJob, size: MonitorSize, detector: EmvaDetec
 
 
 def _lowered(resolved: ResolvedJob, size: MonitorSize, part: str, detector: EmvaDetector) -> tuple[str, Lowered]:
-    """Return a description of a part of the memory, and the number in the files that must be lowered to reduce it."""
+    """Return a description of a part of the memory, and which number in the files must be lowered to reduce it."""
     job, rows, columns, frames = resolved.job, size.rows, size.columns, size.frames
     owner: Spec = job
     least = 1

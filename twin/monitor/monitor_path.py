@@ -37,13 +37,16 @@ _MOST_RAYS = 400_000
 """Largest number of rays traced at once, to limit memory: blurred spots need many."""
 
 WIDEST = 1.1
-"""Growth of the beams' aperture up to which the pixel filter is accurate (to 3e-6 of the peak), and ratio of one filter
-to the next.
+"""Largest ratio of a beam's aperture to that of a pixel filter for which the filter is accurate (3e-6 of the peak).
+
+Filters are computed for apertures in this ratio to one another.
 """
 
 
 class MonitorPath(MonitorBeams):
     """Ray trace and images of the monitor channels of one instrument.
+
+    A channel is the light of one pinhole: through the camera to the return face and back to an area CCD.
 
     Parameters
     ----------
@@ -52,11 +55,11 @@ class MonitorPath(MonitorBeams):
     backend
         Backend of the ray trace.
     nodes
-        Pupil quadrature for all states, without check. By default a quadrature that is accurate to 1e-6 of the peak for
-        the unperturbed instrument's spots anywhere in the last of ``SPOT_RANGES`` of the CCD, out to the far corner,
-        and for images those of ``class_beams``.
+        Pupil quadrature for all states, used without a check of its accuracy. By default a quadrature that is accurate
+        to 1e-6 of the peak for the unperturbed instrument's spots anywhere in the last of ``SPOT_RANGES`` of the CCD,
+        out to the far corner; images take the nodes of ``class_beams``.
     cameras
-        Cameras whose channels are traced; None for all. Values of a channel do not depend on the other channels.
+        Cameras whose channels are traced; None for all cameras. Values of a channel do not depend on the others.
 
     Attributes
     ----------
@@ -82,7 +85,7 @@ class MonitorPath(MonitorBeams):
 
     @cached_property
     def node_classes(self) -> NodeClasses:
-        """Ladder of pupil quadratures from which the images of this instrument take their nodes."""
+        """Series of ever finer pupil quadratures (classes of nodes) that the images of this instrument use."""
         phase = 2.0 * np.pi * self.numerical_aperture * self.pitch / self.wavelength
         return NodeClasses(phase, (0.5 * self.shape[0], 0.5 * self.shape[1]))
 
@@ -103,14 +106,14 @@ class MonitorPath(MonitorBeams):
 
     @cached_property
     def _own_class(self) -> int:
-        """Number of the class of pupil nodes that the unperturbed instrument needs."""
+        """Index of the class of pupil nodes (see ``NodeClasses``) that the unperturbed instrument needs."""
         coarse = self.coarse_trace([{}])
         far = np.broadcast_to((1.0 - 1e-9) * SPOT_RANGES[-1] * 0.5 * np.array(self.shape), coarse.centre.shape)
         number = int(self.node_classes.class_of(far, 0, coarse.blur, coarse.aperture / self.numerical_aperture)[0])
         return self._require_class(number, coarse, 0)
 
     def class_beams(self, number: int) -> MonitorBeams:
-        """Return the beams with the pupil nodes of a class, given by its number."""
+        """Return the monitor's beams traced at the pupil nodes of the class with index ``number``."""
         if not self._sized or number == self._own_class:
             return self
         if number not in self._class_beams:
@@ -118,9 +121,9 @@ class MonitorPath(MonitorBeams):
         return self._class_beams[number]
 
     def class_of(self, coarse: CoarseTrace, margin: int = 0) -> np.ndarray:
-        """Return the class of nodes that suffices for all spots of each state, (S,), as estimated from a few rays.
+        """Return the class of nodes that suffices for all spots of each of S states, (S,), estimated from a few rays.
 
-        Dimensions: S states.
+        A class is one of the pupil quadratures in ``NodeClasses``.
 
         Parameters
         ----------
@@ -137,9 +140,9 @@ class MonitorPath(MonitorBeams):
         return self.node_classes.class_of(position, margin, coarse.blur, widening)
 
     def _require_class(self, number: int, coarse: CoarseTrace, state: int) -> int:
-        """Return the number of a class of pupil nodes if it exists.
+        """Return the number of a class of pupil nodes (a pupil quadrature) if it exists.
 
-        UncertainImageError is raised for a spot that is blurred too much for any class.
+        UncertainImageError is raised for a spot that is blurred too much for the finest class.
         """
         if number >= len(self.node_classes.reached):
             worst = int(np.argmax(coarse.blur[:, state]))
@@ -165,7 +168,7 @@ class MonitorPath(MonitorBeams):
         return self._response(0)
 
     def _response(self, wider: int) -> PixelResponse:
-        """Return the response of pixel and pinhole for beams whose aperture is wider by some factors of ``WIDEST``."""
+        """Return the response of pixel and pinhole for a beam aperture wider by ``WIDEST`` to the power ``wider``."""
         if wider not in self._responses:
             pinhole = self.instrument.spec.autocollimator.reticle.pinhole
             cutoff = 2.0 * self.numerical_aperture * WIDEST**wider / self.wavelength
@@ -218,7 +221,7 @@ class MonitorPath(MonitorBeams):
     def iterate_photons(
         self, states: Sequence[State], margin: int = 0, chunk: int = 32, single: bool = True
     ) -> Iterator[tuple[slice, np.ndarray]]:
-        """Yield the images of ``expected_photons`` for some states at a time: (slice of the states, photons)."""
+        """Yield (slice of the states, expected photons) for a few states at a time, as in ``expected_photons``."""
         for start in range(0, len(states), chunk):
             chunk_states = states[start : start + chunk]
             with one_blas_thread():
@@ -226,12 +229,10 @@ class MonitorPath(MonitorBeams):
             yield slice(start, start + len(chunk_states)), photons
 
     def photons_of(self, state: State, placed: PlacedBodies | None = None, single: bool = False) -> np.ndarray:
-        """Return the expected photons per pixel and frame of one state, (C, rows, columns).
+        """Return the expected photons per pixel and frame of one state, (C, rows, columns) for C channels.
 
-        They equal ``expected_photons`` to the last bit; channels of cameras without moved bodies are rendered only
-        once.
-
-        Dimensions: C channels.
+        They equal those of ``expected_photons`` to the last bit; channels of cameras without moved bodies are rendered
+        only once.
 
         Parameters
         ----------
@@ -302,9 +303,9 @@ class MonitorPath(MonitorBeams):
         return self._parts[names]
 
     def _at_rest(self, single: bool) -> tuple[np.ndarray, int]:
-        """Return the photons of the unperturbed instrument, (C, rows, columns), and the class of pupil nodes they need.
+        """Return the unperturbed instrument's photons, (C, rows, columns) for C channels, and its class of nodes.
 
-        Dimensions: C channels.
+        The class is the index of the quadrature (``NodeClasses``) that the images need.
         """
         if single not in self._rested:
             photons, number = self._render([{}], 0, single)
@@ -314,14 +315,12 @@ class MonitorPath(MonitorBeams):
     def _render(
         self, states: Sequence[State], margin: int, single: bool, coarse: CoarseTrace | None = None
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Return the expected photons, each state with the pupil nodes of its class, and the classes.
-
-        Dimensions: S states, C channels.
+        """Return the expected photons of states, and the class of pupil nodes with which each was computed.
 
         Returns
         -------
         tuple of ndarray
-            Photons (S, C, rows + 2 margin, columns + 2 margin), and classes (S,).
+            Photons (S, C, rows + 2 margin, columns + 2 margin) for S states and C channels, and classes (S,).
 
         Raises
         ------
@@ -350,13 +349,16 @@ class MonitorPath(MonitorBeams):
     def _images(
         self, states: Sequence[State], coarse: CoarseTrace, number: int, margin: int, single: bool
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Return the photons of states, (S, C, ...), with nodes of one class, and the class that each needs, (S,).
+        """Return the photons of states, computed with nodes of one class, and the class that each state needs.
 
         States for which two quadratures over the pupil disagree need a larger class. A beam that is partly cut off
         (vignetted) gets the last class: each quadrature has its own error at the beam's edge, and two may agree by
         chance.
 
-        Dimensions: S states, C channels.
+        Returns
+        -------
+        tuple of ndarray
+            Photons (S, C, rows, columns) for S states and C channels, and classes (S,).
 
         Raises
         ------
@@ -411,14 +413,25 @@ class MonitorPath(MonitorBeams):
     def _require_energy(
         self, images: np.ndarray, rays: CcdRays, share: np.ndarray, margin: int, known_bad: np.ndarray
     ) -> np.ndarray:
-        """Raise UncertainImageError if the light of images (C*S, R, C) does not equal that of their rays.
+        """Raise UncertainImageError if the light of an image does not equal that of the rays that fall on it.
 
-        Dimensions: C channels, S states, R rows.
+        Parameters
+        ----------
+        images : (C * S, R, K) ndarray
+            Images of R rows and K columns for C channels x S states (all states of a channel together).
+        rays : CcdRays
+            Traced rays of these images.
+        share : ndarray
+            Fraction of the channel's light that each ray carries.
+        margin : int
+            Extra pixels rendered on every side of the CCD.
+        known_bad : ndarray of bool
+            True for images that are already known to be inaccurate; they are not checked.
 
         Returns
         -------
-        (C*S,) ndarray
-            Light beyond the allowed range.
+        (C * S,) ndarray
+            Light beyond the allowed range, as a fraction of the channel's light.
         """
         half = 0.5 * np.array(self.shape) + margin
         wings = np.full(len(images), WINGS * self.wavelength / (2.0 * np.pi * self.numerical_aperture * self.pitch))
@@ -437,23 +450,21 @@ class MonitorPath(MonitorBeams):
 
     @property
     def light_per_pixel(self) -> np.ndarray:
-        """Factor from an image of unit power to photons per pixel and frame, (C,), in m^2.
+        """Factor from an image of unit power (1/m^2) to photons per pixel and frame, (C,) for C channels, in m^2.
 
-        It is photons per frame times the pixel's area.
-
-        Dimensions: C channels.
+        It is the channel's photons per frame times the pixel's area.
         """
         return np.array([channel.photons * self.pitch**2 for channel in self.channels])
 
 
 class _OnSpots(MonitorBeams):
-    """Monitor beams whose positions on the CCD count from the centre of their own spot, wherever it is."""
+    """Monitor beams whose positions on the CCD are measured from the centre of their own spot."""
 
     def _with(self, nodes: PupilNodes) -> MonitorBeams:
         return _OnSpots(self.instrument, self.backend, nodes, self.cameras)
 
     def _require_on_ccd(self, channel: Channel, position: np.ndarray) -> None:
-        """Accept every spot, since its CCD is centred on it."""
+        """Do nothing, since every CCD is centred on its spot."""
 
     def rays(self, states: Sequence[State], coarse: CoarseTrace | None = None) -> CcdRays:
         rays = super().rays(states, coarse)
@@ -465,12 +476,9 @@ class _OnSpots(MonitorBeams):
 class SpotPath(_OnSpots, MonitorPath):
     """Optical path of a monitor whose area CCDs were centred on their spots when the instrument was built.
 
-    It serves spots of instruments that are not built as designed.
+    It is used for instruments that are not built as designed, whose spots are not at their nominal positions.
     """
 
     def class_of(self, coarse: CoarseTrace, margin: int = 0) -> np.ndarray:
-        """Return the class of pupil nodes that suffices for all spots of each state, centred on their CCDs, (S,).
-
-        Dimensions: S states.
-        """
+        """Return the class of pupil nodes that suffices for all spots of each of S states, (S,), with centred spots."""
         return super().class_of(replace(coarse, centre=np.zeros_like(coarse.centre)), margin)

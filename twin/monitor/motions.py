@@ -14,7 +14,7 @@ from scenes.specs.instrument import BASE, CENTRAL_PRISM
 _UNITS = {"rotate": ("arcsec", ARCSEC), "shift": ("um", 1e-6), "scale": ("ppm", 1e-6), "figure": ("nm", 1e-9)}
 _AXES = "XYZ"
 FIGURE_TERMS = {4: "power", 5: "astigmatism", 6: "astigmatism", 7: "coma", 8: "coma"}
-"""Noll index of each Zernike term of a mirror's figure in the tables -> its name."""
+"""Noll index -> name, for each Zernike term of a mirror's figure that the tables contain."""
 
 
 @dataclass(frozen=True)
@@ -72,12 +72,12 @@ class ElementaryMotion:
                 raise ValueError(f"a motion is a rotate, shift, scale or figure, not a {self.kind!r}")
 
     def state(self, amount: float) -> State:
-        """Return the state with only this motion of the given amount, in SI units."""
+        """Return the state of the instrument with only this motion, of the given amount in SI units."""
         return {self.body: self.motion(amount)}
 
 
 def line_family(camera: str) -> tuple[ElementaryMotion, ...]:
-    """Return the four motions for which paper 001 derives its formulas.
+    """Return the four motions for which paper 001 (Wang et al. 2018) derives its formulas.
 
     They are the line CCD shifted along X and Y and rotated about Z, and the optics scaled. The scale enlarges mirrors
     and spacings together and keeps the focal plane in focus, with detectors of unchanged size: it changes the principal
@@ -123,5 +123,8 @@ def _six(body: str, name: str, pivot: str) -> list[ElementaryMotion]:
 
 
 def pivot_states(motions: Sequence[ElementaryMotion]) -> list[State]:
-    """Return for each motion the unperturbed state with its pivot and figure term, for derivatives about that state."""
+    """Return for each motion the unperturbed state, with the motion's pivot and (at zero amplitude) its figure term.
+
+    Derivatives with respect to the motions are taken about these states.
+    """
     return [m.state(0.0) for m in motions]

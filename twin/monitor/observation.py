@@ -1,7 +1,7 @@
-"""Observation of states of an instrument: trace, render, expose and recover them.
+"""Observation of states of an instrument: trace rays, render and expose images, and recover the changes from them.
 
-The main job, courses (time series of states), studies, the live twin, error budgets and random states all use it; their
-differences are in `ObservationOptions`.
+The main job, time series, studies, the live twin, error budgets and random states all use it; their differences are in
+`ObservationOptions`.
 """
 
 from __future__ import annotations
@@ -29,11 +29,12 @@ LOST = (AimError, BeamMissedError)
 """Exceptions that mean that the light of a state does not reach the area CCDs."""
 
 Record: TypeAlias = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray | MeasuredSpots, np.ndarray]]
-"""Function that exposes the detectors, with its own random streams.
+"""Function that exposes the detectors to light: from expected photons and state numbers to frames before and after.
 
-From expected photons (S, C, rows, columns) of S states and C channels, and state numbers (S,), it returns the frames
-before, (C, frames, rows, columns) for all states or (S, C, frames, rows, columns), or already measured spots before;
-and the frames after, (S, C, frames, rows, columns).
+Its arguments are the expected photons (S, C, rows, columns) of S states and C channels, and the state numbers (S,),
+which select random streams. It returns two things: the frames before the change, (C, frames, rows, columns) for all
+states or (S, C, frames, rows, columns), or else the already measured spots before; and the frames after the change, (S,
+C, frames, rows, columns).
 """
 
 
@@ -46,9 +47,9 @@ class ObservationOptions:
     record : Record
         Function that exposes the detectors: from expected photons and state numbers to frames before and after.
     centroid : str
-        Centroid method of the spots: ``ml``, ``gaussian`` or ``energy``.
+        Centroid method of the spots: ``ml`` (maximum likelihood), ``gaussian`` or ``energy``.
     chunk : int
-        Number of states processed at once; the last digits of a state depend on the others in its chunk.
+        Number of states processed at once; the last digits of a state's results depend on the others in its chunk.
     single : bool
         True to render in single precision.
     omit : callable | None
@@ -58,7 +59,7 @@ class ObservationOptions:
         True to use the experiment's prior, and to check results by a ray trace of its motions; False to report standard
         deviations due to noise alone.
     keep_parts : bool
-        True to return the parts of the noise, which are large.
+        True to return the contributions to the noise separately, which takes much memory.
     frames : int | None
         Number of frames averaged into each recorded image; None if frames are recorded one by one.
     """
@@ -78,18 +79,16 @@ class ObservationOptions:
 class Light:
     """Light of S states on the area CCDs before detection, with the true changes of the cameras.
 
-    Dimensions: C channels.
-
     Attributes
     ----------
     numbers : (S,) ndarray of int
-        Numbers of the states.
+        Numbers of the states, which select random streams.
     placed : PlacedBodies
-        Bodies of the states.
+        Positions of the bodies in the states.
     truth : Truth
         True changes of the cameras.
     photons : (S, C, rows, columns) ndarray
-        Expected photons per pixel and frame.
+        Expected photons per pixel and frame on the CCDs of C channels.
     """
 
     numbers: np.ndarray
@@ -122,7 +121,7 @@ class Observation:
 
     @property
     def numbers(self) -> np.ndarray:
-        """Numbers of the states that could be measured, which select their random streams."""
+        """Numbers of the states that could be measured; a state's number selects its random stream."""
         return self.light.numbers[self.measured]
 
     @property
@@ -137,16 +136,14 @@ def observe(
     how: ObservationOptions,
     numbers: Sequence[int] | np.ndarray | None = None,
 ) -> Iterator[Observation]:
-    """Trace, render, expose and recover states, some at a time.
-
-    Dimensions: S states.
+    """Trace, render, expose and recover states, ``how.chunk`` states at a time.
 
     Parameters
     ----------
     experiment : MonitorExperiment
         Experiment with the instrument.
     states : sequence of State
-        States to observe.
+        S states to observe.
     how : ObservationOptions
         Options.
     numbers : (S,) array_like of int | None
@@ -192,9 +189,7 @@ def light_of(
     single: bool = True,
     photons: np.ndarray | None = None,
 ) -> Light:
-    """Trace and render states together.
-
-    Dimensions: C channels.
+    """Trace and render states together: return their expected photons and the cameras' true changes.
 
     Parameters
     ----------
@@ -207,7 +202,7 @@ def light_of(
     single : bool
         True to render in single precision.
     photons : (S, C, rows, columns) ndarray | None
-        Expected photons, if already rendered.
+        Expected photons for S states and C channels, if already rendered.
 
     Raises
     ------
@@ -291,7 +286,9 @@ def read(experiment: MonitorExperiment, light: Light, how: ObservationOptions) -
 
 
 def shared_detector(experiment: MonitorExperiment, frames: int, seed: int, stray: np.ndarray | float = 0.0) -> Record:
-    """Return a `Record` that exposes every state with the same detectors, against one nominal measurement.
+    """Return a `Record` function that exposes all states with the same detectors.
+
+    Changes are relative to one measurement of the nominal state.
 
     Parameters
     ----------
@@ -300,9 +297,9 @@ def shared_detector(experiment: MonitorExperiment, frames: int, seed: int, stray
     frames : int
         Number of frames of each exposure.
     seed : int
-        Seed of the detectors and all noise; each state has its own stream.
+        Seed of the detectors and all noise; each state has its own random stream.
     stray : ndarray | float
-        Photons added to those of the nominal spots.
+        Photons per pixel and frame added to those of the nominal spots.
     """
     before = experiment.frames_before(frames, seed, stray)
     return lambda photons, numbers: (before, experiment.frames_after(photons, frames, seed, numbers))
@@ -320,7 +317,7 @@ class StateReader:
     seed
         Seed of all noise.
     centroid
-        Centroid method of the spots: ``ml``, ``gaussian`` or ``energy``.
+        Centroid method of the spots: ``ml`` (maximum likelihood), ``gaussian`` or ``energy``.
     """
 
     def __init__(self, experiment: MonitorExperiment, frames: int, seed: int, centroid: str = "ml") -> None:
@@ -344,22 +341,19 @@ class StateReader:
         return judged_spots(clean, self.frames, self.experiment.calibration, self.centroid)
 
     def read(self, state: State, noise: bool = True, number: int = 0, single: bool = False) -> Observation:
-        """Trace, render and recover a state.
-
-        Dimensions: C channels.
+        """Trace and render one state, expose it, and recover the cameras' changes from its images.
 
         Parameters
         ----------
         state : State
             Body -> motion, as returned by ``MonitorExperiment.state``.
         noise : bool
-            True to expose frames. False to measure the expected images, (1, C, rows, columns); sigmas are those that
-            the noise of the frames would cause.
+            True to expose frames. False to measure the expected images, (1, C, rows, columns) for C channels; sigmas
+            are those that the noise of the frames would cause.
         number : int
-            Number of the state, which selects its random stream; for a course (time series of states), the number of
-            the time.
+            Number of the state, which selects its random stream; in a time series, the number of the time.
         single : bool
-            True to render in single precision, as for all times of a course.
+            True to render in single precision, as for all times of a time series.
 
         Raises
         ------

@@ -1,7 +1,8 @@
-"""Table of what every estimator reads in each state: value, standard deviations and true change.
+"""Table of the changes that every estimator reports in each state: value, standard deviations and true change.
 
-The table is made once for a state or a course (time series of states). JSON files, the terminal, reports, CSV tables,
-scripts, studies and the live page are views of it. The parameters are declared in `analysis.monitor.parameters`.
+A change as reported by an estimator is called its reading. The table is made once for a state or a time series; JSON
+files, the terminal, reports, CSV tables, scripts, studies and the live page present parts of it. The parameters are
+declared in `analysis.monitor.parameters`.
 """
 
 from __future__ import annotations
@@ -27,28 +28,28 @@ from twin.monitor.truth import Truth
 
 @dataclass(frozen=True, eq=False)
 class Reading:
-    """One change as read by one estimator: a row of the table, in the unit of the parameter.
+    """One change as estimated by one estimator: a row of the table, in the unit of the parameter.
 
     Numbers are arrays over S states, (S,), or floats of one state. For a whole time series they are root mean squares.
 
     Attributes
     ----------
     group : str
-        Camera, or group of what two cameras read together.
+        Name of the camera; ``intersection_angle`` or ``ground`` for quantities of two cameras together.
     parameter : Parameter
         Parameter that changes.
     estimator : str
         Name of the estimator.
     true : float or (S,) ndarray
-        True change from the exact trace; NaN for a measurement.
+        True change from the exact trace; NaN for a real measurement, whose true change is unknown.
     value : float or (S,) ndarray
-        Value of the reading.
+        Estimated change.
     error : float or (S,) ndarray
         Value minus true change.
     sigma : float or (S,) ndarray
         Total standard deviation of the error.
     noise : float or (S,) ndarray
-        Standard deviation from the noise of the images alone.
+        Standard deviation due to the noise of the images alone.
     """
 
     group: str
@@ -62,7 +63,7 @@ class Reading:
 
     @property
     def camera(self) -> str:
-        """Name of the camera that changes; empty for what two cameras read together."""
+        """Name of the camera that changes; empty for quantities of two cameras together."""
         return "" if self.group in (ANGLE_GROUP, GROUND_GROUP) else self.group
 
     @property
@@ -79,9 +80,9 @@ class Reading:
 
     @property
     def ratio(self) -> float:
-        """Error divided by its standard deviation; NaN for a missing reading.
+        """Error divided by its standard deviation; NaN for a missing estimate.
 
-        Without noise it is infinite unless the error is only rounding.
+        With a standard deviation of zero it is infinite, unless the error is only rounding.
         """
         if self.sigma > 0.0 or math.isnan(self.sigma):
             return float(self.error / self.sigma)
@@ -89,16 +90,16 @@ class Reading:
 
     @property
     def size(self) -> float:
-        """Value divided by its standard deviation."""
+        """Estimated change divided by its standard deviation."""
         return float(self.value / self.sigma) if self.sigma > 0.0 else 0.0
 
     @property
     def far(self) -> bool:
-        """True if the error is so many standard deviations large that reports mark it."""
+        """True if the error, in standard deviations, exceeds the limit above which reports mark it."""
         return abs(self.ratio) > FAR
 
     def shown(self, value: float, sign: bool = False) -> str:
-        """Format a number of this reading with the digits that its sigma justifies.
+        """Format a number of this estimate with the digits that its standard deviation justifies.
 
         Parameters
         ----------
@@ -111,11 +112,11 @@ class Reading:
 
     @property
     def read(self) -> str:
-        """Text of the value with its standard deviation and unit."""
+        """Text of the estimated change with its standard deviation and unit."""
         return f"{self.shown(self.value)} ± {self.shown(self.sigma)} {self.parameter.unit}"
 
     def group_in(self, nested: dict[str, Any]) -> dict[str, Any]:
-        """Return the part of nested results to which this reading belongs; it is added if missing.
+        """Return the part of nested results that this estimate belongs to; it is added if missing.
 
         Parameters
         ----------
@@ -125,7 +126,7 @@ class Reading:
         return nested["cameras"].setdefault(self.camera, {}) if self.camera else nested.setdefault(self.group, {})
 
     def each(self, of: Callable[[Any], Any]) -> Reading:
-        """Return the reading with a function applied to each of its numbers.
+        """Return a copy with a function applied to each of its numbers (true change, value, error, sigmas).
 
         Parameters
         ----------
@@ -138,22 +139,22 @@ class Reading:
 
 @dataclass(frozen=True, eq=False)
 class ReadingTable:
-    """Readings of S states.
+    """Table of the changes that all estimators report in S states.
 
     Attributes
     ----------
     rows : tuple of Reading
-        Readings, ordered by group, change and estimator.
+        One row for each change and estimator, ordered by group, change and estimator.
     ground_residuals : mapping
-        Estimator -> residual ground errors after a correction by its readings, RMS over the line, (S,): further keys of
-        its group in files.
+        Estimator -> ground errors, (S,), that remain after a correction with its estimates, RMS over the line. In files
+        they are further keys of the group ``ground``.
     """
 
     rows: tuple[Reading, ...]
     ground_residuals: Mapping[str, Mapping[str, Any]]
 
     def __iter__(self) -> Iterator[Reading]:
-        """Iterate over the readings (rows of the table)."""
+        """Iterate over the rows of the table, one for each change and estimator."""
         return iter(self.rows)
 
     def at(self, state: int) -> ReadingTable:
@@ -172,12 +173,12 @@ class ReadingTable:
 
     @property
     def rms(self) -> ReadingTable:
-        """Table of the root mean squares over the states, for the cameras and their intersection angle."""
+        """Table of root mean squares over the states, for the cameras' changes and the angle between two cameras."""
         rows = (row.each(lambda number: float(np.sqrt(np.mean(np.square(number))))) for row in self.rows)
         return ReadingTable(tuple(row for row in rows if row.group != GROUND_GROUP), {})
 
     def of(self, estimator: str) -> tuple[Reading, ...]:
-        """Return the rows of one estimator's readings.
+        """Return the rows of the table that belong to one estimator.
 
         Parameters
         ----------
@@ -187,14 +188,14 @@ class ReadingTable:
         return tuple(row for row in self.rows if row.estimator == estimator and not np.all(np.isnan(row.sigma)))
 
     def by_change(self) -> list[list[Reading]]:
-        """Return for each change the list of its readings by all estimators."""
+        """Return for each change the rows of all estimators that report it."""
         out: dict[tuple[str, str], list[Reading]] = {}
         for row in self.rows:
             out.setdefault((row.group, row.parameter.key), []).append(row)
         return list(out.values())
 
     def row(self, group: str, key: str, estimator: str) -> Reading:
-        """Return the reading of one change by one estimator.
+        """Return the row of one change by one estimator.
 
         Parameters
         ----------
@@ -209,7 +210,7 @@ class ReadingTable:
         return next(row for row in self.rows if (row.group, row.parameter.key, row.estimator) == wanted)
 
     def groups(self, truth: str = "") -> dict[str, Any]:
-        """Return the table as JSON files nest it.
+        """Return the table as nested plain data for JSON files.
 
         The groups are ``cameras`` by name, ``intersection_angle`` and ``ground``, each by estimator.
 
@@ -241,12 +242,12 @@ class ReadingTable:
 
     @staticmethod
     def joined(parts: Sequence[ReadingTable]) -> ReadingTable:
-        """Return one table for the states of several tables, one table after the other.
+        """Return one table whose states are those of several tables, one table after the other.
 
         Parameters
         ----------
         parts : sequence of ReadingTable
-            Tables with the same rows.
+            Tables with the same rows (changes and estimators).
         """
         names = ("true", "value", "error", "sigma", "noise")
         rows = tuple(
@@ -263,7 +264,7 @@ class ReadingTable:
 
 
 def plain(number: Any) -> Any:
-    """Return a float or nested lists, as JSON holds them; negative zero becomes zero, NaN becomes None."""
+    """Return a number or array as a float or nested lists for JSON: negative zero becomes zero, NaN becomes None."""
     if isinstance(number, float):
         return None if math.isnan(number) else number + 0.0
     return [plain(item) for item in np.asarray(number).tolist()]
@@ -276,9 +277,9 @@ def reading_table(
     ground: GroundGeometry | None = None,
     prior: Disturbances | None = None,
 ) -> ReadingTable:
-    """Return the table of all readings from the results of the estimators.
+    """Return the table of all changes that the estimators report, from their results.
 
-    A change that no motion of the prior causes has no estimate by the estimators that need a prior; it is NaN.
+    For a change that no motion of the prior causes, the value of an estimator that needs a prior is NaN.
 
     Parameters
     ----------
@@ -287,9 +288,9 @@ def reading_table(
     cameras : mapping of str to CameraCalibration
         Calibration of each camera.
     truth : Truth | None
-        True changes of the same states; None for a measurement.
+        True changes of the same states; None for a real measurement.
     ground : GroundGeometry | None
-        Ground geometry of a pair of known altitude, for the true ground errors.
+        Ground geometry of a stereo pair of known altitude, for the true ground errors.
     prior : Disturbances | None
         Prior of the estimators that need one; None if there is none.
     """
@@ -299,10 +300,7 @@ def reading_table(
     def add(
         group: str, which: Iterable[Parameter], true: np.ndarray | None, read: Mapping[str, Sequence[np.ndarray]]
     ) -> None:
-        """Append the rows of a group of changes from arrays (S, P) of their numbers.
-
-        Dimensions: S states, P changes.
-        """
+        """Append the rows of a group of changes from arrays of their numbers, (S, P) for S states and P changes."""
         for k, parameter in enumerate(which):
             for estimator, (values, sigmas, noises) in read.items():
                 value = values[:, k]
@@ -347,10 +345,8 @@ def reading_table(
 
 
 def _sigma(combination: np.ndarray, covariance: np.ndarray) -> np.ndarray:
-    """Return the standard deviations (S, P) of P linear combinations of a camera's four parameters.
+    """Return the standard deviations of P linear combinations of a camera's four parameters, (S, P) for S states.
 
     ``combination`` holds the coefficients (P, 4), ``covariance`` the covariances of the parameters (S, 4, 4).
-
-    Dimensions: S states.
     """
     return np.asarray(np.sqrt(np.einsum("pi,sij,pj->sp", combination, covariance, combination)))

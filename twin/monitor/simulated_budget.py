@@ -1,8 +1,8 @@
-"""Error budget of a monitor: random states of each cause, rendered, measured and converted to angles.
+"""Error budget of a monitor by simulation: random states due to each cause, rendered, measured, converted to angles.
 
-The first line is the noise of the centroid; each other line is one cause of a disturbances file. A line is the error of
-one spot's position as an angle, displacement / principal distance, at 3 sigma: three times the rms over random states,
-all spots and both axes.
+The first line of the budget is the noise of the centroid; each other line is one cause of a disturbances file. A line
+is the error of one spot's position as an angle, displacement / principal distance, at 3 sigma: three times the rms over
+random states, all spots and both axes.
 """
 
 from __future__ import annotations
@@ -28,10 +28,10 @@ from twin.monitor.observation import ObservationOptions, observe, shared_detecto
 from twin.monitor.truth import Truth
 
 _CENTROID = "centroid"
-"""Name of the line for the noise of the image alone."""
+"""Name of the budget line for the noise of the image alone."""
 
 ALLOWED = 0.1 * ARCSEC
-"""Error of one line for which the allowed input is computed: three standard deviations, in radians."""
+"""Angle error at three standard deviations, in radians, for which each line's allowed input is computed."""
 _SEARCH_STEPS = 4
 
 _PARAMETER_FIELDS = ("d_alpha_rad", "d_beta_rad", "d_gamma_rad", "d_f_m")
@@ -73,16 +73,16 @@ class BudgetLine:
 
 @dataclass(frozen=True, eq=False)
 class CombinedErrors:
-    """Errors of all causes together, from T trials.
+    """Errors due to all causes together, from T random trials.
 
     Attributes
     ----------
     spot : tuple of float
-        Three sigma of a spot's angle error per axis and its standard deviation, in radians.
+        Three sigma of a spot's angle error per axis, and its standard deviation, in radians.
     parameters : mapping
-        Estimator -> parameter -> (three sigma, its standard deviation) of reading - truth, in radians and metres, over
-        trials and both cameras. A change of the camera itself by the focal plane's temperature (its line CCD expands)
-        is not an error of the reading.
+        Estimator -> parameter -> (three sigma, its standard deviation) of estimate - truth, in radians and metres, over
+        trials and both cameras. The change of the camera itself when the focal plane's temperature expands its line CCD
+        does not count as an error of the estimate.
     """
 
     spot: tuple[float, float]
@@ -90,7 +90,7 @@ class CombinedErrors:
 
 
 class ErrorBudget:
-    """Simulation of an error budget.
+    """Simulation of a monitor's error budget.
 
     Parameters
     ----------
@@ -107,7 +107,7 @@ class ErrorBudget:
     Raises
     ------
     InputError
-        The disturbances are not of this instrument, or one of their causes has the name of a fixed line.
+        The disturbances do not belong to this instrument, or one of their causes has the name of a fixed line.
     """
 
     def __init__(self, spec: ErrorBudgetSpec, resolved: ResolvedJob, backend: Backend, seed: int) -> None:
@@ -125,7 +125,7 @@ class ErrorBudget:
 
     @property
     def causes(self) -> tuple[str, ...]:
-        """Names of the causes in the order of the disturbances file, without those that are zero."""
+        """Names of the causes in the order of the disturbances file, without those whose sigma is zero."""
         return tuple(dict.fromkeys(c.cause for c in self.prior.components))
 
     @property
@@ -156,7 +156,7 @@ class ErrorBudget:
         return self._line(name, _shifts(self.experiment, states), value, unit)
 
     def input_of(self, cause: str) -> tuple[float, str]:
-        """Return three standard deviations of a cause, and their unit; raise ValueError if there is no such cause."""
+        """Return three standard deviations of a cause and their unit; raise ValueError if there is no such cause."""
         components = self.prior.of_causes((cause,)).components
         if not components:
             raise ValueError(f"error budget: no cause {cause!r}; there are {', '.join(self.causes)}")
@@ -166,7 +166,7 @@ class ErrorBudget:
         return 3.0 * first.sigma / first.unit_size, first.unit
 
     def states(self, causes: Sequence[str], trials: int, stream: int) -> list[State]:
-        """Return random states of some causes, drawn independently.
+        """Return random states in which the named causes act, each drawn independently from its prior.
 
         Parameters
         ----------
@@ -183,9 +183,9 @@ class ErrorBudget:
         return states_of(amounts, prior.components, self.experiment.thermal)
 
     def warmed_focal_planes(self, warmer: float) -> tuple[float, float]:
-        """Return the true change of principal distance of warmer focal planes, and its reading, in metres.
+        """Return the true change of principal distance due to warmer focal planes, and its estimate, in metres.
 
-        The reading is by eq. (7) of paper 001.
+        The estimate is by eq. (7) of paper 001 (Wang et al. 2018).
 
         Parameters
         ----------
@@ -203,8 +203,9 @@ class ErrorBudget:
     def halved_glass(self, slope: float) -> tuple[float, float, float]:
         """Compare the spots' response to a temperature gradient before and after halving the 180-deg prisms' glass.
 
-        Rhomboid prisms take over half of the sideways transfer of the light. The same gradients across the prism, once
-        along its y and once along its z, act on both instruments.
+        In the second instrument, longer rhomboid prisms take over half of the sideways shift of the light by the
+        180-deg prisms. The same gradients across the 180-deg prisms, once along their y and once along their z, act on
+        both instruments.
 
         Parameters
         ----------
@@ -239,7 +240,7 @@ class ErrorBudget:
         return glass[0], glass[1], rms[1] / rms[0]
 
     def _transfers(self) -> list[np.ndarray]:
-        """Return for every 180-deg prism the vector from where light enters to where it leaves it, in its frame."""
+        """Return for every 180-deg prism the vector from where light enters to where it leaves, in its own frame."""
         tree = self.experiment.instrument.assembly.tree
         out = []
         for channel in self.experiment.instrument.channels:
@@ -248,10 +249,12 @@ class ErrorBudget:
         return out
 
     def _centroid_line(self) -> BudgetLine:
-        """Return the line of the energy centroid in single frames, with the light at which it is 0.1 arcsec.
+        """Return the budget line for the noise of the energy centroid in single frames.
 
-        Between shot noise and read noise the scatter is no power law of the light, so the allowed light is searched
-        for.
+        The allowed input is the light at which that noise is 0.1 arcsec.
+
+        Between shot noise and read noise the scatter is no power law of the light, so the allowed light is found by a
+        numerical search.
         """
         scatter = self._centroid_scatter(1.0)
         target = np.log(ALLOWED / (3.0 * self.radians_per_pixel))
@@ -264,9 +267,9 @@ class ErrorBudget:
         return self._line(_CENTROID, scatter, light, "photons per frame", light * float(np.exp(share[-1])))
 
     def _centroid_scatter(self, light: float) -> np.ndarray:
-        """Return the energy centroids of single frames minus their mean, (frames, C, 2) px, at a fraction of the light.
+        """Return the energy centroids of single frames minus their mean, (frames, C, 2) px for C channels.
 
-        Dimensions: C channels.
+        ``light`` is the light as a fraction of the nominal light.
         """
         count = max(self.spec.trials, 2)
         setup, stream = self.experiment, np.random.SeedSequence(self.seed, spawn_key=(8,))
@@ -280,11 +283,9 @@ class ErrorBudget:
         return np.asarray((position - position.mean(axis=0)) * np.sqrt(count / (count - 1.0)))
 
     def _line(self, name: str, shifts: np.ndarray, value: float, unit: str, allowed: float | None = None) -> BudgetLine:
-        """Return the line of the budget from spot displacements (S, C, 2), px.
+        """Return a line of the budget from spot displacements (S, C, 2) for S states and C channels, px.
 
-        Without ``allowed`` the error is taken as proportional to the input.
-
-        Dimensions: S states, C channels.
+        Without ``allowed`` the allowed input follows from an error proportional to the input.
         """
         angle = self.radians_per_pixel * shifts
         three_sigma, sigma = _three_sigma(angle)
@@ -293,9 +294,9 @@ class ErrorBudget:
         return BudgetLine(name, three_sigma, sigma, (float(axes[0]), float(axes[1])), value, unit, float(allowed))
 
     def together(self, progress: Progress = lambda fraction, text: None) -> CombinedErrors:
-        """Simulate all causes together through noisy images and every estimator.
+        """Simulate all causes together, with noisy images that every estimator evaluates.
 
-        Each image is the mean of as many frames as the budget's ``frames``.
+        Each image is the mean of as many frames as the key ``frames`` of the budget specifies.
         """
         progress(0.0, "all causes: states")
         states = self.states(self.causes, self.spec.all_together, len(self.lines))

@@ -1,4 +1,4 @@
-"""Course of an instrument (time series of its states): states, the monitor's images and their analysis."""
+"""Time series of an instrument's states (a course): the states, the monitor's images and their analysis."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ from twin.monitor.observation import LOST, ObservationOptions, observe, shared_d
 from twin.monitor.reading_table import ReadingTable, reading_table
 
 LARGEST_SERIES = 200_000_000
-"""Largest number of pixels of a series' first frames, which stay in memory: about 1.2 GB.
+"""Largest number of pixels of a time series' first frames, which stay in memory: about 1.2 GB.
 
 There is one such frame for each time and channel.
 """
@@ -41,28 +41,28 @@ There is one such frame for each time and channel.
 
 @dataclass(frozen=True, eq=False)
 class TimeSeries:
-    """Results of a course, a time series of T states of an instrument.
+    """Results of a time series of T states of an instrument (a course).
 
-    Dimensions: C spots.
+    Dimensions: T times, C spots.
 
     Attributes
     ----------
     times : (T,) ndarray
         Times, in seconds.
     temperatures : mapping
-        Node path -> its temperature change at each time, perturbation included.
+        Path of a body -> its temperature change at each time, perturbation included.
     motions : mapping
-        Node path -> its motion at each time, perturbation included, for the nodes that the course moves.
+        Path of a body -> its motion at each time, perturbation included, for the bodies that the time series moves.
     shown : int
         Index of the time for which the run's other files and figures are made.
     angle : float
         Angle between two cameras in the nominal state, in radians; NaN unless there are two.
     readings : ReadingTable
-        True changes and readings at all times, against one nominal measurement.
+        True and estimated changes at all times, relative to one nominal measurement.
     smoothed : SmoothedCourse | None
         Estimates from all measurements together; None without a prior.
     shift : (T, 2 C) ndarray
-        Shifts of the spots, in their order, in pixels.
+        Shifts of the spots (row and column of each), in pixels.
     shift_covariance : (T, 2 C, 2 C) ndarray
         Covariance of the shifts, in px^2.
     photons : (T, C, rows, columns) ndarray of float32
@@ -76,7 +76,7 @@ class TimeSeries:
     evidence : SpotEvidence
         Goodness of fit of all spots.
     curvature : mapping of str to Curvature
-        Estimator -> test of the linearity of its motions, at all times.
+        Estimator -> test at all times of the linearity of the motions that it assumes.
     agrees : (T,) ndarray of bool
         True where the shifts agree with the prior; the false-alarm rate is that of all times together.
     """
@@ -100,11 +100,11 @@ class TimeSeries:
 
     @property
     def sigma_holds(self) -> np.ndarray:
-        """True at the times at which the standard deviations are valid, (T,): spots and readings are as assumed.
+        """True at the times at which the standard deviations are valid, (T,) for T times.
+
+        They are valid where the spots and the shifts pass the tests of their assumptions.
 
         It is False at all times if the measurements together contradict the prior or its time laws.
-
-        Dimensions: T times.
         """
         agrees = self.agrees & (self.smoothed is None or self.smoothed.consistency.agrees)
         return agrees & np.all(
@@ -112,7 +112,7 @@ class TimeSeries:
         )
 
     def doubts(self, spots: Sequence[str]) -> tuple[str, ...]:
-        """Return statements on invalid sigmas and on readings recomputed because of nonlinearity, without full stops.
+        """Return sentences on invalid sigmas and on estimates recomputed because of nonlinearity, without full stops.
 
         Parameters
         ----------
@@ -141,7 +141,7 @@ class TimeSeries:
         return tuple(out)
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the contents of course.json, the file of results of a time series.
+        """Return the contents of course.json, the result file of a time series.
 
         They are those of truth.json and recovered.json, with a list over the times for each number.
         """
@@ -149,7 +149,7 @@ class TimeSeries:
         return numbers
 
     def group(self, name: str) -> dict[str, Any] | None:
-        """Return a group of readings as in course.json, including filtered and smoothed ones; None if there is none.
+        """Return a group of changes as in course.json, with filtered and smoothed estimates; None without it.
 
         Parameters
         ----------
@@ -165,7 +165,7 @@ class TimeSeries:
 
 
 def _angle(course: TimeSeries) -> dict[str, Any] | None:
-    """Return what is read of the intersection angle over the course, with its nominal value; None without an angle."""
+    """Return the estimated angle between two cameras over the time series, with its nominal value; None without one."""
     group = course.group("intersection_angle")
     return None if group is None else {"nominal_deg": float(np.degrees(course.angle))} | group
 
@@ -185,12 +185,12 @@ _MOTIONS: Record[Sequence[Motion]] = Record(
 
 
 def _agreement(course: TimeSeries) -> dict[str, Any] | None:
-    """Return the test of all measurements of the course against the prior as plain data; None without a prior."""
+    """Return the test of all measurements of the time series against the prior, as plain data; None without a prior."""
     return None if course.smoothed is None else course.smoothed.to_dict()
 
 
 def _between(course: TimeSeries) -> dict[str, Any] | None:
-    """Return the smoothed changes at times between those of the course as plain data; None if there are none."""
+    """Return the smoothed changes at times between the measurements, as plain data; None if there are none."""
     return course.smoothed.between_dict() if course.smoothed and len(course.smoothed.times) else None
 
 
@@ -210,14 +210,14 @@ COURSE: Record[TimeSeries] = Record(
 
 
 def series_states(experiment: MonitorExperiment, job: JobSpec) -> list[State]:
-    """Return the state of the instrument at each time of a job's course (time series).
+    """Return the state of the instrument at each time of a job's time series (course).
 
     Parameters
     ----------
     experiment : MonitorExperiment
         Experiment with the instrument.
     job : JobSpec
-        Job with a course, checked by ``scenes.specs.job.checked_nodes``.
+        Job with a time series, checked by ``scenes.specs.job.checked_nodes``.
 
     Raises
     ------
@@ -245,14 +245,14 @@ def run_series(
     states: Sequence[State],
     advance: Callable[[int], None] = lambda done: None,
 ) -> TimeSeries:
-    """Trace, render, expose and recover all times of a course against one nominal measurement.
+    """Trace, render, expose and recover all times of a time series, relative to one nominal measurement.
 
     Parameters
     ----------
     experiment : MonitorExperiment
         Experiment with the instrument.
     resolved : ResolvedJob
-        Job with a course; its frames and seed are used.
+        Job with a time series (course); its frames and seed are used.
     states : sequence of State
         States from ``series_states``.
     advance : callable
@@ -343,7 +343,7 @@ def run_series(
 
 
 def too_large(job: JobSpec, k: int, reason: str) -> InputError:
-    """Return the error for a state, that at time number ``k``, which cannot be rendered."""
+    """Return the input error for the state at time number ``k`` that cannot be rendered, with the reason."""
     course = _course(job)
     changed = {"temperature": list(course.temperature), "motion": list(course.motion)}
     parts = {name: f"{name}s of {', '.join(nodes)}" for name, nodes in changed.items() if nodes}
@@ -356,7 +356,7 @@ def too_large(job: JobSpec, k: int, reason: str) -> InputError:
 
 
 def _course(job: JobSpec) -> CourseSpec:
-    """Return the course of a job: its times, and the temperatures and motions at these."""
+    """Return the specification of a job's time series: its times, with the temperatures and motions at each."""
     assert job.course is not None
     return job.course
 
@@ -368,7 +368,7 @@ MIN_LIGHT = 0.5
 def _warnings(
     experiment: MonitorExperiment, course: CourseSpec, saturated: np.ndarray, share: np.ndarray
 ) -> tuple[str, ...]:
-    """Return warnings for the user about saturated pixels and lost light in the images of a course."""
+    """Return warnings for the user about saturated pixels and lost light in the images of a time series."""
     out = []
     for i, channel in enumerate(experiment.path.channels):
         bad = np.flatnonzero(saturated[:, i])
@@ -387,37 +387,36 @@ def _warnings(
 
 
 _AS_GOOD = 3.0
-"""Difference of log likelihood ratios, a factor 20 of likelihood, below which the spots do not discriminate two bodies.
-"""
+"""Difference of log likelihoods (a factor 20 of likelihood) below which the spots do not show which body jumped."""
 MOST_BETWEEN, LARGEST_BETWEEN = 7, 400
-"""Largest number of smoothed times between two times of a course, and in total."""
+"""Largest numbers of smoothed times that are inserted: between two times of a course (time series), and in total."""
 
 
 @dataclass(frozen=True, eq=False)
 class SmoothedCourse:
-    """Estimates over a course (time series) from all its measurements together, using the time laws of the prior.
+    """Estimates over a time series from all its measurements together, using the time laws of the prior.
 
-    Dimensions: F times, T times.
+    Dimensions: T times of measurements, F times between them.
 
     Attributes
     ----------
     name : str
         Name of the prior.
     changes : ReadingTable
-        Changes at all times of the course, by the estimators `filtered` (from the measurements up to each time) and
+        Changes at all times of the series, by the estimators `filtered` (from the measurements up to each time) and
         `smoothed` (from all).
     times : (F,) ndarray
-        Times between those of the course, in seconds.
+        Times between those of the measurements, in seconds.
     between : ReadingTable
         Changes at these times.
     innovations : (T,) ndarray
-        Chi-square of each measurement against its prediction from those before.
+        Chi-square of each measurement against its prediction from the measurements before it.
     each : int
         Degrees of freedom of each innovation.
     consistency : Consistency
         Chi-square test of the whole series.
     jumps : tuple of Jump | None
-        Detected jumps; None if the prior has no jumps.
+        Detected jumps; None if the prior allows no jumps.
     jump_false_alarm : float
         Probability that a jump is detected in a series without any.
     """
@@ -452,7 +451,7 @@ class SmoothedCourse:
         )
 
     def between_dict(self) -> dict[str, Any]:
-        """Return the changes at times between those of the course as plain data for course.json."""
+        """Return the smoothed changes at times between the measurements, as plain data for course.json."""
         return {"times_s": self.times.tolist(), **self.between.groups()}
 
     def to_dict(self) -> dict[str, Any]:
@@ -502,11 +501,11 @@ class CourseSmoother:
     Parameters
     ----------
     prior
-        Prior with its time laws; without it (None) nothing is smoothed.
+        Prior with its time laws; without one (None) nothing is smoothed.
     cameras
         Calibration of each camera.
     ground
-        Ground geometry of a pair of known altitude, else None.
+        Ground geometry of a stereo pair of known altitude, else None.
     times
         Times of the measurements, in seconds, ascending.
     """
@@ -524,12 +523,12 @@ class CourseSmoother:
         self._noise: SeriesNoise | None = None
 
     def add(self, recovery: Recovery) -> Recovery:
-        """Store shifts and noise of some states, and return the recovery without the noise maps.
+        """Store shifts and noise of some states, and return the recovery without its large per-pixel noise maps.
 
         Parameters
         ----------
         recovery : Recovery
-            Recovery of the next states, with the parts of their noise.
+            Recovery of the next states, with the separate contributions to their noise.
         """
         if recovery.parts is None:
             return recovery
@@ -539,16 +538,14 @@ class CourseSmoother:
     def take(self, shift: np.ndarray, before: NoiseParts, after: NoiseParts) -> None:
         """Store the shifts and the noise of states that were measured elsewhere.
 
-        Dimensions: S states.
-
         Parameters
         ----------
         shift : (S, 2 C) ndarray
-            Shifts (after - before) of the next states, in pixels.
+            Shifts (after - before) of C spots (row and column of each) in the next S states, in pixels.
         before : NoiseParts
-            Noise of the C spots before, the same at every call.
+            Noise of the C spots before the change, the same at every call.
         after : NoiseParts
-            Noise of the S C spots after, state by state.
+            Noise of the S C spots after it, state by state.
         """
         if self._noise is None:
             self._noise = SeriesNoise(before, window_of(shift.shape[1]))
@@ -556,7 +553,7 @@ class CourseSmoother:
         self._shifts.append(shift)
 
     def smoothed(self) -> SmoothedCourse | None:
-        """Return the smoothed changes of all stored states; None without a prior, and for a single time."""
+        """Return the smoothed changes of all stored states; None without a prior, or for a single time."""
         prior, noise, times = self._prior, self._noise, self._times
         if prior is None or noise is None or len(times) < 2:
             return None

@@ -24,7 +24,7 @@ LINE_POINTS = 41
 """Number of points along the line CCD from which its roll and the principal distance are determined."""
 
 ACROSS = np.array([0.0, 1.0, 0.0])
-"""Direction in the world near which the first transverse axis of a chief ray is taken."""
+"""Direction in the world frame; the first transverse axis of each chief ray is chosen as near to it as possible."""
 
 
 @shows("cameras", "principal_distance", "angle [deg]", "angle_change [arcsec]", "lines")
@@ -69,9 +69,10 @@ class Truth:
         return replace(self, cameras=cameras, angle_change=self.angle_change[states], lines=lines)
 
     def vector(self, camera: str) -> np.ndarray:
-        """Return the true d_alpha, d_beta, d_gamma (rad) and d_f (m) of a camera, (S, 4).
+        """Return the true d_alpha, d_beta, d_gamma (rad) and d_f (m) of a camera, (S, 4) for S states.
 
-        Dimensions: S states.
+        They are the rotations of the line of sight about the nominal camera's Y, X and Z, and the change of the
+        principal distance.
 
         Parameters
         ----------
@@ -81,16 +82,14 @@ class Truth:
         return self.cameras[camera].vector
 
     def ground_error(self, geometry: GroundGeometry) -> np.ndarray:
-        """Return the errors (S, 3) of ground points located with the nominal cameras, in metres.
+        """Return the errors of ground points located with the nominal cameras, (S, 3) for S states, in metres.
 
         The components are along track, across track and up.
-
-        Dimensions: S states.
 
         Parameters
         ----------
         geometry : GroundGeometry
-            Geometry of the pair over the ground.
+            Geometry of the stereo pair over the ground.
         """
         lines = np.moveaxis(self.lines, 0, 1)
         return geometry.found(lines[1:], lines[:1])
@@ -111,7 +110,7 @@ def half_fields(instrument: Instrument, distance: Mapping[str, float]) -> dict[s
 
 
 def ground_geometry(instrument: Instrument, distance: Mapping[str, float]) -> GroundGeometry | None:
-    """Return the ground geometry of a pair of known altitude; None for other instruments.
+    """Return the ground geometry of a stereo pair of known altitude; None for other instruments.
 
     Parameters
     ----------
@@ -146,7 +145,10 @@ def line_points(instrument: Instrument, camera: str) -> np.ndarray:
 
 
 def line_in_world(instrument: Instrument, camera: str, placed: PlacedBodies) -> np.ndarray:
-    """Return the points of the line CCD in the world, (S, LINE_POINTS, 3), in metres; complex if ``placed`` is."""
+    """Return the points of the line CCD in the world frame for S states, (S, LINE_POINTS, 3), in metres.
+
+    The array is complex if ``placed`` is, for derivatives by the complex step.
+    """
     position = line_points(instrument, camera)
     line = np.stack([np.zeros_like(position), position, np.zeros_like(position)], axis=-1)
     return points_to_world(placed, line_body(f"{BASE}/{camera}"), line)
@@ -208,7 +210,10 @@ class LineSight:
         return self.truth_of(self.trace(states, placed) if states else self.nominal[:, :0])
 
     def truth_of(self, sight: np.ndarray) -> Truth:
-        """Return the true changes of S states from directions of sight (cameras, S, LINE_POINTS, 3)."""
+        """Return the true changes of the cameras in S states, from traced lines of sight.
+
+        ``sight`` holds the directions of the lines of sight in the world frame, (cameras, S, LINE_POINTS, 3).
+        """
         sight = np.concatenate([self.nominal, sight], axis=1)
         cameras: dict[str, LineChange] = {}
         principal: dict[str, float] = {}
@@ -231,21 +236,19 @@ class LineSight:
 
     @cached_property
     def _aimed(self) -> tuple[np.ndarray, np.ndarray]:
-        """Aim parameters and their Jacobian for the chief rays of the unperturbed instrument.
+        """Aim parameters of the unperturbed chief rays, and the Jacobian of their hit points with respect to these.
 
-        All other states are aimed starting from these.
+        The chief rays of all other states are aimed starting from these.
         """
         to_stop, points, guess = self._from_the_image([{}], self.instrument.assembly.place())
         return aim_chief_rays(self.backend, to_stop, points, guess, ACROSS)[1:]
 
     @cached_property
     def axes(self) -> dict[str, np.ndarray]:
-        """Camera -> the axes X, Y, Z about which its changes count, as columns (3, 3) in the base frame.
+        """Camera -> axes X, Y, Z about which its changes are measured, as columns (3, 3) in the base frame.
 
-        Z is the nominal line of sight.
-
-        The line of sight of an instrument as built differs from the design; Y is then perpendicular to it, as near as
-        possible to the camera's Y.
+        Z is the nominal line of sight. Where the instrument as built has another line of sight than its design, Y is
+        perpendicular to it and as near as possible to the camera's Y.
         """
         axes = {name: self.instrument.camera_axes(name) for name in self.instrument.cameras}
         if not self.instrument.as_built:
@@ -258,9 +261,7 @@ class LineSight:
     ) -> tuple[SystemBatch, np.ndarray, np.ndarray]:
         """Return the optical systems from line CCD to stop, the points of the line CCDs, and the launch directions.
 
-        The points have the shape (B, LINE_POINTS, 3), the directions (B, 1, 3).
-
-        Dimensions: B systems.
+        For B systems the points have the shape (B, LINE_POINTS, 3), the directions (B, 1, 3).
         """
         instrument, names = self.instrument, list(self.instrument.cameras)
         to_stop = assemble(instrument.assembly, [f"{n}/image_to_stop" for n in names], states, placed=placed)
@@ -270,10 +271,7 @@ class LineSight:
 
 
 def _about(sight: np.ndarray, across: np.ndarray) -> np.ndarray:
-    """Return the axes X, Y, Z of a line of sight as columns of a matrix.
-
-    Z is along the line of sight, and Y as near to the direction ``across`` as possible.
-    """
+    """Return axes X, Y, Z as columns of a matrix: Z is a line of sight, Y as near as possible to ``across``."""
     x = np.cross(across, sight)
     x = x / np.linalg.norm(x)
     return np.stack([x, np.cross(sight, x), sight], axis=-1)
@@ -296,11 +294,9 @@ result.
 def truth_jacobian(
     instrument: Instrument, backend: Backend, motions: Sequence[ElementaryMotion]
 ) -> dict[str, np.ndarray]:
-    """Return the derivatives of the true parameters of every camera with respect to elementary motions.
+    """Return the derivatives of the true parameters of every camera with respect to M elementary motions.
 
     They are central differences of the exact trace.
-
-    Dimensions: M motions.
 
     Returns
     -------

@@ -1,1 +1,1 @@
-"""An instrument in operation: its record, its estimated state, alarms, reports and products, and simulated lives."""
+"""An instrument in operation: database of readings, estimated state, alarms, reports, and simulated operation."""

@@ -1,4 +1,4 @@
-"""``python -m twin.operate``: record and estimated state of an instrument in operation."""
+"""Command line of ``python -m twin.operate``: record and estimated state of an instrument in operation."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ if TYPE_CHECKING:
     from twin.operate.record.taking import IngestResult
 
 POLL = 10.0
-"""Time between two polls of watched sources, in seconds."""
+"""Time between two checks of watched files for new readings, in seconds."""
 
 app = cli.program(no_args_is_help=True)
 
@@ -214,7 +214,7 @@ def ingest(
 def _new_alarms(call: Call, page: Path | None) -> list[str]:
     """Return the new alarms of the estimate under the record's plan, and write the report.
 
-    An error of the estimate is printed; the ingest has succeeded nevertheless.
+    If the estimate fails, its error is printed; the readings have been ingested nevertheless.
     """
     if not call.has_estimate:
         if page is not None:
@@ -250,13 +250,13 @@ def _names_own_instrument(instrument: str | None, history: History) -> bool:
 
 
 def _counted(counts: Mapping[str, int]) -> str:
-    """Return the numbers of new, known and refused entries in words."""
+    """Return a text with the numbers of new, already known and refused entries."""
     text = "{new} taken, {known} known already, {refused} refused".format(**counts)
     return text + (f", {before} refused before" if (before := counts["refused_before"]) else "")
 
 
 def _line(taken: IngestResult) -> str:
-    """Return the result of the ingest of a file in words, with its first refusals."""
+    """Return a text on the result of ingesting a file, with its first refusals."""
     lines = [f"{taken.file}: {_counted(taken.counts)}"]
     shown = [f"  refused{'' if line is None else f', line {line}'}: {reason}" for line, reason in taken.refused[:10]]
     more = len(taken.refused) - len(shown)
@@ -264,7 +264,7 @@ def _line(taken: IngestResult) -> str:
 
 
 def _taken(taken: IngestResult) -> dict[str, Any]:
-    """Return the result of the ingest of a file as plain data."""
+    """Return the result of ingesting a file as plain data, for JSON output."""
     refused = [{"line": line, "reason": reason} for line, reason in taken.refused]
     return {"file": taken.file, **taken.counts, "refused": refused, "before": taken.before}
 

@@ -45,13 +45,13 @@ if TYPE_CHECKING:
     pass
 
 BANDS = ((1.9600, 0.22, "95 %"), (0.9945, 0.42, "68 %"))
-"""Confidence bands of a figure: multiple of sigma, opacity and name of each, the wide one first."""
+"""Confidence bands of a figure: multiple of sigma, opacity and name of each, the widest first."""
 _MOST_ERROR_BARS = 60
 """Largest number of single readings drawn with error bars; more would hide the curve."""
 _LIMIT_EXTENTS = 3.0
-"""Ratio of a requirement's limit to the extent of the time series, up to which the limit is drawn.
+"""Largest ratio of a requirement's limit to the range of the time series for which the limit is drawn.
 
-A larger limit would flatten the curve.
+If a larger limit were drawn, the curve would look flat.
 """
 
 
@@ -124,7 +124,7 @@ def _course(axes: Axes, overview: Overview, trend: Trend, quantity: Quantity) ->
 
 
 def _points(axes: Axes, trend: Trend, q: int) -> None:
-    """Draw the single readings of a quantity."""
+    """Draw the values of a quantity from single readings of the monitor, with error bars if there are few."""
     points = trend.points
     known = np.isfinite(points.values[:, q])
     if not known.any():
@@ -159,7 +159,7 @@ def _dated(axes: Axes) -> None:
 
 
 def innovations_svg(overview: Overview) -> str:
-    """Draw chi-square of the newest innovations (readings minus their predictions) with its limit."""
+    """Draw the chi-square of the newest innovations (readings minus predictions) with its critical value."""
     with svg.look("operate-innovations"):
         innovations = overview.filter_result.innovations
         times = np.array([one[0] for one in innovations], np.int64)
@@ -184,9 +184,9 @@ def innovations_svg(overview: Overview) -> str:
 
 
 RECENT = 30 * DAY
-"""Span before the newest reading that the second figure of time series shows, in microseconds."""
+"""Time before the newest reading that the second figure of time series shows, in microseconds."""
 MOST_EXPLAINED = 4
-"""Largest number of quantities in the lead whose scatter explained by temperatures is given."""
+"""Largest number of quantities for which the summary gives the share of the scatter that temperatures explain."""
 MOST_MOTIONS = 12
 """Number of the most significant motions of bodies that the report lists."""
 MOST_SHOWN = 40
@@ -196,7 +196,7 @@ _JUMP_HEADS = ("log likelihood ratio", "false-alarm probability", "other candida
 
 
 def daily_report(history: History, overview: Overview, end: int) -> Report:
-    """Return the report of a day.
+    """Return the daily report of an instrument in operation.
 
     Parameters
     ----------
@@ -246,7 +246,14 @@ def daily_report(history: History, overview: Overview, end: int) -> Report:
 
 
 def end_of_day(text: str | None, newest: int) -> int:
-    """Return the end of a UTC day, in microseconds of TAI since 2000; by default of the newest reading's day.
+    """Return the end of a UTC day, in microseconds of TAI since 2000.
+
+    Parameters
+    ----------
+    text : str or None
+        Date, ISO 8601; None for the day of the newest reading.
+    newest : int
+        Time of the newest reading, in microseconds of TAI since 2000.
 
     Raises
     ------
@@ -264,7 +271,7 @@ def end_of_day(text: str | None, newest: int) -> int:
 
 
 def state_table(overview: Overview) -> Table:
-    """Return the table of all quantities: value, sigma, requirement, its probability, and the expected violation."""
+    """Return the table of all quantities: value, sigma, requirement, probability and time of a violation."""
     now = overview.filter_result.now
     heads = ("change", "now", "σ", "limit", "P(exceeded) [%]", "allowed [%]", "holds", "expected violation")
     rows: list[list[Cell]] = []
@@ -290,7 +297,7 @@ def state_table(overview: Overview) -> Table:
 
 
 def _required_cells(overview: Overview, quantity: Quantity) -> list[Cell]:
-    """Return the cells of a quantity's requirement; empty ones without a requirement."""
+    """Return the table cells on a quantity's requirement; empty cells for a quantity without one."""
     requirement = overview.required(quantity)
     if requirement is None:
         return ["", "", "", "", ""]
@@ -408,7 +415,7 @@ def _prediction_section(overview: Overview) -> Section:
 
 
 def _explained_sentence(overview: Overview) -> str:
-    """Return the sentence on the share of the scatter that temperatures explain; empty if it is unknown."""
+    """Return the sentence on the share of the quantities' scatter that measured temperatures explain, or ""."""
     known = {name: share for name, share in overview.filter_result.explained.items() if math.isfinite(share)}
     if not known:
         return ""
@@ -504,7 +511,7 @@ def _alarm_section(overview: Overview) -> Section:
 
 
 def _acknowledged_text(ack: Mapping[str, Any]) -> str:
-    """Return who acknowledged an alarm, when, and the note."""
+    """Return a text on the acknowledgement of an alarm: person, time and note."""
     note = f": {ack['note']}" if ack.get("note") else ""
     return f"{ack['by']}, {str(ack['acknowledged_utc'])[:16].replace('T', ' ')}{note}"
 

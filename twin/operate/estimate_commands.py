@@ -1,4 +1,4 @@
-"""Commands on an estimate: forecast, alarms, decisions, products, daily report; printed state of the instrument."""
+"""Commands of `twin.operate` on an estimate: forecast, alarms, exclusion of readings, products, daily report."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from twin.operate.record.history import History
 
 STEPS = 4
-"""Default number of times of a forecast after the newest reading."""
+"""Default number of forecast times after the newest reading."""
 
 
 @on_record
@@ -243,22 +243,22 @@ def report(
 def write_report(
     call: Call, history: History, operation: Operation, end: int, words: Sequence[str], out: Path
 ) -> Report:
-    """Write the report of a day.
+    """Write the daily report of an operation as an HTML file.
 
     Parameters
     ----------
     call : Call
-        The running command.
+        Command in progress, with its options and output.
     history : History
-        Its record, or the record as of an earlier time.
+        Record of the command, or its state at an earlier time.
     operation : Operation
         Estimate of that record.
     end : int
         End of the day, in microseconds of TAI since 2000.
     words : Sequence[str]
-        Arguments of ``twin.operate report`` that repeat the report.
+        Command-line arguments of ``twin.operate report`` that reproduce the report.
     out : Path
-        File, which is replaced.
+        File to be written; an existing one is replaced.
 
     Raises
     ------
@@ -283,7 +283,7 @@ def _open_text(count: int) -> str:
 
 
 def alarm_line(row: Mapping[str, Any]) -> str:
-    """Return an alarm of the record in words, with its acknowledgement."""
+    """Return a line of text on an alarm of the record, with its acknowledgement."""
     seen = row["acknowledged"]
     state = "open" if seen is None else f"seen by {seen['by']}{': ' if seen['note'] else ''}{seen['note']}"
     return f"alarm {row['id']}, {row['time_utc']}, {row['kind']} ({state}): {row['text']}"
@@ -347,7 +347,7 @@ def _show_course(course: Course, console: Console) -> None:
 
 
 def show_power(found: Sequence[DetectionPower], console: Console) -> None:
-    """Print a table with the smallest detectable jumps of each body, in their stated standard deviations."""
+    """Print a table of the smallest detectable jump of each body, in units of its prior standard deviation."""
     heads = ("smallest detectable jump, in stated sigmas", *(key.replace("_", " ") for key in found[0].plain))
     sizes = ([one.body, *("none" if size is None else f"{size:.2g}" for size in one.plain.values())] for one in found)
     show_table(console, heads, sizes, ())

@@ -1,11 +1,12 @@
 """Estimated motions of an instrument at one time, as files of other commands.
 
-The files are the job of the estimated state for `twin.render`, and its uncertainty as a file of disturbances, a prior
-for `twin.asbuilt`.
+The files are a job for `twin.render`, which has the estimated state, and a file of disturbances with its uncertainty, a
+prior for `twin.asbuilt`.
 
-Two causes may move the same body in the same way about different points. A job and a file of disturbances state each
-component once: amounts add up, and a rotation (vector theta) or a relative expansion s about a point q equals, to first
-order, the same about the component's pivot p with an additional shift theta x (p - q), or s (p - q).
+Two causes may rotate or expand the same body about different points. A job and a file of disturbances give each
+component (body, kind and axis of motion) only once. The amounts are therefore added, and a rotation (vector theta, rad)
+or a relative expansion s about a point q is converted, to first order, to that about the component's pivot p with an
+additional shift theta x (p - q), or s (p - q).
 """
 
 from __future__ import annotations
@@ -29,19 +30,19 @@ from scenes.specs.job_tables import TableTemperatureSpec
 from scenes.yaml.yaml_file import dump_yaml
 
 UNSUPPORTED = ("index_gradient",)
-"""Kinds of disturbance components that `perturb` of a job has no key for."""
+"""Kinds of disturbance components for which the key `perturb` of a job has no equivalent."""
 PIVOTED = ("rotate", "scale")
-"""Kinds of disturbance components whose effect depends on a pivot."""
+"""Kinds of disturbance components whose effect depends on a pivot point."""
 
 
 @dataclass(frozen=True, eq=False)
 class EstimatedMotions:
-    """Estimate of all specified motions at one time.
+    """Estimate of all motions specified in the disturbances, at one time.
 
     Attributes
     ----------
     components : tuple[Component, ...]
-        The M specified components.
+        The M specified components of motion.
     mean : (M,) ndarray
         Estimated amounts, in SI units.
     covariance : (M, M) ndarray
@@ -95,9 +96,9 @@ class OmittedComponent:
     amount : float
         Omitted amount, in SI units: the estimate for a state, the standard deviation for a prior.
     unit : str
-        Display unit.
+        Unit in which the amount is displayed.
     unit_size : float
-        The display unit in SI units.
+        Size of this unit in SI units.
     share : float | None
         For a prior, the largest share of the variance of a spot or a parameter that the component contributes; None for
         a state.
@@ -111,9 +112,9 @@ class OmittedComponent:
 
 
 def perturbation(found: EstimatedMotions, thermal: ThermalModel) -> dict[str, PerturbationSpec]:
-    """Return the estimated amounts as `perturb` of a job, without components of the kinds `UNSUPPORTED`.
+    """Convert estimated motions to the section `perturb` of a job, without those of the kinds `UNSUPPORTED`.
 
-    The result corresponds to `scenes.models.disturbances.state_of` of the same amounts.
+    The result describes the same state as `scenes.models.disturbances.state_of` for the same amounts.
 
     Parameters
     ----------
@@ -166,7 +167,7 @@ def state_file(
     instrument : str
         Name of the instrument, or absolute path of its file.
     disturbances : str
-        Name or absolute path of the disturbances on which the sigmas depend.
+        Name or absolute path of the file of disturbances, the prior of the estimate.
     remark : str
         Comment at the top of the file, one or several lines.
     """
@@ -182,7 +183,7 @@ def state_file(
 
 
 def _short(perturb: Mapping[str, Mapping[str, object]]) -> dict[str, dict[str, object]]:
-    """Return perturbations without the default values of a job."""
+    """Return perturbations without the keys that have the default values of a job."""
     usual = PerturbationSpec().plain()
     return {
         body: {key: value for key, value in what.items() if key == "temperature" or value != usual.get(key)}
@@ -191,9 +192,7 @@ def _short(perturb: Mapping[str, Mapping[str, object]]) -> dict[str, dict[str, o
 
 
 def merge_components(motions: EstimatedMotions, instrument: Instrument) -> tuple[tuple[Component, ...], Array]:
-    """Merge components of the same body, kind and axis; return them and the matrix (J, M) from the motions to them.
-
-    Array dimensions: J merged components.
+    """Merge components of motion with the same body, kind and axis.
 
     Parameters
     ----------
@@ -201,6 +200,13 @@ def merge_components(motions: EstimatedMotions, instrument: Instrument) -> tuple
         The M motions.
     instrument : Instrument
         Instrument whose motions they are.
+
+    Returns
+    -------
+    tuple of Component
+        The J merged components.
+    (J, M) ndarray
+        Matrix that converts amounts of the M motions to amounts of the J components.
     """
     nodes, bodies = instrument.nodes, {body.path: body for body in instrument.assembly.tree.bodies}
     components: list[Component] = []
@@ -231,14 +237,17 @@ def merge_components(motions: EstimatedMotions, instrument: Instrument) -> tuple
 
 
 def _pivot_shift(body: Body, component: Component, pivot: str) -> Array:
-    """Return the shift of a body, (3,), metres per unit, that moving a rotation's or scale's pivot is equivalent to."""
+    """Return the shift of a body that is equivalent to a change of the pivot of a rotation or expansion.
+
+    It is a vector (3,), in metres per radian or per unit of relative expansion.
+    """
     apart = np.array(body.pivots[pivot]) - np.array(body.pivots[component.pivot])
     return np.asarray(np.cross(np.eye(3)[component.axis], apart) if component.kind == "rotate" else apart)
 
 
 @dataclass(frozen=True, eq=False)
 class Prior:
-    """Uncertainty of an estimated state, as a file of disturbances.
+    """Uncertainty of an estimated state, written as a file of disturbances.
 
     Array dimensions: M motions.
 
@@ -249,7 +258,7 @@ class Prior:
     components : tuple[Component, ...]
         The J components of the file.
     table : (J, M) ndarray
-        Matrix from the specified motions to these components.
+        Matrix that converts amounts of the M specified motions to amounts of these components.
     omitted : tuple[OmittedComponent, ...]
         Components that the file omits.
     """
@@ -263,23 +272,23 @@ class Prior:
 def prior_files(
     motions: EstimatedMotions, stated: Disturbances, instrument: Instrument, stem: str, reason: str, remark: str
 ) -> Prior:
-    """Return the covariance of the estimated motions as `joint` of a file of disturbances.
+    """Write the covariance of the estimated motions as the section `joint` of a file of disturbances.
 
-    A file holds at most `MOST_JOINT` components. If there are more, those that alone would contribute the largest share
-    to the variance of some spot or parameter are selected.
+    A file holds at most `MOST_JOINT` components. If there are more, those are selected that contribute the largest
+    share of the variance of any spot or camera parameter.
 
     Parameters
     ----------
     motions : EstimatedMotions
         The M motions at one time.
     stated : Disturbances
-        Effect of the same motions on spots and parameters.
+        Effect of the same motions on spots and camera parameters.
     instrument : Instrument
         Instrument whose motions they are.
     stem : str
         Name of the file.
     reason : str
-        Source of its numbers.
+        Source of the numbers, to be named in the file.
     remark : str
         Comment at the top of the file, one or several lines.
     """
@@ -309,7 +318,7 @@ def prior_files(
 
 
 def largest_shares(motions: EstimatedMotions, stated: Disturbances) -> Array:
-    """Return the largest share (M,) of the variance of a spot or a parameter that each motion alone contributes.
+    """Return the largest share of the variance of any spot or camera parameter due to each of M motions, (M,).
 
     Parameters
     ----------

@@ -1,8 +1,9 @@
 """Comparison of the estimates of a simulated life with its truth, as numbers, a table and a figure.
 
-The life is filtered reading by reading. Four estimates of the cameras are compared at every reading: the ground
-calibration, the single reading, the filtered estimate from the readings so far, and the smoothed estimate from all
-readings. Forecasts are compared with what happened. The truth is read only after that.
+A life is the simulated operation of an instrument over a mission. It is filtered reading by reading. Four estimates of
+the cameras are compared at every reading: the ground calibration, the single reading, the filtered estimate from the
+readings so far, and the smoothed estimate from all readings. Forecasts are compared with the later true state. The
+truth is read only after all estimates have been made.
 """
 
 from __future__ import annotations
@@ -40,14 +41,14 @@ METHODS = {
     "filtered": "filtered estimate",
     "smoothed": "smoothed estimate",
 }
-"""Key of each of the four compared estimates -> its name in the report."""
+"""Names in the report of the four compared estimates, by key."""
 
 
 @dataclass(frozen=True, eq=False)
 class Estimate:
-    """Values and standard deviations (T, Q) of one estimate at T times, in each quantity's unit; NaN where unknown.
+    """Values and standard deviations (T, Q) of one estimate, in each quantity's unit; NaN where unknown.
 
-    Array dimensions: Q quantities.
+    Array dimensions: T times, Q quantities.
     """
 
     values: Array
@@ -56,7 +57,7 @@ class Estimate:
 
 @dataclass(frozen=True, eq=False)
 class JudgedLife:
-    """Four estimates of a simulated instrument, and the truth.
+    """Four estimates of the state of a simulated instrument over its life, and the truth.
 
     Array dimensions: T times.
 
@@ -69,7 +70,7 @@ class JudgedLife:
     true : (T, Q) ndarray
         True changes, in each quantity's unit.
     methods : Mapping[str, Estimate | Course]
-        Key in `METHODS` -> estimate.
+        Key in `METHODS` -> estimate at the times of the readings.
     horizon : float
         Horizon of the forecasts, in seconds.
     forecast : Estimate
@@ -77,7 +78,7 @@ class JudgedLife:
     outcomes : (T, Q) ndarray
         True changes at the forecast times; NaN where the life ends before.
     interrupted : (T,) ndarray of bool
-        Whether an event, which no forecast can know of, occurred between the reading and the forecast time.
+        True where an event occurred between the reading and the forecast time, which no forecast can predict.
     filter_result : FilterResult
         Result of filtering all readings.
     """
@@ -118,7 +119,7 @@ def judged(plan: OperationSetup, files: Path, truth: Mapping[str, Any], advance:
     Parameters
     ----------
     plan : OperationSetup
-        Plan of the operation.
+        Plan of operation of the instrument.
     files : Path
         YAML file that describes the tables of the life.
     truth : Mapping[str, Any]
@@ -179,7 +180,7 @@ def _prior(operation: Operation, times: NDArray[np.int64]) -> Estimate:
 
 
 class StepwiseIngest:
-    """Files of a life, ingested into a record up to one time after the other.
+    """Files of a simulated life, ingested into a record step by step in the order of time.
 
     Array dimensions: T times.
 
@@ -206,7 +207,7 @@ class StepwiseIngest:
         self.times = np.array(sorted(every), np.int64)
 
     def take(self, until: int) -> None:
-        """Ingest the entries since the last call.
+        """Ingest the entries after the previous call up to a time.
 
         Parameters
         ----------
@@ -250,7 +251,7 @@ def true_changes(truth: Mapping[str, Any], quantities: Sequence[Quantity], times
 
 
 def _single(readings: Sequence[Mapping[str, Any]], quantities: Sequence[Quantity]) -> Estimate:
-    """Return the estimate from each reading alone, by the best estimator under the specified disturbances."""
+    """Return the estimate from each reading alone, with minimum variance for the specified disturbances."""
     values, sigmas = [], []
     for read in readings:
         groups = {**read["cameras"], **{name: read[name] for name in (ANGLE_GROUP, GROUND_GROUP) if name in read}}
@@ -283,13 +284,15 @@ def rms(error: Array) -> float:
 
 
 SHARES = {1.0: math.erf(math.sqrt(0.5)), 2.0: math.erf(math.sqrt(2.0))}
-"""Multiple of sigma -> share of normal errors within it."""
+"""Multiple of sigma -> share of normally distributed errors within it."""
 CHANCE = 1e-3
-"""Probability that a share of independent normal numbers lies outside the limits that the report gives for it."""
+"""Probability that the share of independent normal errors within a multiple of sigma lies outside the limits in the
+report.
+"""
 SHOWN = ((ANGLE_GROUP, "change_arcsec"), (GROUND_GROUP, "height_m"))
-"""Group and key of the quantities in the figure, where the instrument has them.
+"""Group and key of the quantities that the figure shows, where the instrument has them.
 
-A camera's change of focal length is shown beside them.
+The figure also shows a camera's change of focal length.
 """
 _DAY = 86_400 * MICRO
 _YEAR = 365.25 * _DAY
@@ -299,7 +302,7 @@ _COVERED = ("filtered", FORECAST)
 
 
 def judged_numbers(life: JudgedLife) -> dict[str, Any]:
-    """Return the comparison as plain data.
+    """Return the comparison of the estimates with the truth as plain data, for judged.json.
 
     It holds, for each quantity and estimate, the RMS error, errors and sigmas at all readings and the shares within one
     and two sigmas; the same of the forecasts; and the scores, explained scatter, sensors and jumps of the filter.
@@ -307,7 +310,7 @@ def judged_numbers(life: JudgedLife) -> dict[str, Any]:
     Parameters
     ----------
     life : JudgedLife
-        The compared life.
+        Estimates and truth of the simulated life.
     """
     out_by_group: dict[str, dict[str, Any]] = {}
     for number, quantity in enumerate(life.quantities):
@@ -343,7 +346,7 @@ def judged_numbers(life: JudgedLife) -> dict[str, Any]:
 
 
 def _error_summary(error: Any, sigma: Any) -> dict[str, Any]:
-    """Return the RMS of errors and the shares of them within one and two sigmas, ignoring NaN."""
+    """Return the RMS of errors and their shares within one and two sigmas as plain data, ignoring NaN."""
     value = rms(error)
     out: dict[str, Any] = {"rms": value if math.isfinite(value) else None}
     out |= {"errors": _rounded(error), "sigmas": _rounded(sigma)}
@@ -360,14 +363,14 @@ def _rounded(values: Any) -> list[float | None]:
 
 
 def likely_shares(count: int, times: float) -> tuple[float, float]:
-    """Return the limits of the share of independent normal numbers within a multiple of sigma.
+    """Return limits for the share of `count` independent normal errors that lie within a multiple of sigma.
 
     The share lies outside them with the probability ``CHANCE``.
 
     Parameters
     ----------
     count : int
-        Number of independent numbers.
+        Number of independent errors.
     times : float
         Multiple of sigma.
     """
@@ -376,12 +379,12 @@ def likely_shares(count: int, times: float) -> tuple[float, float]:
 
 
 def judged_report(life: JudgedLife, name: str) -> Report:
-    """Return the report of the comparison.
+    """Return the report on the comparison of the estimates with the truth.
 
     Parameters
     ----------
     life : JudgedLife
-        The compared life.
+        Estimates and truth of the simulated life.
     name : str
         Name of the instrument.
     """
@@ -474,7 +477,7 @@ def judged_svg(life: JudgedLife, quantities: Sequence[tuple[str, str]]) -> str:
     Parameters
     ----------
     life : JudgedLife
-        The compared life.
+        Estimates and truth of the simulated life.
     quantities : Sequence[tuple[str, str]]
         Group and key of each quantity; one column of the figure each.
     """

@@ -1,4 +1,4 @@
-"""Commands on a simulated life: draw, render and write it; estimate it and compare the estimates with its truth."""
+"""Commands of `twin.operate` on a simulated life of an instrument: simulate it, and compare estimates with truth."""
 
 from __future__ import annotations
 

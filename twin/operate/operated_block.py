@@ -1,9 +1,9 @@
-"""Block adjustment of scenes whose cameras a monitor observes in operation.
+"""Block adjustment of scenes whose cameras are observed by a monitor in operation.
 
 The record's estimate at several times, with the covariance between times, gives the prior of the cameras' parameters in
-every pass over the scene. Between two readings nearly all of an error is common to the times of a pass; the rest is
-what moves meanwhile by the specified time laws. An adjustment of images that uses the estimate as readings of the
-cameras needs both. The code of the block adjustment itself does not depend on records.
+every pass over the scene. Between two readings, nearly all of an estimate's error is common to the times of a pass; the
+remainder is due to motions in the meantime, according to the specified time laws. An adjustment of images that uses the
+estimate as a prior of the cameras needs both parts. The code of the block adjustment itself does not depend on records.
 """
 
 from __future__ import annotations
@@ -76,8 +76,8 @@ def posterior(
 ) -> Posterior:
     """Return the joint posterior of quantities at several times, from all readings.
 
-    The work is that of one smoothing pass, plus T^2 times the square of the number of states: some hundred times of a
-    pass take seconds.
+    The computing time is that of one smoothing run, plus a term proportional to T^2 times the square of the number of
+    states: some hundred times take seconds.
 
     Array dimensions: T times.
 
@@ -120,16 +120,16 @@ KEYS = ("d_alpha_arcsec", "d_beta_arcsec", "d_gamma_arcsec", "d_f_um")
 UNITS = np.array([ARCSEC, ARCSEC, ARCSEC, 1e-6])
 """Size in rad or m of one unit of each key in ``KEYS``."""
 _NEAR = 0.02
-"""Largest difference between a camera of the record and the block's line.
+"""Largest accepted difference between a camera of the record and the line of the block with the same name.
 
-It is relative for focal lengths, and in radians for look angles.
+It applies to the relative difference of focal lengths, and to the difference of look angles in radians.
 """
 
 
 def run_operated_block(
     setup: AnyAdjust, backend: Backend | None, seed: int, advance: Advance = silent, pool: Pool | None = None
 ) -> BlockRun:
-    """Draw or read a block and adjust it, with the record of its monitor if the file names one.
+    """Simulate or read a block and adjust it, with the camera prior from a record if the file names one.
 
     Parameters
     ----------
@@ -147,7 +147,7 @@ def run_operated_block(
     Raises
     ------
     InputError
-        A table or the record cannot be used.
+        A table of measurements or the record cannot be used.
     BenchError
         The orbit does not exist, or the block cannot be adjusted.
     """
@@ -206,7 +206,7 @@ def _prior_of_record(
 
 
 def camera_prior(estimate: Posterior, cameras: Sequence[str], passes: Sequence[int]) -> JointCameraPrior:
-    """Return the estimate of cameras as a prior of a block adjustment.
+    """Convert estimated changes of cameras to their joint prior in a block adjustment.
 
     Array dimensions: P passes.
 

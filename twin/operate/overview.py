@@ -1,8 +1,8 @@
 """Overview of an instrument in operation, for the daily report.
 
-It takes the estimate of `twin.operate.estimate.operation_filter` and the alarms of the record, and states in words and
-rows whether the requirements are met, what changed and how good the predictions were. Nothing is estimated here. Single
-readings of the monitor are selected for the figures: the first, the last and evenly chosen ones.
+It summarises the estimate of `twin.operate.estimate.operation_filter` and the alarms of the record in sentences and
+table rows: whether the requirements are met, what changed, and how good the predictions were. Nothing is estimated
+here. Single readings of the monitor are selected for the figures: the first, the last and evenly chosen ones.
 """
 
 from __future__ import annotations
@@ -32,9 +32,9 @@ if TYPE_CHECKING:
     from twin.operate.record.history import History
 
 KIND = "monitor"
-"""Value of an entry's kind, in the record, for the readings of the monitor."""
+"""Kind of the record's entries that are readings of the monitor."""
 _BATCH = 400
-"""Number of rows in one query."""
+"""Number of rows in one query of the database."""
 
 
 def _rows() -> Select[Any]:
@@ -43,7 +43,7 @@ def _rows() -> Select[Any]:
 
 
 def monitor_span(history: History) -> tuple[int, int]:
-    """Return the times of the first and the newest reading of the monitor; 0 without any.
+    """Return the times of the first and the newest reading of the monitor; 0 if there are none.
 
     Times are in microseconds of TAI since 2000.
     """
@@ -54,7 +54,7 @@ def monitor_span(history: History) -> tuple[int, int]:
 
 
 def readings(history: History, begin: int, end: int, most: int) -> list[dict[str, Any]]:
-    """Return readings of the monitor in a span, in the order of time; evenly chosen if there are more than ``most``.
+    """Return the monitor's readings in a time span, or ``most`` evenly chosen ones, in the order of time.
 
     Parameters
     ----------
@@ -63,7 +63,7 @@ def readings(history: History, begin: int, end: int, most: int) -> list[dict[str
     begin : int
         First time of the span, in microseconds of TAI since 2000.
     end : int
-        Last time of the span, which belongs to it.
+        Last time of the span, inclusive.
     most : int
         Largest number of readings.
 
@@ -88,7 +88,7 @@ def readings(history: History, begin: int, end: int, most: int) -> list[dict[str
 DAY = 86_400 * MICRO
 """One day, in microseconds."""
 CONFIDENCE = 0.95
-"""Confidence level of the intervals of the shares of predictions."""
+"""Confidence level of the intervals given for the shares of readings within multiples of sigma."""
 WITHIN: Mapping[int, float] = FrozenMap({k: float(2.0 * norm.cdf(k) - 1.0) for k in (1, 2)})
 """Multiple of sigma -> expected share of normally distributed components within it."""
 _ESTIMATORS = ("posterior", "model")
@@ -96,7 +96,7 @@ _ESTIMATORS = ("posterior", "model")
 
 
 def group_name(group: str) -> str:
-    """Return the name of a quantity's group (a camera, the intersection angle or the ground) in words."""
+    """Return the display name of a quantity's group (a camera, the intersection angle or the ground)."""
     return {ANGLE_GROUP: "angle between the cameras", GROUND_GROUP: "ground"}.get(group, group)
 
 
@@ -112,7 +112,7 @@ def minute_text(time: int) -> str:
 
 @dataclass(frozen=True)
 class Coverage:
-    """Share of the readings' components within a multiple of sigma of their predictions.
+    """Share of the readings' decorrelated components that lie within a multiple of sigma of their predictions.
 
     Attributes
     ----------
@@ -139,7 +139,7 @@ class Coverage:
 
     @property
     def holds(self) -> bool:
-        """True if the interval contains the expected share."""
+        """True if the confidence interval of the share contains the expected share."""
         return self.count == 0 or self.low <= self.expected <= self.high
 
 
@@ -181,7 +181,7 @@ class SingleReadings:
 
 
 def single_readings(entries: Sequence[Mapping[str, Any]], quantities: Sequence[Quantity]) -> SingleReadings:
-    """Return the quantities, with sigmas, that single readings of the monitor give without the filter.
+    """Return the quantities and sigmas estimated from single readings of the monitor, without the filter.
 
     Parameters
     ----------
@@ -210,7 +210,7 @@ def evenly_spaced(begin: int, end: int, count: int) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False)
 class Occurrence:
-    """Something that happened at a time.
+    """Occurrence in an operation at a time: a jump, event, fault of a sensor, alarm or exclusion of a reading.
 
     Attributes
     ----------
@@ -221,7 +221,7 @@ class Occurrence:
     text : str
         Description.
     again : bool
-        Whether it duplicates another occurrence, such as a jump's alarm.
+        True if it duplicates another occurrence, as the alarm of a jump does.
     """
 
     time: int
@@ -232,18 +232,18 @@ class Occurrence:
 
 @dataclass(frozen=True, eq=False)
 class Overview:
-    """State of an operation, as it is reported.
+    """State of an operation, as input of its daily report.
 
     Attributes
     ----------
     operation : Operation
-        The estimate.
+        Estimate of the record under its plan.
     filter_result : FilterResult
         Result of filtering all readings.
     alarms : tuple[Mapping[str, Any], ...]
         Alarms of the record, as `History.alarms` returns them.
     events : tuple[tuple[int, str, tuple[str, ...]], ...]
-        (time_us, name, causes that step) of all events of the record.
+        (time_us, name, causes whose motions step) of all events of the record.
     begin : int
         Time of the first reading of the monitor, in microseconds of TAI since 2000.
     """
@@ -291,12 +291,12 @@ class Overview:
 
     @property
     def coverages(self) -> tuple[Coverage, ...]:
-        """Coverage of the predictions within 1 and 2 sigma."""
+        """Shares of the readings' components within 1 and 2 sigma of their predictions, with expected shares."""
         scores = self.filter_result.scores
         return (coverage(1, scores.within_one, scores.components), coverage(2, scores.within_two, scores.components))
 
     def occurrences(self) -> Iterator[Occurrence]:
-        """Yield all occurrences, unordered; a jump counts at the time of its detection."""
+        """Yield all occurrences (jumps, events, alarms and others), unordered; a jump at the time of its detection."""
         result = self.filter_result
         for jump in result.jumps:
             label, unit, size, sigma = best_known_motion(jump)
@@ -320,7 +320,7 @@ class Overview:
             yield Occurrence(time, "excluded", f"{kind} of {subject}: {reason}")
 
     def changed(self, begin: int, end: int) -> list[Occurrence]:
-        """Return the occurrences from a time on and before another one, in the order of time."""
+        """Return the occurrences from `begin` (inclusive) to `end` (exclusive), in the order of time."""
         occurrences = [occurrence for occurrence in self.occurrences() if begin <= occurrence.time < end]
         return sorted(occurrences, key=lambda one: one.time)
 
@@ -350,7 +350,7 @@ class Overview:
         begin : int
             Beginning of the span, in microseconds of TAI since 2000.
         end : int
-            End of the span, which does not belong to it.
+            End of the span, exclusive.
         when : str
             Name of the span in the sentence.
         """
@@ -376,7 +376,7 @@ class Overview:
         ]
 
     def score_sentence(self) -> str:
-        """Return the sentence on the share of readings within one and two sigmas of their predictions."""
+        """Return the sentence on the shares of readings within one and two sigmas of their predictions."""
         one, two = self.coverages
         if not one.count:
             return "No reading has been predicted yet"
@@ -431,14 +431,14 @@ def _limit(requirement: RequirementStatus) -> str:
 
 
 def best_known_motion(jump: DetectedJump) -> tuple[str, str, float, float]:
-    """Return name, unit, size and sigma of the most significant motion of a jump."""
+    """Return name, unit, size and sigma of the motion of a jump with the largest ratio of size to sigma."""
     return max(jump.sizes, key=lambda one: abs(one[2]) / one[3] if one[3] > 0.0 else 0.0)
 
 
 def line_change_text(overview: Overview, jump: DetectedJump) -> str:
-    """Return the change of the line of sight by a jump in words; empty if it is unknown.
+    """Return a text on the change of the line of sight due to a jump; empty if it is unknown.
 
-    It lists the required quantities, or all quantities if none is required.
+    It lists the quantities that have requirements, or all quantities if none has.
     """
     parts = []
     for quantity in overview.quantities:
@@ -461,7 +461,7 @@ class Trend:
     past : Course
         Estimate from all readings, up to the newest.
     future : Course | None
-        Forecast from there; None if the span ends before.
+        Forecast from there on; None if the span ends before.
     points : SingleReadings
         Single readings, a selection if there are too many.
     """
@@ -489,7 +489,7 @@ def trend(history: History, overview: Overview, begin: int, end: int, count: int
     end : int
         End of the span; times after the newest reading are forecast.
     count : int
-        Largest number of times, of the past and of the future each.
+        Largest number of times in the past, and in the future.
     """
     operation, now = overview.operation, overview.time
     edges = [t for jump in overview.filter_result.jumps for t in (jump.after_us, jump.until_us)]

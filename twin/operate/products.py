@@ -1,20 +1,21 @@
 """Products of an operation's estimate for the time of a scene.
 
-They are the camera models that locate its images, the state of the instrument as a job, and its uncertainty as a prior.
+They are camera models for georeferencing its images, the state of the instrument as a job, and its uncertainty as a
+prior.
 
 Motions whose specified time law is `white` differ in every image and every reading, such as the differences between
-orbits. No reading determines them for an image taken at a different moment, and an image takes seconds. Camera models
-are not corrected for them, and their specified sizes make ERR_RAND, the error that images do not share. All other
-motions are corrected as estimated, and their uncertainty makes ERR_BIAS.
+orbits. No reading determines them for an image taken at a different moment. Camera models are therefore not corrected
+for them, and their specified sigmas give ERR_RAND, the error that images do not share. All other motions are corrected
+as estimated, and their uncertainty gives ERR_BIAS.
 
 The products have a period of validity. The estimate p(t) of a quantity at a time t, used at a different time t', has
 the error p(t) - P(t'), where P is the true value. p(t') is the mean of P(t') given the same readings, with the standard
-deviation sigma(t'), and p(t) depends on these readings alone, so that the mean square error is exactly
+deviation sigma(t'). Because p(t) depends only on these readings, the mean square error is exactly
 
     sigma(t')^2 + (p(t') - p(t))^2.
 
-The estimate is valid as long as the root of this is at most 1 + `SHARE` times sigma(t) for every quantity, within the
-readings and the forecast, and not across a known change of the instrument.
+The estimate is valid as long as the root of this is at most (1 + `SHARE`) sigma(t) for every quantity, within the times
+of readings and forecast, and not across a known change of the instrument.
 """
 
 from __future__ import annotations
@@ -54,7 +55,7 @@ if TYPE_CHECKING:
     from twin.orbit.export.export_run import ExportSource
 
 SHARE = 0.2
-"""Relative growth of the root mean square error of an estimate that ends its validity."""
+"""Relative increase of the root mean square error of an estimate, used at another time, that ends its validity."""
 _FIRST = MICRO
 """Shortest distance from the time of the estimate at which its validity is examined, in microseconds."""
 _STEPS = 48
@@ -73,7 +74,7 @@ class ValidityLimit:
     time : int
         Microseconds of TAI since 2000.
     reason : str
-        Reason in words.
+        Reason as text, such as an event.
     """
 
     time: int
@@ -87,9 +88,9 @@ class Validity:
     Attributes
     ----------
     since, until : int
-        Beginning and end, in microseconds of TAI since 2000.
+        Beginning and end of the period, in microseconds of TAI since 2000.
     since_reason, until_reason : str
-        Reasons why it is not valid before and after.
+        Reasons why the estimate is not valid before and after the period.
     """
 
     since: int
@@ -119,7 +120,7 @@ def validity(
     last : ValidityLimit
         Latest time with an estimate.
     limits : Sequence[ValidityLimit]
-        Limits in between; one at the time itself counts as before it.
+        Limits between `first` and `last`, such as events; one at `time` itself counts as before it.
     beside : Course | None
         Estimate just after the time, used instead of that at the time.
     """
@@ -156,7 +157,7 @@ def _limits_of_validity(
     time: int,
     sides: Mapping[int, tuple[int, NDArray[np.int64]]],
 ) -> dict[int, tuple[int, int, str]]:
-    """Return the ends of the validity before (-1) and after (+1) the estimate; sides without an end are missing.
+    """Return the limits of validity before (key -1) and after (key +1) an estimate; missing where there is none.
 
     Each is the last valid distance and the first invalid one, in microseconds, and the reason.
 
@@ -198,7 +199,7 @@ def _limits_of_validity(
 
 
 STATE, PRIOR = "state", "prior"
-"""Names of the files of the state and of the prior."""
+"""Names, without ending, of the files of the instrument's estimated state and of its prior."""
 APART = 60 * MICRO
 """Difference between the times of the scene and of the estimate that gives a warning, in microseconds."""
 
@@ -220,7 +221,7 @@ class Products:
     version : str
         SHA-256 of the record's last entry, of the plan and of the program's version.
     course : Course
-        Estimate at that time.
+        Estimate of all quantities at that time.
     validity : Validity
         Period of validity.
     changes : Mapping[str, EstimatedChange]
@@ -363,7 +364,7 @@ def _ends(operation: Operation, history: History, result: FilterResult) -> tuple
 
 
 def _at(course: Course, k: int) -> Course:
-    """Return the estimate at time number ``k`` alone."""
+    """Return the estimate at the time of index ``k`` only."""
     names = ("times", "values", "sigmas", "changes", "covariance")
     return replace(course, **{name: getattr(course, name)[k : k + 1] for name in names})
 
@@ -443,7 +444,7 @@ def _exported(scene: ExportSource, backend: Backend, changes: Mapping[str, Estim
 def _heights(scene: ExportSource) -> tuple[float, float] | None:
     """Return the lowest and the highest ground for fitting the models, in metres.
 
-    They are the usual heights, extended by the scene's terrain.
+    They are the default range of heights, extended to include the scene's terrain.
     """
     if not isinstance(scene.setup, AngleSetup):
         return None
@@ -453,7 +454,7 @@ def _heights(scene: ExportSource) -> tuple[float, float] | None:
 
 
 _RELIEFS = 4.0
-"""Number of standard deviations of a terrain that its models cover."""
+"""Number of standard deviations of a random terrain's heights that the fitted height range covers on each side."""
 
 
 def _warnings(
@@ -487,7 +488,7 @@ NUMBERS = "products.json"
 
 
 def _cameras(products: Products) -> dict[str, dict[str, float]]:
-    """Return each camera's (or other group's) quantities with sigmas, in the units at the ends of their keys."""
+    """Return the quantities with sigmas by camera (or other group), in the units named by their keys."""
     out: dict[str, dict[str, float]] = {}
     for k, quantity in enumerate(products.course.quantities):
         group = out.setdefault(quantity.group, {})

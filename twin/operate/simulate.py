@@ -1,11 +1,11 @@
 """Simulated life of an instrument in operation.
 
-Amounts of every specified motion are drawn over time by the laws of their disturbances; every reading is rendered and
-recovered; and the telemetry of a real instrument is written as files, which the record ingests like any others. The
-truth is written to a file of its own, which the operation never reads.
+Random time series of all specified motions are drawn according to the time laws in the file of disturbances; the
+monitor's images are rendered and measured for every reading; and telemetry as of a real instrument is written to files,
+which the record ingests like any others. The truth is written to a separate file, which the operation never reads.
 
-Laws without steps are drawn by `scenes.models.drawn_motions`; steps occur at random at a specified mean rate, or at the
-dates of events. The filter and the smoother, which such lives test, are not used here.
+Motions without steps are drawn by `scenes.models.drawn_motions`; steps occur at random times with a specified mean
+rate, or at the dates of events. The filter and the smoother, which are tested with such simulations, are not used here.
 """
 
 from __future__ import annotations
@@ -40,17 +40,19 @@ from twin.operate.record.telemetry import CONFIG, RESULTS
 Moments = NDArray[np.int64]
 
 _MOTIONS, _JUMPS, _EVENTS, _DATES, _COEFFICIENTS = 10, 11, 12, 13, 14
-"""Random streams of a seed; the detectors' exposures use the first ones (`MonitorExperiment.frames_after`)."""
+"""Numbers of the random streams of a seed: motions, jumps, steps at events, dates of events, errors of thermal
+coefficients. The detectors' exposures use smaller numbers (`MonitorExperiment.frames_after`).
+"""
 _MARGIN = 0.1
-"""Share of a life, at its beginning and its end, without random dates of events.
+"""Share of a life's duration, at its beginning and at its end, in which no random dates of events are drawn.
 
-So the effect of each event can be observed.
+The effect of each event can thus be observed.
 """
 
 
 @dataclass(frozen=True)
 class Step:
-    """Step of motions at one moment.
+    """Step of the motions of one or more bodies at one moment.
 
     Array dimensions: M motions.
 
@@ -61,7 +63,7 @@ class Step:
     cause : str
         Cause in the disturbances file.
     body : str
-        Body that stepped; empty if those of all bodies of the cause stepped, by an event.
+        Body that stepped; empty if all bodies of the cause stepped at an event.
     event : str
         Event of the step; empty for a jump at an unknown time.
     sizes : (M,) ndarray
@@ -77,7 +79,7 @@ class Step:
 
 @dataclass(frozen=True, eq=False)
 class Life:
-    """Amount of every specified motion of an instrument at T times.
+    """Amounts of all specified motions of an instrument at T times of its simulated operation.
 
     Attributes
     ----------
@@ -92,8 +94,8 @@ class Life:
     dates : tuple[tuple[int, str], ...]
         (time in microseconds, name) of every event.
     coefficients : Mapping[str, float]
-        Body with a temperature -> relative error of its thermal coefficient: true effect of its temperature on light
-        over the computed one, minus 1.
+        Body with a temperature -> relative error of its thermal coefficient: ratio of the true to the computed optical
+        effect of its temperature, minus 1.
     """
 
     times: Moments
@@ -116,10 +118,10 @@ class Life:
 
     @cached_property
     def acting(self) -> Array:
-        """Amounts of the motions as they act on light, (T, M), in SI units.
+        """Effective amounts of the motions, as they act on light, (T, M), in SI units.
 
-        Temperatures are multiplied by their body's true over its computed effect on light. Array dimensions: T times, M
-        motions.
+        Temperatures are multiplied by the ratio of the true to the computed optical effect of their body. Array
+        dimensions: T times, M motions.
         """
         factor = [1.0 + self.coefficients.get(c.body, 0.0) * (c.kind == "temperature") for c in self.components]
         return np.asarray(self.amounts * np.array(factor))
@@ -146,7 +148,7 @@ def drawn_life(
     dates: Sequence[tuple[int, str]] | None = None,
     coefficient_error: float = 0.0,
 ) -> Life:
-    """Draw the amounts of every motion over time, with steps and events.
+    """Draw the amounts of all motions over time at random, with steps and events.
 
     Array dimensions: T times.
 
@@ -157,7 +159,7 @@ def drawn_life(
     times : (T,) ndarray of int64
         Microseconds of TAI since 2000, ascending.
     zero : int
-        Origin of the time laws, in microseconds of TAI since 2000.
+        Time at which the time laws begin, in microseconds of TAI since 2000.
     seed : int
         Seed of all random numbers; those of one cause do not depend on the others.
     causes : Mapping[str, Sequence[str]]
@@ -165,7 +167,7 @@ def drawn_life(
     dates : Sequence[tuple[int, str]] | None
         (time, event) of every event; None to draw one date for each.
     coefficient_error : float
-        Relative standard deviation of the factor between the true and the computed effect of a body's temperature.
+        Relative standard deviation of the ratio of the true to the computed optical effect of a body's temperature.
     """
     seconds = (times - zero) / MICRO
     drawn = drawn_motions(stated, seconds, lambda number: np.random.default_rng(stream(seed, _MOTIONS, number)))
@@ -186,7 +188,10 @@ def drawn_life(
 def _jumps(
     stated: DisturbancePrior, cause: str, motions: Sequence[int], times: Moments, rng: np.random.Generator
 ) -> Iterator[Step]:
-    """Yield the steps of a cause whose law has jumps at a mean interval; the motions of one body step together."""
+    """Yield random steps of a cause whose time law has jumps at a mean interval.
+
+    The motions of one body step together.
+    """
     mean_interval = stated.laws[motions[0]].jump
     if mean_interval is None:
         return
@@ -198,7 +203,7 @@ def _jumps(
 
 
 def _step(stated: DisturbancePrior, where: Sequence[int], rng: np.random.Generator) -> Array:
-    """Return random sizes (M,) of a step of some motions in SI units, correlated as specified; zero for the others.
+    """Draw the sizes (M,) of a step of some motions, in SI units, correlated as specified; zero for the others.
 
     Array dimensions: M motions.
     """
@@ -209,7 +214,7 @@ def _step(stated: DisturbancePrior, where: Sequence[int], rng: np.random.Generat
 
 
 def _drawn_dates(events: Sequence[str], times: Moments, seed: int) -> tuple[tuple[int, str], ...]:
-    """Return one date for each event, uniform over the life except for its margins."""
+    """Draw one date for each event, uniformly distributed over the life except for its margins."""
     first, span = int(times[0]), int(times[-1]) - int(times[0])
     rng = np.random.default_rng(stream(seed, _DATES))
     shares = rng.uniform(_MARGIN, 1.0 - _MARGIN, len(events)).tolist()
@@ -229,12 +234,12 @@ RENDER = "render and recover"
 _SENSORS = 15
 """Number of the random stream of the temperature sensors' errors."""
 _KELVIN = 4
-"""Number of decimals of a sensor's temperature in kelvin; real sensors show as many or fewer."""
+"""Number of decimals of a simulated sensor's temperature in kelvin; real sensors have as many or fewer."""
 
 
 @dataclass(frozen=True)
 class Simulation:
-    """Parameters of a simulated life.
+    """Parameters of a simulated operation (life) of an instrument.
 
     Attributes
     ----------
@@ -249,7 +254,7 @@ class Simulation:
     frames : int
         Number of frames of each exposure.
     coefficient_error : float
-        Relative standard deviation, from body to body, of the factor between the true and the computed effect of a
+        Relative standard deviation, from body to body, of the ratio of the true to the computed optical effect of a
         temperature.
     sensor_sigma : float
         Standard deviation of a temperature sensor, in kelvin.
@@ -297,7 +302,7 @@ class SimulatedRecord:
     Attributes
     ----------
     life : Life
-        The drawn life.
+        Random motions of the life.
     times : (R,) ndarray of int64
         Times of the readings of the monitor, in microseconds of TAI since 2000.
     readings : tuple[dict[str, Any], ...]
@@ -305,7 +310,7 @@ class SimulatedRecord:
     truth : Mapping[str, Any]
         True changes of the cameras at these times, nested as in JSON files.
     lost : tuple[tuple[int, str], ...]
-        Time of each impossible reading, and the reason.
+        Time of each reading that could not be measured, and the reason.
     """
 
     life: Life
@@ -372,7 +377,7 @@ def simulate_record(
 def _readings(
     experiment: MonitorExperiment, observation: Observation, frames: int, suspects: Mapping[str, CameraCrosstalk]
 ) -> Iterator[dict[str, Any]]:
-    """Yield the recovered values of the monitor for each state, as the content of recovered.json."""
+    """Yield the monitor's results for each simulated state, as the content of recovered.json."""
     channels = tuple((channel.camera, channel.name) for channel in experiment.path.channels)
     common = channels, experiment.cameras, experiment.ground, experiment.disturbances
     centroid = experiment.resolved.job.analysis.centroid
@@ -384,7 +389,7 @@ def _readings(
 def write_simulated(
     folder: RunFolder, plan: OperationSetup, experiment: MonitorExperiment, what: Simulation, simulated: SimulatedRecord
 ) -> None:
-    """Write the telemetry of the life, and the file that describes its tables; not the truth.
+    """Write the telemetry of a simulated life, and the YAML file that describes its tables, but not the truth.
 
     Parameters
     ----------
@@ -425,7 +430,7 @@ def write_simulated(
 
 
 def sensed_temperatures(reference: float, what: Simulation, life: Life) -> dict[str, np.ndarray]:
-    """Return the readings of each body's temperature sensor, (T,), in kelvin; NaN where it gives none.
+    """Simulate the readings of each body's temperature sensor, (T,), in kelvin; NaN where it gives none.
 
     Array dimensions: T times.
 
@@ -436,7 +441,7 @@ def sensed_temperatures(reference: float, what: Simulation, life: Life) -> dict[
     what : Simulation
         Parameters of the simulation.
     life : Life
-        The drawn life.
+        Random motions of the life.
     """
     out: dict[str, np.ndarray] = {}
     for number, (body, change) in enumerate(life.temperatures.items()):
@@ -455,7 +460,7 @@ def sensed_temperatures(reference: float, what: Simulation, life: Life) -> dict[
 
 
 def truth_numbers(plan: OperationSetup, what: Simulation, simulated: SimulatedRecord) -> dict[str, Any]:
-    """Return the truth as plain data.
+    """Return the truth of a simulated life as plain data.
 
     It holds the traced changes of cameras, angle and ground, steps, coefficients and temperatures.
 

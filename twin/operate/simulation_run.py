@@ -1,4 +1,4 @@
-"""Run of a simulated life: options of the command, checks, computation, files and ingest into a record."""
+"""Command that simulates the operation of an instrument: options, checks, computation, files, ingest into a record."""
 
 from __future__ import annotations
 
@@ -32,11 +32,11 @@ from twin.operate.terminal import input_errors, utc_option
 PROGRAM = "twin.operate"
 CALIBRATE, INGEST = "calibrate", "ingest into the record"
 NO_TRUTH = "none"
-"""Value of --truth for which no truth is written."""
+"""Value of the option --truth for which no file of the truth is written."""
 MOST = 100_000
-"""Largest number of monitor readings in one life: they take some hours, and give a gigabyte of results."""
+"""Largest number of monitor readings in one simulated life: so many take some hours, and a gigabyte of results."""
 _READING = 2e5
-"""Memory of a reading in bytes, for the numbers kept beside its frames."""
+"""Memory per reading, in bytes, for the numbers stored beside its frames."""
 DAY = 86_400.0
 
 
@@ -121,7 +121,7 @@ def _require_name(option: str, name: str, names: Collection[str]) -> None:
 
 
 class _Options:
-    """Command-line options of the simulation, to which an error about too little memory refers."""
+    """Source of error messages about too little memory, which refer to the command-line options."""
 
     def error(self, problem: str, key: KeyPath, *, found: object, allowed: str) -> InputErrorText:
         return InputErrorText(f"{key[0]}: {problem}; {found} readings, allowed: {allowed}")
@@ -150,7 +150,7 @@ def simulate_into(
     truth : Path | None
         File for the truth; None for one in the folder of the telemetry, ``none`` for no file.
     force : bool
-        Replace the folder if it holds such files.
+        True to replace the folder if it has the files of an earlier simulation.
     what : Simulation
         Parameters of the simulation.
     backend : Backend
@@ -232,7 +232,7 @@ def simulate_into(
 
 
 def _again(truth: Path | None, what: Simulation, backend: Backend) -> Iterator[str]:
-    """Yield the words of the command line that makes the same files again, run in their folder."""
+    """Yield the words of the command line that reproduces the files, to be run in their folder."""
     yield from (PROGRAM, "simulate", CONFIG, *what.words, "--seed", str(what.seed), "--backend", backend.name)
     if truth is not None:  # a repetition writes no files outside its folder
         yield from ("--truth", NO_TRUTH)
@@ -265,7 +265,7 @@ def _require_empty(history: History) -> None:
 
 
 def _require_known_sensors(experiment: MonitorExperiment, what: Simulation) -> None:
-    """Raise InputErrorText for a sensor on a body without a temperature in the prior, or a faulty one not simulated."""
+    """Raise InputErrorText for a sensor on a body without a prior temperature, or a faulty one not simulated."""
     assert experiment.stated is not None  # a plan states something
     warm = {component.body for component in experiment.stated.components if component.kind == "temperature"}
     for body in what.sensors or ():

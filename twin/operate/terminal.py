@@ -57,7 +57,7 @@ def errors_reported() -> Iterator[Console]:
 
 @contextmanager
 def input_errors(what: str = "") -> Iterator[None]:
-    """Raise a Problem as InputErrorText about ``what``, an option (with its dashes) or a path."""
+    """Convert a Problem to an InputErrorText about ``what``, an option (with its dashes) or a path."""
     try:
         yield
     except Problem as problem:
@@ -87,12 +87,12 @@ def utc_option(option: str, text: str) -> int:
 
 
 def print_result(errors: Console, options: cli.Options, data: Any, show: Callable[[Console], None]) -> None:
-    """Print a result, as JSON or in words.
+    """Print the result of a command, as JSON or as text.
 
     Parameters
     ----------
     errors : Console
-        Console for the error that standard output is closed.
+        Console for error messages, such as that standard output is closed.
     options : cli.Options
         Options that choose JSON, words or nothing.
     data : dict, list, number, str or None
@@ -108,7 +108,7 @@ def print_result(errors: Console, options: cli.Options, data: Any, show: Callabl
 
 
 def print_line(console: Console, text: str) -> None:
-    """Print a line without markup."""
+    """Print a line of text as it is, without interpreting markup."""
     console.print(text, markup=False, highlight=False, soft_wrap=True)
 
 
@@ -124,7 +124,7 @@ def show_table(console: Console, heads: Sequence[str], rows: Iterable[Sequence[s
 
 @dataclass(frozen=True)
 class Call:
-    """Command in progress on a record, with what its functions share.
+    """Command in progress on a record, with the objects that its functions share.
 
     Attributes
     ----------
@@ -144,7 +144,7 @@ class Call:
     options: cli.Options
 
     def print_result(self, data: Any, show: Callable[[Console], None]) -> None:
-        """Print the result of the command, as JSON or, by the function ``show``, in words."""
+        """Print the result of the command, as JSON or, by the function ``show``, as text."""
         print_result(self.errors, self.options, data, show)
 
     def resolve_plan(self, plan: Path | None) -> OperationSetup:
@@ -175,7 +175,7 @@ class Call:
         setup : OperationSetup
             Plan of operation.
         history : History | None
-            The record as of an earlier time, instead of the command's.
+            Earlier state of the record, used instead of the command's record.
 
         Raises
         ------
@@ -196,7 +196,7 @@ class Call:
         return self.history.plan() is not None and self.history.first("monitor") is not None
 
     def estimate(self, plan: Path | None = None) -> tuple[Operation, FilterResult, list[Alarm]]:
-        """Return the estimate under a plan, its result, and its new alarms, which are added to the record."""
+        """Filter the record under a plan; return the estimate, its result, and new alarms, added to the record."""
         from twin.operate.estimate.reported_estimate import raise_alarms
 
         operation = self.filtered_operation(self.resolve_plan(plan))
@@ -236,7 +236,7 @@ def require_new(out: Path) -> None:
 
 
 def on_record(work: Callable[..., None]) -> Callable[..., None]:
-    """Return the command that opens a record and calls a function with it.
+    """Convert a function to a command that opens a record and calls the function with it.
 
     Parameters
     ----------

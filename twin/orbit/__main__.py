@@ -37,7 +37,7 @@ PROGRAM = "twin.orbit"
 
 
 class Correction(StrEnum):
-    """Kind of the correction of an image that control points determine, as an option's choices."""
+    """Choices of the option `--correction`: image correction that is fitted to the control points."""
 
     shift = "shift"
     affine = "affine"
@@ -79,7 +79,7 @@ def adjust(
     ] = None,
     scheduler: cli.Scheduler = None,
 ) -> None:
-    """Adjust a block of scenes; the command's help is that of the test."""
+    """Run the command `adjust`: block adjustment of scenes from many passes."""
     procedure = PROCEDURES["orbit adjust"]
 
     def reduced() -> AnyAdjust:
@@ -244,7 +244,7 @@ def export(
 
 
 def _sigma(name: str, text: str | float) -> float:
-    """Return the standard deviation that an option gives, in SI units; pixels stay pixels.
+    """Return the standard deviation that an option gives, in SI units or, if given in pixels, in pixels.
 
     Raises
     ------
@@ -264,7 +264,7 @@ def _sigma(name: str, text: str | float) -> float:
 
 
 _SIGMAS = {"position": (DISTANCE, 1e5, "1 m"), "attitude": (ANGLE, 0.1, "2 arcsec"), "height": (DISTANCE, 1e4, "3 m")}
-"""Kind of quantity, largest value in SI units, and an example, by name of the option."""
+"""Kind of quantity, largest accepted value in SI units, and an example for error messages, by name of the option."""
 
 
 def _ground(lowest: str | None, highest: str | None) -> tuple[float, float] | None:
@@ -289,7 +289,7 @@ def _ground(lowest: str | None, highest: str | None) -> tuple[float, float] | No
 
 
 _DEEPEST, _TOP = -500.0, 9000.0
-"""Lowest and highest ground that the options accept, in metres above the ellipsoid: the range of land."""
+"""Lowest and highest ground height that the options accept, in metres above the ellipsoid: the range of land."""
 
 
 if __name__ == "__main__":

@@ -28,7 +28,7 @@ It is three degrees from grazing, more than the triangles' normals differ from t
 """
 
 EXITS = 4
-"""Number of ways in which light can leave a surface: two clear apertures, each with two sides."""
+"""Number of ways in which light can leave a surface: through either of two clear apertures, toward +z or toward -z."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,7 +88,7 @@ class Patch:
 
 @dataclass(frozen=True, eq=False)
 class Segment:
-    """Clear path segment from an aperture to the next one that a family of paths meets.
+    """Clear path segment, with no surface in between, from an aperture to the next one that nominal light meets.
 
     Attributes
     ----------
@@ -99,7 +99,7 @@ class Segment:
     end : Patch
         Aperture at the end.
     after : int
-        Index of the family's next segment in the list; -1 if there is none.
+        Index, in the list of segments, of the next one along the same family of paths; -1 if there is none.
     behind : int
         1 where the next segment leaves the end toward -z.
     """
@@ -112,14 +112,18 @@ class Segment:
 
 
 class ClearSegments:
-    """Clear segments along families of paths, up to their detectors.
+    """Clear segments (path segments with no surface in between) of the nominal light paths to the detectors.
+
+    A family of paths is all paths that meet the same surfaces in the same order; there is one nominal family per
+    detector.
 
     Parameters
     ----------
     scenery : Scenery
         All surfaces.
     families : Mapping[str, Sequence[int]]
-        Detector -> codes of the events before it.
+        Detector -> events (surface and what happens there) of its nominal family, as the numbers of
+        ``path_families.code``.
 
     Attributes
     ----------
@@ -146,7 +150,10 @@ class ClearSegments:
                 self._apertures[name] = [(-1, line[0]), *self._follow(line)]
 
     def _follow(self, line: Sequence[Patch]) -> Iterator[tuple[int, Patch]]:
-        """Add the segments of a family; yield the index of each (-1 if not clear) and the aperture at its end."""
+        """Add the clear segments between successive apertures of a light path to the list of segments.
+
+        Yields the index of each segment (-1 where it is not clear) and the aperture at its end.
+        """
         last = -1
         for start, end in pairwise(line):
             segment = self._between(start, end)
@@ -160,26 +167,26 @@ class ClearSegments:
             yield last, end
 
     def apertures(self, family: str | None = None) -> list[tuple[int, Patch]]:
-        """Return the apertures that a family meets, up to its detector, each with the index of the segment before it.
+        """Return the apertures that the nominal light of a detector meets, each with the index of the segment to it.
 
-        The index is -1 where that segment is not clear. The list is empty for an unknown family.
+        The index is -1 where that segment is not clear. The list is empty for an unknown detector.
 
         Parameters
         ----------
         family : str or None
-            Detector of the family, None for the first one.
+            Name of the detector, None for the first one.
         """
         return self._apertures.get(family or next(iter(self._apertures), ""), [])
 
     def from_source(self, start: Patch, family: str | None = None) -> Segment | None:
-        """Return the segment from a source to the first surface of a family, None where it is not clear.
+        """Return the segment from a source to the first surface of a detector's nominal light, None if not clear.
 
         Parameters
         ----------
         start : Patch
             Emitting disk of the source.
         family : str or None
-            Detector of the family, None for the first one.
+            Name of the detector, None for the first one.
         """
         line = self.apertures(family)
         segment = self._between(start, line[0][1]) if line else None
@@ -189,7 +196,10 @@ class ClearSegments:
         return replace(segment, after=after, behind=self.segments[after].exit_side % 2)
 
     def _between(self, start: Patch, end: Patch) -> Segment | None:
-        """Return the segment from one aperture to another, in their glass body or in the open; None if not clear."""
+        """Return the segment from one aperture to another, or None if another surface may lie between.
+
+        Both lie in the same glass body, or outside all glass.
+        """
         if start.solid is not None and start.solid == end.solid:
             return None if start.surface == end.surface else Segment(start.surface, 2 * start.aperture + 1, end)
         for behind in (0, 1):
@@ -203,9 +213,9 @@ class ClearSegments:
 
 
 def _shortest(choices: Sequence[Sequence[Patch]]) -> list[Patch]:
-    """Choose one aperture of each event so that the line through their middles is shortest, as light does.
+    """Choose one clear aperture for each event of a path so that the line through the apertures' middles is shortest.
 
-    Return an empty list where an event has no aperture.
+    By Fermat's principle it is then the nominal path. The result is empty where an event has no aperture.
     """
     if not all(choices):
         return []
@@ -288,9 +298,10 @@ class _Obstacles:
         self.solids = [s.solid for s in surfaces]
 
     def leave_clear(self, start: Patch, end: Patch) -> bool:
-        """Return True if no other surface extends into the convex hull of two apertures' boxes.
+        """Return True if no other surface extends into the convex hull of the boxes about two apertures.
 
-        A convex glass body lies behind each of its faces, and the segment before it.
+        Faces of the glass bodies of the two apertures do not count: a convex body lies behind each of its faces, and so
+        does the segment if it is inside.
         """
         planes = ConvexHull(np.vstack([start.corners, end.corners])).equations
         away = self.corners @ planes[:, :3].T + planes[:, 3]
@@ -302,7 +313,7 @@ class _Obstacles:
 
 
 def _reaches(triangles: np.ndarray, planes: np.ndarray, margin: float) -> bool:
-    """Return True if any triangle comes closer than ``margin`` to the region inside all planes."""
+    """Return True if any triangle comes closer than ``margin`` metres to the convex region inside all planes."""
     away = triangles @ planes[:, :3].T + planes[:, 3] - margin
     for corners, levels in zip(triangles, away, strict=True):
         if np.any(np.min(levels, axis=0) > 0.0):
@@ -318,7 +329,10 @@ def _reaches(triangles: np.ndarray, planes: np.ndarray, margin: float) -> bool:
 
 
 def _cut(corners: np.ndarray, levels: np.ndarray) -> np.ndarray:
-    """Return the part of a convex polygon where a linear function, given at its corners, is not positive."""
+    """Return the part of a convex polygon where a linear function is zero or negative.
+
+    ``levels`` are the values of the function at the polygon's corners.
+    """
     out = []
     for k, level in enumerate(levels):
         after = (k + 1) % len(levels)

@@ -1,4 +1,4 @@
-"""Importance sampling: directions of diffused and scattered light, and the share of paths that are followed.
+"""Importance sampling: random directions of diffused and scattered light, and random termination of weak paths.
 
 A surface diffuses light or scatters it about the specular direction; the directions are drawn for each path.
 
@@ -39,7 +39,7 @@ def near_distance(u: Any) -> Any:
 
 
 def near_density(distance: Any) -> Any:
-    """Return the probability density of the squared distance that ``near_distance`` draws."""
+    """Return the density of the squared distance that ``near_distance`` draws, per squared direction cosine."""
     import drjit as dr
 
     return dr.select(
@@ -60,7 +60,7 @@ class OutgoingPaths:
     index : Dr.Jit array
         Refractive index on the side that the path goes to.
     event : Dr.Jit array
-        Event at the surface.
+        Number of the event at the surface, a value of ``path_families.Event``.
     weight : Dr.Jit array
         Weight of the path.
     toward : Dr.Jit array
@@ -87,7 +87,7 @@ class TableSampling:
     tables : FinishTables
         Tables of the scene's measured surface finishes.
     marks : Dr.Jit array
-        Numbers of the tables of each path's surface finish, see ``tables.MARKS``.
+        Numbers of the coating table and the scatter table of each path's surface finish, see ``tables.MARKS``.
     cosine : Dr.Jit array
         Cosine of the angle of incidence.
     """
@@ -235,15 +235,18 @@ def sample_bsdf(
 LEAST_SURVIVAL = 0.2
 """Smallest survival probability of a path.
 
-A class from which the first paths brought nothing may still bring light, and is sampled with at most five times the
-variance.
+A class of paths (those that left nominal light after the same number of surfaces) from which the first paths brought
+nothing to the detectors may still bring light, and is sampled with at most five times the variance.
 """
 
 PRIOR = 0.1
-"""Share of the variance that is assigned to all classes of paths in equal parts before anything is learnt."""
+"""Share of the variance that is attributed to all classes of paths in equal parts before anything is learnt.
+
+A class is the paths that leave nominal light after the same number of surfaces.
+"""
 
 NOMINAL_COST = 0.15
-"""Measured computing time at a surface of the nominal path, relative to that at any other surface."""
+"""Computing time of a path at a surface of the nominal path, relative to that at any other surface; as measured."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -265,7 +268,10 @@ class LearnedRoulette:
     seed: int
 
     def survival_probability(self, numbers: np.ndarray, passed: np.ndarray) -> np.ndarray:
-        """Return the survival probability of each path, by its number and the nominal surfaces passed."""
+        """Return the survival probability of each path, by its number in the run and the nominal surfaces passed.
+
+        ``numbers`` and ``passed`` have one entry per path.
+        """
         known = np.minimum(passed, len(self.survival) - 1)
         return np.where((numbers < self.first) | (passed >= len(self.survival)), 1.0, self.survival[known])
 
@@ -293,7 +299,7 @@ class PathHistory:
         True where the path left the nominal path at a surface; False where it missed the next one or reached the
         detector.
     steps : (N,) ndarray
-        Number of surfaces met after that.
+        Number of surfaces that the path met after it left the nominal path.
     """
 
     passed: np.ndarray

@@ -2,11 +2,11 @@
 
 In each step a path is traced to the next surface (``surface_intersection``), the surface divides its light, and the
 path continues in one of the possible directions. Neighbouring paths are processed together, as many as fit into the
-processor's vector registers (a packet). A packet takes as long as its longest path, and includes everything that any of
-its paths needs: what only some surfaces need (Newton's method, Fresnel's formulas, a lobe, a detector) is computed only
-in packets that need it. Sources let neighbours start alike, and paths that leave nominal light (``sequential``) are
-sorted so that neighbours behave alike. Sorting once more, after four more steps, would save 9 percent of the packets'
-steps and cost as much, as measured.
+processor's vector registers (a packet of paths). A packet takes as long as its longest path, and each step of it
+executes all operations that any of its paths needs; operations for some surfaces only (Newton's method, Fresnel's
+formulas, a scatter lobe, a detector) are skipped in packets without such a surface. Sources therefore start neighbours
+alike, and paths that leave nominal light (``sequential``) are sorted so that neighbours behave alike. Sorting once
+more, after four more steps, would save 9 percent of the packets' steps and cost as much, as measured.
 """
 
 from __future__ import annotations
@@ -25,11 +25,14 @@ from twin.path_tracing.path_result import Accumulators, Arrival, record
 from twin.path_tracing.surface_intersection import Flight, Intersection, locate, next_surface
 
 STEP_BACK = 1e-5
-"""Distance behind a skipped triangle at which the search continues, in metres."""
+"""Distance behind a triangle hit by rounding only at which the search for the next surface continues, in metres."""
 
 STRAY, UNLIKELY, GONE = 1, 2, 8
-"""Bits of a path's history: scattered or diffused somewhere; unit of the number of unlikely directions taken, at most
-two; escaped to infinity. A path with none of them is coherent with its neighbours."""
+"""Bits of a path's history; a path without any of them behaves like its neighbours.
+
+STRAY: it was scattered somewhere. UNLIKELY: unit of the number, at most two, of unlikely directions that it took. GONE:
+it has escaped to infinity.
+"""
 
 
 @dataclass(frozen=True)
@@ -55,7 +58,8 @@ class Features:
     near : bool
         True if some scattered directions are drawn close to the specular one.
     keep_nominal : bool
-        True if detections of the nominal family are recorded as well.
+        True if detections of the nominal light are recorded one by one, too, and not only those of ghosts and stray
+        light.
     log : bool
         True if the events of every path are recorded.
     """
@@ -83,10 +87,11 @@ class Limits:
     capacity : Dr.Jit array
         Number of detections that can be recorded.
     floors : sequence of Dr.Jit arrays
-        Smallest probability of each possible direction after none, one, and more unlikely ones; 0: proportional to
-        power.
+        Smallest probability of each possible direction (reflected, transmitted, diffused) for paths that have taken no,
+        one, and more unlikely directions before; 0: probabilities are proportional to power.
     scatter_floors : sequence of Dr.Jit arrays
-        Smallest probability of drawing a direction from a scatter lobe, after none, one, and more unlikely ones.
+        Smallest probability of drawing a direction from a scatter lobe, for paths that have taken no, one, and more
+        unlikely directions before.
     near : Dr.Jit array
         Share of these directions that are drawn close to the specular one.
     weak : Dr.Jit array
@@ -124,7 +129,7 @@ class Launch:
     ahead : Dr.Jit array
         Distance ahead at which the search for the next surface starts, metres.
     signature : Dr.Jit array
-        Signature of its events so far.
+        Hash of its events so far (surfaces met and what happened there), which identifies its family of paths.
     steps : Dr.Jit array
         Number of these events.
     """
@@ -332,7 +337,7 @@ class Shares:
         Refractive index before over that behind, and cosine of the angle of refraction, 0 for total reflection; None
         without glass.
     marks : sequence of Dr.Jit arrays
-        Numbers of the tables of measured surface finishes, see ``tables.MARKS``.
+        Numbers of the coating and scatter tables of measured surface finishes, see ``tables.MARKS``.
     """
 
     reflected: Any
@@ -366,7 +371,7 @@ class Choice:
     weight : Dr.Jit array
         Weight with which they continue.
     unlikely : Dr.Jit mask
-        True where a floor made the direction more likely than its share of the light.
+        True where the smallest probability (floor) made the direction more likely than its share of the light.
     """
 
     reflecting: Any
@@ -379,7 +384,8 @@ class Choice:
 def choose(shared: Shares, weight: Any, floor: Any, rng: Any, met: Any) -> Choice:
     """Draw whether paths at a surface are reflected, transmitted or diffused.
 
-    Each possibility has the probability of its share of the light, but at least ``floor``.
+    Each possibility has the probability of its share of the light, but at least ``floor``. ``met`` is the mask of the
+    paths that are at a surface.
     """
     import drjit as dr
 
@@ -401,7 +407,7 @@ def choose(shared: Shares, weight: Any, floor: Any, rng: Any, met: Any) -> Choic
 def shares(
     prepared: PreparedScene, features: Features, row: Any, met: Any, place: Intersection, inside: Any, before: Any
 ) -> Shares:
-    """Return how the surface finish that each path meets divides the light."""
+    """Return the reflected, transmitted, diffused and scattered shares of light at the surface that each path meets."""
     import drjit as dr
 
     tables, glass = prepared.tables, features.glass

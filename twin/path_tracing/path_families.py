@@ -12,19 +12,22 @@ from scenes.models.scenery import Scenery
 
 
 class Event(IntEnum):
-    """Kind of event of a path at a surface; values from ``DIFFUSE`` on are stray light."""
+    """Kind of event of a path at a surface, such as reflected or scattered.
+
+    Values from ``DIFFUSE`` on are stray light.
+    """
 
     REFLECT = 0
     TRANSMIT = 1
     DIFFUSE = 2
     SCATTER = 3
-    """Scattered into the lobe around the reflected direction."""
+    """Path scattered into the lobe around the reflected direction."""
     SCATTER_THROUGH = 4
-    """Scattered into the lobe around the refracted direction."""
+    """Path scattered into the lobe around the refracted direction."""
 
 
 OUTSIDE = 8
-"""Number added to the event where it happens outside a face's clear apertures."""
+"""Number added to the number of an event (``Event``) that happens outside the clear apertures of a surface."""
 
 BITS = 4
 START = 0xCBF29CE484222325
@@ -33,12 +36,15 @@ _WORD = (1 << 64) - 1
 
 
 def code(part: int, event: Event, outside: bool = False) -> int:
-    """Return an event as a number: the index of the part and the kind of event."""
+    """Return the number of an event: index of the surface it happens on, kind of event, and whether outside apertures.
+
+    ``outside`` is True where the path meets the surface outside its clear apertures.
+    """
     return (part + 1) << BITS | (int(event) + (OUTSIDE if outside else 0))
 
 
 def decode(number: int) -> tuple[int, Event, bool]:
-    """Return part, event and True if outside the clear apertures; the inverse of ``code``."""
+    """Return surface index, kind of event, and True if outside the clear apertures: the inverse of ``code``."""
     event = number & (1 << BITS) - 1
     return (number >> BITS) - 1, Event(event % OUTSIDE), event >= OUTSIDE
 
@@ -55,12 +61,12 @@ def signature(codes: Iterable[int]) -> int:
 
 
 MARKS = {Event.REFLECT: "", Event.TRANSMIT: ">", Event.DIFFUSE: "~", Event.SCATTER: "*", Event.SCATTER_THROUGH: ">*"}
-"""Kind of event -> character after a surface's name in the text of a family; a reflection has none."""
+"""Kind of event -> character that follows a surface's name in the text of a path; a reflection has none."""
 
 
 @dataclass(frozen=True)
 class SurfaceEvent:
-    """Event of a family: the surface's name, the kind of event, and True if outside the surface's clear apertures."""
+    """Event of a path: name of the surface, kind of event, and True if outside the surface's clear apertures."""
 
     part: str
     event: Event
@@ -72,7 +78,7 @@ class SurfaceEvent:
 
 
 def nominal_codes(scenery: Scenery, assembly: Assembly, sequence: str) -> tuple[int, ...]:
-    """Return the codes of the events along a sequence of the assembly, up to the detector at its end.
+    """Return the events of light along a sequence of elements, up to the detector at its end, as numbers of ``code``.
 
     Elements that only mark a position are omitted.
 
@@ -99,7 +105,7 @@ def nominal_codes(scenery: Scenery, assembly: Assembly, sequence: str) -> tuple[
 
 
 def surface_events(scenery: Scenery, codes: tuple[int, ...]) -> tuple[SurfaceEvent, ...]:
-    """Return the events, with the names of their surfaces, that numeric codes stand for."""
+    """Return the events of a path, with the names of their surfaces, from their numbers (``code``)."""
     parts = scenery.parts
     return tuple(SurfaceEvent(parts[part], event, outside) for part, event, outside in map(decode, codes))
 

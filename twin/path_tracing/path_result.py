@@ -18,7 +18,8 @@ from twin.path_tracing.tables import NOMINAL_SUMS, ROWS_PER_SURFACE, Kind, Scene
 
 NOMINAL, GHOST, STRAY = range(3)
 CLASSES = 3
-"""Number of classes of detected paths: nominal family, another family without scattering, scattered somewhere."""
+"""Number of classes of detected paths: nominal path; another path without scattering (ghost); scattered (stray light).
+"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,7 +33,8 @@ class Accumulators:
     left : Dr.Jit array
         (3,) weight escaped to infinity, weight still under way at the step limit, weight at the start.
     sums : Dr.Jit array
-        (detectors * NOMINAL_SUMS) count, weight, its square, weighted x, y, x^2, y^2 of the nominal family.
+        (detectors * NOMINAL_SUMS) sums over the detections of nominal light: count, weight, its square, weighted x, y,
+        x^2, y^2.
     images : Dr.Jit array
         (CLASSES * pixels of all detectors) weight.
     counter : Dr.Jit array
@@ -56,7 +58,7 @@ class Accumulators:
 
     @property
     def arrays(self) -> list[Any]:
-        """All arrays that a launch writes to."""
+        """All arrays that a launch (group of paths traced together) writes to."""
         out = [self.absorbed, self.left, self.sums, self.images, self.counter, *self.records.values()]
         return out if self.log is None else [*out, self.log]
 
@@ -64,7 +66,23 @@ class Accumulators:
 def make_accumulators(
     backend: Backend, rows: int, detectors: int, pixels: int, capacity: int, log: int = 0
 ) -> Accumulators:
-    """Return empty accumulators; ``log`` is the number of events of all paths together, 0 for no log."""
+    """Return accumulators of zeros for a launch.
+
+    Parameters
+    ----------
+    backend : Backend
+        Backend that holds the arrays.
+    rows : int
+        Number of surface finishes.
+    detectors : int
+        Number of detectors.
+    pixels : int
+        Number of pixels of all detectors together.
+    capacity : int
+        Number of detections that can be recorded.
+    log : int
+        Number of events of all paths together that are recorded; 0 for none.
+    """
     import drjit as dr
 
     Float, UInt = backend.Float, backend.UInt
@@ -87,7 +105,7 @@ def make_accumulators(
 
 @dataclass(frozen=True, eq=False)
 class Arrival:
-    """Light that arrives at surfaces: position in the surface's x, y, absorbed weight, and the path so far."""
+    """Light that arrives at a surface: where in its x, y (metres), the weight it absorbs, and the path's history."""
 
     x: Any
     y: Any
@@ -108,7 +126,10 @@ def record(
     at: Arrival,
     keep_nominal: bool,
 ) -> None:
-    """Add detections to the detectors' images, to the sums of the nominal family, and to the records."""
+    """Add detected light to the detectors' images, to the sums of nominal light, and to the list of detections.
+
+    Detections of nominal light are listed only if ``keep_nominal``; at most ``capacity`` are listed.
+    """
     import drjit as dr
 
     Float, UInt = backend.Float, backend.UInt
@@ -176,7 +197,7 @@ class Family:
 
     @property
     def text(self) -> str:
-        """Events of the family in one line."""
+        """Events of the family in one line: names of surfaces with a character for the kind of event."""
         return " ".join(str(t) for t in self.surface_events) or "(not identified)"
 
 
@@ -209,7 +230,10 @@ class Balance:
 
     @property
     def error(self) -> float:
-        """Missing power relative to the emitted power; 0 up to rounding unless roulette or floors are used."""
+        """Missing power relative to the emitted power.
+
+        It is 0 up to rounding, unless roulette or smallest probabilities of directions are used.
+        """
         total = sum(self.absorbed.values()) + sum(self.detected.values()) + self.escaped + self.under_way
         return float(total / self.emitted - 1.0)
 
@@ -231,7 +255,7 @@ class Detections:
     length : ndarray
         Optical path, metres.
     signature : ndarray
-        Signature of the family.
+        Hash of the path's events, the same for all paths of a family.
     kind : ndarray
         ``NOMINAL``, ``GHOST`` or ``STRAY``.
     """
@@ -260,7 +284,7 @@ class PathResult:
     paths : int
         Number of traced paths.
     detections : Detections
-        Single detections that were kept: all except the nominal families', or all.
+        Single detections: all those of ghosts and stray light, and those of nominal light only if requested.
     """
 
     families: tuple[Family, ...]
@@ -270,11 +294,11 @@ class PathResult:
     detections: Detections
 
     def of(self, detector: str, kind: str) -> tuple[Family, ...]:
-        """Return the families of one kind at one detector, the strongest first."""
+        """Return the path families of one kind (nominal, ghost or stray) at one detector, the strongest first."""
         return tuple(f for f in self.families if f.detector == detector and f.kind == kind)
 
     def nominal(self, detector: str) -> Family:
-        """Return the nominal family of a detector.
+        """Return the nominal family of a detector: the paths that met the surfaces of nominal light in its order.
 
         Raises
         ------
@@ -288,12 +312,12 @@ class PathResult:
 
 
 SUMS = 7
-"""Number of sums of a family: count, weight, its square, weighted x, y, x^2, y^2."""
+"""Number of sums over the paths of a family: count, weight, its square, weighted x, y, x^2, y^2."""
 
 
 @dataclass(frozen=True)
 class Key:
-    """Key of a family whose events are not looked up yet: index of the detector, signature, kind."""
+    """Key of a family of paths whose events are not known yet: index of the detector, hash of the events, and kind."""
 
     detector: int
     signature: int
@@ -308,7 +332,7 @@ class Collector:
     scenery : Scenery
         Scene.
     nominal : Sequence[int]
-        Signature of the nominal family of each detector; 0 if it has none.
+        Hash of the events of the nominal family of each detector; 0 if it has none.
     keep : bool
         Keep single detections.
     """
@@ -327,7 +351,7 @@ class Collector:
         self._kept: list[dict[str, np.ndarray]] = []
 
     def add(self, accumulators: Accumulators, emitted: float, paths: int) -> tuple[np.ndarray, np.ndarray]:
-        """Add a launch; return path numbers and weights of detections off the nominal families."""
+        """Add the results of a launch; return numbers and weights of the paths detected off the nominal path."""
         self.absorbed += accumulators.absorbed.numpy().reshape(self.absorbed.shape)
         self.left += accumulators.left.numpy()
         if self.images.size:
@@ -355,7 +379,7 @@ class Collector:
         self.examples.setdefault(key, example)
 
     def _sort_in(self, r: dict[str, np.ndarray]) -> None:
-        """Add detections off the nominal families to the sums of their families."""
+        """Add each detection off the nominal path to the sums of its family (paths with the same events)."""
         label = np.stack([r["signature"], r["detector"].astype(np.uint64), r["kind"].astype(np.uint64)], axis=-1)
         keys, first, family = np.unique(label, axis=0, return_index=True, return_inverse=True)
         family = family.ravel()
@@ -366,7 +390,7 @@ class Collector:
             self._put(Key(detector, signature, kind), sums[k], int(r["path"][first[k]]))
 
     def strongest(self, most: int) -> list[Key]:
-        """Return the ``most`` families with the most power whose events are not known beforehand."""
+        """Return the ``most`` families with the largest detected power among those whose events are still unknown."""
         keys = [k for k in self.sums if k.kind != NOMINAL]
         return sorted(keys, key=lambda k: -self.sums[k][1])[:most]
 

@@ -32,8 +32,11 @@ GROUP = 4
 """Number of consecutive surfaces between two tests of whether any path processed together is still active."""
 
 ENDED, MISSED, TURNED = range(3)
-"""Reasons why a path has left: absorbed by the detector; does not meet the next surface as nominal light does; takes
-another direction there or has reached the end."""
+"""Reasons why a path has left the nominal path.
+
+They are: absorbed by the detector; does not meet the next surface as nominal light does; takes another direction there
+or has reached the last traced surface.
+"""
 
 DRAWS_PER_FLOAT64 = 1
 """Number of steps that the random generator takes for one float64."""
@@ -53,9 +56,10 @@ class Step:
     aperture : int
         Index of its clear aperture that is met.
     segment : int
-        Index of the clear segment that leads to it in ``tables.segment_table``; 0 if there is none.
+        Index, in ``tables.segment_table``, of the clear segment (with nothing between its ends) that leads to it; 0 if
+        there is none.
     code : int
-        Code of the event there.
+        Number of the event there, see ``path_families.code``.
     detects : bool
         True for the detector at the end.
     front : bool
@@ -91,12 +95,12 @@ class Step:
 
     @property
     def row(self) -> int:
-        """Index of the surface's finish in the table of finishes, for the side that is met."""
+        """Index, in the table of finishes, of the finish of the side of the surface that nominal light meets."""
         return layout.ROWS_PER_SURFACE * self.surface + (0 if self.front else 1)
 
     @property
     def total(self) -> bool:
-        """True where light must be reflected totally in order to continue."""
+        """True where nominal light must be totally reflected to continue."""
         return self.event == Event.REFLECT and self.body > 0 and (self.finish.bare or self.finish.transmission > 0.0)
 
     @property
@@ -108,19 +112,19 @@ class Step:
 
     @property
     def absorbed(self) -> float:
-        """Share of the light that is absorbed, where it does not depend on the angle; shares below rounding are 0."""
+        """Fraction of the light that the surface absorbs, if it does not depend on the angle; 0 below rounding."""
         f = self.finish
         share = 0.0 if f.bare else 1.0 - f.reflectance - f.transmission - f.diffuse
         return share if share > 1e-15 else 0.0
 
     @property
     def ends(self) -> bool:
-        """True where all light is absorbed, so that every path ends."""
+        """True where the surface absorbs all light, so that every path ends there."""
         return self.absorbed == 1.0
 
     @property
     def known(self) -> bool:
-        """True where the finish allows the event of nominal light and is not a measured table."""
+        """True where nominal light can continue with this finish, and its shares do not come from a measured table."""
         f = self.finish
         share = f.transmission if self.event == Event.TRANSMIT else f.reflectance
         possible = (self.total and not f.diffuse) or f.bare or share > 0.0 or (self.detects and self.ends)
@@ -130,16 +134,17 @@ class Step:
 def make_steps(
     scenery: Scenery, line: Sequence[tuple[int, Patch]], codes: Sequence[int], source: np.ndarray
 ) -> tuple[Step, ...]:
-    """Return the surfaces of the nominal path that all paths can pass in the same way.
+    """Return the surfaces of the nominal path, as far as all paths can be traced through them with the same numbers.
 
     Parameters
     ----------
     scenery : Scenery
         Surfaces.
     line : sequence of (int, Patch)
-        Apertures that nominal light meets, each with the row of the segment that leads to it, see ``Step``.
+        Apertures that nominal light meets, each with the row in ``tables.segment_table`` of the clear segment that
+        leads to it; 0 where that is not clear.
     codes : Sequence[int]
-        Codes of the family's events.
+        Numbers of the events of nominal light, see ``path_families.code``.
     source : (3,) ndarray
         Middle of the source, world frame, metres.
     """
@@ -181,7 +186,7 @@ class NominalPart:
     passed : Dr.Jit array
         Number of surfaces that each has passed.
     reason : Dr.Jit array
-        ``ENDED``, ``MISSED`` or ``TURNED``.
+        Reason why each has left: ``ENDED``, ``MISSED`` or ``TURNED``.
     draws : tuple of int
         Number of steps of the random generator still to be taken, by the surfaces passed.
     """
@@ -193,7 +198,7 @@ class NominalPart:
 
     @property
     def arrays(self) -> list[Any]:
-        """All arrays to be evaluated."""
+        """All arrays of the paths, which Dr.Jit has to evaluate."""
         at = self.launch
         return [at.position, at.direction, at.weight, at.length, at.rng, self.passed, self.reason]
 
@@ -393,7 +398,7 @@ class OneSurface:
         return self.prepared.tables.samples
 
     def geometry(self, surface: Any, active: Any) -> list[Any]:
-        """Return the surface's numbers of the geometry table, without clear segments.
+        """Return the surface's row of the geometry table (pose, apertures, kind) without its clear segments.
 
         Numbers that encode a kind are constants of the kernel's code.
         """
@@ -404,11 +409,11 @@ class OneSurface:
         return out
 
     def clearance(self, surface: int) -> Any:
-        """Return the clearance of any surface, metres."""
+        """Return the distance beyond any surface at which the search for the next one starts, metres."""
         return self._numbers(self.prepared.tables.rows, layout.ROW * surface + layout.CLEARANCE, 1)[0]
 
     def finish(self, row: Any, active: Any) -> list[Any]:
-        """Return reflectance, transmission, diffuse share and share of the lobe of the surface's finish.
+        """Return reflectance, transmission, and shares of diffused and of scattered light, of the surface's finish.
 
         Shares of 0 or 1 are constants of the kernel's code.
         """
@@ -426,7 +431,7 @@ class OneSurface:
         return self._numbers(self.prepared.tables.segments, layout.SEGMENT * self.step.segment, layout.SEGMENT)
 
     def _numbers(self, source: Any, first: int, count: int) -> list[Any]:
-        """Read numbers at an index that is the same for all paths, so that the kernel reads them once."""
+        """Return ``count`` numbers of a table from index ``first``, read once because it is the same for all paths."""
         import drjit as dr
 
         backend = self.prepared.backend
@@ -473,7 +478,7 @@ class Departures:
         steps : Sequence[Step]
             Surfaces of the nominal path.
         stretch : NominalPart
-            Paths.
+            The paths at the point where they have left the nominal path.
         numbers : (N,) ndarray
             Numbers of the N paths in the run.
         learned : LearnedRoulette or None

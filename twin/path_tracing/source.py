@@ -64,7 +64,7 @@ class DiskSource:
 
     @classmethod
     def along(cls, centre: np.ndarray, axis: np.ndarray, radius: float, cone: float = 0.0) -> DiskSource:
-        """Make a source with an arbitrary pair of transverse axes."""
+        """Make a source from its axis; the pair of transverse axes is arbitrary."""
         axis = np.asarray(axis, np.float64) / np.linalg.norm(axis)
         helper = np.eye(3)[np.argmin(np.abs(axis))]
         return cls(np.asarray(centre, np.float64), axis, transverse_axes(axis, helper), radius, cone)
@@ -88,7 +88,7 @@ class DiskSource:
 
     @property
     def patch(self) -> Patch:
-        """Disk of positions that emits the light, as the start of a clear segment."""
+        """Disk that emits the light, as the start of a clear segment (a stretch of path with nothing in between)."""
         pose = Pose(np.column_stack([*self.across, self.axis]), self.centre)
         r = self.radius
         return Patch.flat(-1, 0, pose, (-r, r, -r, r))
@@ -221,9 +221,9 @@ def _drawn(backend: Backend, source: DiskSource, numbers: Any, total: int, seed:
 
 
 def pieces(total: int, size: int, cut: int = 0) -> Iterator[tuple[int, int]]:
-    """Divide a run into launches of at most ``size`` paths; yield the first path's number and the count.
+    """Divide a run into launches of at most ``size`` paths; yield the number of the first path and of paths of each.
 
-    No launch extends across the path number ``cut``.
+    A launch is a group of paths traced together. No launch extends across the path number ``cut``.
     """
     for begin, end in ((0, cut), (cut, total)):
         for first in range(begin, end, size):

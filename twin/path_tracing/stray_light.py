@@ -1,10 +1,10 @@
 """Ghosts and stray light on the area CCDs, which are added to the diffraction images of the spots.
 
-The spot's diffraction image (``twin.monitor.monitor_path``) holds the nominal family exactly. The light of every
-pinhole is path-traced through the whole instrument, and the surfaces that a path met distinguish the nominal family
-from all others, so that nothing is counted twice. The other light consists of geometric rays in pixels. It passed
-apertures of the same size as those of the nominal spot, and is convolved with the nominal spot's diffraction image
-before it is added. Its interference with the nominal light is neglected.
+The spot's diffraction image (``twin.monitor.monitor_path``) contains exactly the light on the nominal path, the nominal
+family. The light of every pinhole is path-traced through the whole instrument, and the surfaces that a path met
+distinguish the nominal family from all others, so that nothing is counted twice. The other light consists of geometric
+rays in pixels. It passed apertures of the same size as those of the nominal spot, and is convolved with the nominal
+spot's diffraction image before it is added. Its interference with the nominal light is neglected.
 """
 
 from __future__ import annotations
@@ -37,15 +37,19 @@ CONE_MARGIN = 1.25
 """Half-angle of the cone into which a pinhole emits, relative to that of the pupil seen from the focal plane."""
 
 AIM_RINGS = 6
-NARROW_MARGIN = 1.2
-"""Radius of the narrow cone relative to that of the rays to the outermost of ``AIM_RINGS`` on the return face.
+"""Number of rings of rays by which the direction from a pinhole to the return face is sampled.
 
-The rays end 3 % inside its edge.
+The return face is the mirror surface that sends the monitor's light back.
+"""
+NARROW_MARGIN = 1.2
+"""Radius of the narrow cone of emission, relative to the cone of rays to the outermost of ``AIM_RINGS``.
+
+These rays end on the return face, the mirror surface that sends the monitor's light back, 3 % inside its edge.
 """
 
 
 class NominalPathLost(PhysicalError, RuntimeError):
-    """No path reached an area CCD along its nominal surfaces, so that nothing can be normalised."""
+    """No path reached a monitor's area CCD along its nominal surfaces, so stray light cannot be normalised."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,7 +62,7 @@ class StrayResult:
         Area CCD (``<camera>/<channel>/area_ccd``) -> expected photons per pixel and frame from all traced sources,
         without the nominal families.
     runs : Mapping[str, PathResult]
-        Channel -> result for its source.
+        Channel -> result of the path tracer for its pinhole.
     photons_per_power : Mapping[str, float]
         Channel -> photons per frame that correspond to the whole emitted power of its source.
     """
@@ -68,7 +72,10 @@ class StrayResult:
     photons_per_power: Mapping[str, float]
 
     def relative(self, channel: str) -> list[ListedFamily]:
-        """Return the families of a channel's source at any detector, the strongest first."""
+        """Return the families of paths of a channel's pinhole, each with its light relative to the nominal spot's.
+
+        They end at any detector; the strongest comes first.
+        """
         run = self.runs[channel]
         nominal = run.nominal(f"{channel}/area_ccd")
         others = [(family, family.energy / nominal.energy) for family in run.families if family.kind != "nominal"]
@@ -113,7 +120,7 @@ def pinhole(
 ) -> DiskSource:
     """Return the light source of a channel: its pinhole, which emits evenly into a cone that covers the camera's pupil.
 
-    Half of the paths are aimed at the return face.
+    Half of the paths are aimed at the return face, the mirror surface that sends the light back.
 
     Parameters
     ----------
@@ -143,12 +150,15 @@ def pinhole(
 
 
 def _nominal_rays(instrument: Instrument, backend: Backend) -> AimedRays:
-    """Return the rays from every pinhole to its return face in the unperturbed instrument."""
+    """Return the rays from every pinhole to its return face (mirror that sends the light back), nominal instrument."""
     return MonitorPath(instrument, backend, quadrature.disk(AIM_RINGS)).nominal
 
 
 def monitor_families(scenery: Scenery, instrument: Instrument) -> dict[str, tuple[int, ...]]:
-    """Return area CCD -> codes of the events of its nominal family."""
+    """Return a mapping from each monitor's area CCD to its nominal events, as numbers of ``path_families.code``.
+
+    An event is a surface that nominal light meets and what happens to it there.
+    """
     return {
         f"{c.key}/area_ccd": nominal_codes(scenery, instrument.assembly, f"{c.key}/monitor")
         for c in instrument.channels
@@ -192,7 +202,7 @@ def trace_stray(
     sampling : Sampling
         Sampling of the paths.
     cone : float or None
-        Sine of the half-angle into which the pinholes emit, see ``pinhole``.
+        Sine of the half-angle into which the pinholes emit; by default ``CONE_MARGIN`` times that of the pupil.
     chunk : int
         Number of paths of one launch.
     progress : Progress or None
@@ -235,15 +245,15 @@ def trace_stray(
 
 
 SPREAD_PX = 88
-"""Half-width of the diffraction image with which stray light is convolved, in pixels."""
+"""Half-width, in pixels, of the spot's diffraction image with which stray light is convolved."""
 
 FAMILIES = 20
-"""Number of families that are listed for each source, the strongest first."""
+"""Number of path families (paths with the same events) that are listed for each source, the strongest first."""
 
 GHOSTS = 1e-3
-"""Share of a spot's light above which ghosts on its area CCD cause a warning.
+"""Ratio of ghost to spot light on a monitor's area CCD above which a warning is given.
 
-A motion of a pixel is then misread by 1e-3 px, some times the centroid's noise.
+The spot's centroid then follows a motion by one pixel with an error of up to 1e-3 px, several times its noise.
 """
 
 
@@ -266,7 +276,10 @@ class StrayLight:
     paths: int
 
     def share(self, nominal: np.ndarray) -> np.ndarray:
-        """Return the ratio of stray to nominal light on the area CCD of each of C channels, (C,)."""
+        """Return the ratio of stray to nominal light on the area CCD of each of C channels, (C,).
+
+        ``nominal`` holds the expected photons of the nominal spots, as ``photons`` those of stray light.
+        """
         return np.asarray(self.photons.sum(axis=(1, 2)) / nominal.sum(axis=(1, 2)))
 
     def to_dict(self) -> dict[str, Any]:
@@ -358,7 +371,7 @@ def diffraction_spots(experiment: MonitorExperiment) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Ghost:
-    """Ghosts on one area CCD with more than GHOSTS of its spot's light.
+    """Ghosts on one area CCD that together have more than the fraction ``GHOSTS`` of the light of its spot.
 
     Attributes
     ----------
@@ -367,8 +380,8 @@ class Ghost:
     source : str
         Channel that the strongest ghost comes from, ``<camera>/<channel>``.
     body : str or None
-        Path of the prism that causes it, the first with a reflecting face that should transmit; None where the ghost
-        met only nominal surfaces in another order.
+        Path of the prism that causes the strongest ghost, the first with a reflecting face that should transmit; None
+        where the ghost met only nominal surfaces in another order.
     text : str
         Warning.
     """

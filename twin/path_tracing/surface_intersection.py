@@ -1,10 +1,10 @@
 """Intersections of paths with the next surface.
 
-In the open, Mitsuba's ``Scene.ray_intersect_preliminary`` (float32, on triangles) finds the surface; Newton's method
+Outside glass, Mitsuba's ``Scene.ray_intersect_preliminary`` (float32, on triangles) finds the surface; Newton's method
 then finds the point on the analytic surface in float64. Inside a glass body no triangles are needed: the body is convex
-and its faces are flat, so the next face is the nearest one ahead, exactly, and no path leaks through an edge. Back in
-the open, a triangle that is hit by rounding only (of the surface just left, the inside of a glass face, the rim of a
-mesh beyond a mirror's edge) is skipped, and the search continues behind it. Paths start in the open, outside all glass.
+and its faces are flat, so the next face is the nearest one ahead, exactly, and no path leaks through an edge. Outside
+glass again, a triangle that is hit by rounding only (of the surface just left, the inside of a glass face, the rim of a
+mesh beyond a mirror's edge) is skipped, and the search continues behind it. Paths start outside all glass.
 """
 
 from __future__ import annotations
@@ -18,14 +18,15 @@ from twin.path_tracing import tables as layout
 from twin.path_tracing.clear_ways import EXITS
 
 REFINEMENTS = 3
-"""Number of Newton steps from the triangle to the surface.
+"""Number of Newton steps from a ray's intersection with a surface's triangles to that with the true surface.
 
 The error falls from below a millimetre to 1e-7 m, 1e-13 m and to rounding, also at grazing incidence.
 """
 
 EXACT = 1e-12
-"""Largest value of the level function, in metres, at which a surface counts as met: some hundred roundings of ten
-metres.
+"""Largest residual of a surface's equation (``optics.geometry.surface.level``), metres, where it counts as met.
+
+It is some hundred rounding errors of a length of ten metres.
 """
 
 AHEAD = 1e-12
@@ -41,13 +42,14 @@ class Flight:
     position, direction : Dr.Jit Vector3
         Position, metres, and unit direction, ``Vector3``.
     body : Dr.Jit array
-        Number of the glass body that they are in: None in a scene without glass, 0 in the open.
+        Number of the glass body that they are in: None in a scene without glass, 0 outside of glass.
     ahead : Dr.Jit array
         Distance ahead at which the search for a surface starts, metres.
     active : Dr.Jit mask
         Mask of the active paths.
     coherent : Dr.Jit mask
-        Mask of the paths that follow their neighbours.
+        Mask of the paths that were neither scattered nor took an unlikely direction, and so behave like their
+        neighbours.
     segment : Dr.Jit array
         Index of the clear segment of each path; 0 if it is on none.
     segments : bool
@@ -77,7 +79,7 @@ class NextSurface:
     hit : Dr.Jit mask
         Mask of the paths that meet one.
     expected : Dr.Jit mask
-        Mask of the paths that are only expected to meet it, by their clear segment.
+        Mask of the paths that meet it if they hit the aperture at the end of their clear segment; no search was made.
     segment : list of Dr.Jit arrays
         Index of the segment after it, and code of its end, see ``tables.segment_table``.
     """
@@ -121,9 +123,9 @@ def next_surface(backend: Backend, mi: Any, scene: Any, tables: layout.SceneTabl
 
 
 def _end(backend: Backend, tables: layout.SceneTables, flight: Flight) -> tuple[Any, Any, list[Any]]:
-    """Return the distance to the ends of clear segments, a mask of the paths that can meet them, and the segments.
+    """Return approximate distances to the ends of clear segments, which paths can meet them, and the segments.
 
-    The distance is approximate, in metres.
+    A clear segment is a stretch of path with no surface in between. Distances are in metres.
     """
     import drjit as dr
 

@@ -26,14 +26,15 @@ from twin.path_tracing.clear_ways import EXITS, Segment
 _HEADER = 8
 """Count of numbers at the head of a scatter table.
 
-They are: rings, sectors, first share, first of the rings' sums, first of the sectors' sums, first cosine, first
-azimuth, 1 where half of the draws are mirrored.
+They are: number of rings and of sectors; indices of the first share, of the first of the rings' cumulative sums, of the
+first of the sectors', of the first cosine and of the first azimuth; and 1 where half of the random directions are
+mirrored.
 """
 MARKS = 4
-"""Count of numbers that refer from a surface finish to its tables.
+"""Count of the numbers by which a surface finish refers to its measured tables.
 
-They are the numbers of its coating and of its scatter table, each counted from 1 with 0 if there is none, and 1 where
-all that it reflects is what the table scatters. One is unused.
+They are the number of its coating table and of its scatter table, each counted from 1 with 0 if there is none; 1 where
+all that it reflects is what the table scatters, else 0; and an unused one.
 """
 
 
@@ -44,7 +45,7 @@ class FinishTables:
     Attributes
     ----------
     marks : Dr.Jit array
-        (surfaces * 3 * MARKS) numbers of the tables of every finish.
+        (surfaces * 3 * MARKS) numbers of the tables that every finish refers to, see ``MARKS``.
     coatings : Dr.Jit array
         (coatings * (STEPS + 1) * 2) reflectance and transmittance.
     headers : Dr.Jit array
@@ -64,13 +65,14 @@ class FinishTables:
     most_sectors: int
 
     def of(self, row: Any, active: Any) -> list[Any]:
-        """Return the numbers of the coating and scatter tables of each path's surface finish, see ``MARKS``."""
+        """Return the ``MARKS`` numbers by which each path's surface finish refers to its coating and scatter tables."""
         return [self._get(self.marks, row * MARKS + k, active) for k in range(MARKS - 1)]
 
     def shares(self, marks: Sequence[Any], cosine: Any, active: Any) -> tuple[Any, Any]:
-        """Return reflectance and transmittance of the coatings that paths meet.
+        """Return reflectance and transmittance of the measured coatings that paths meet.
 
-        ``cosine`` is that of the angle between path and normal on the side of air.
+        ``marks`` are the numbers of their tables, and ``cosine`` is that of the angle between path and normal on the
+        side of air.
         """
         number, k, w = self._place(marks[0], cosine, fresnel_scatter.COATING_STEPS)
         first = 2 * ((fresnel_scatter.COATING_STEPS + 1) * number + k)
@@ -79,7 +81,7 @@ class FinishTables:
         return (1.0 - w) * low[0] + w * high[0], (1.0 - w) * low[1] + w * high[1]
 
     def total(self, marks: Sequence[Any], cosine: Any, active: Any) -> Any:
-        """Return the total integrated scatter of the tables, for paths that have one."""
+        """Return the total integrated scatter at each path's angle of incidence, for paths with a scatter table."""
         number, k, w = self._place(marks[1], cosine, fresnel_scatter.STEPS)
         has = active & (marks[1] > 0.5)
         first = self._uint(self._get(self.headers, _HEADER * number + 2, has)) + k
@@ -134,7 +136,7 @@ class FinishTables:
         return dr.normalize(out - 2.0 * below * side)
 
     def _place(self, mark: Any, cosine: Any, steps: int) -> tuple[Any, Any, Any]:
-        """Return the number of the table, the interval of the angle of incidence and the position in it."""
+        """Return the table's number from 0, the interval of the angle of incidence, and the fraction of it, 0 to 1."""
         import drjit as dr
 
         angle = dr.acos(dr.clip(cosine, 0.0, 1.0)) * (2.0 * steps / np.pi)
@@ -142,7 +144,10 @@ class FinishTables:
         return self._uint(dr.maximum(mark, 1.0)) - 1, k, angle - self.backend.Float(k)
 
     def _search(self, first: Any, count: Any, most: int, u: Any, active: Any) -> tuple[Any, Any]:
-        """Return the cell whose interval of cumulative shares contains the random number u, and u's position in it."""
+        """Return the cell whose interval of cumulative shares contains a random number u, and u's place in it, 0 to 1.
+
+        ``first`` is the index of the first cumulative share, ``count`` the number of cells, at most ``most``.
+        """
         import drjit as dr
 
         cell = dr.binary_search(
@@ -214,14 +219,15 @@ BLOCKS = 8
 ROW = BLOCK * BLOCKS
 """Count of numbers that describe a surface in the geometry table.
 
-0-8 rotation world to local, 9-11 its shift, 12 clearance, 13 refractive index behind, 14 index of the part plus one, 15
-reciprocal of the index, 16-25 two clear apertures, 26 bits of the kind, 28-31 indices of the first segment for each way
-of leaving the surface, 0 if there is none.
+By index: 0-8 rotation from the world frame to the surface's, 9-11 shift of the same transform, 12 distance beyond the
+surface at which the search for the next one starts, 13 refractive index behind, 14 index of the part plus one, 15
+reciprocal of the refractive index, 16-25 two clear apertures, 26 bits of the kind, 28-31 indices of the first clear
+segment for each way of leaving the surface, 0 if there is none.
 """
 
 CLEARANCE, INDEX, PART, INVERSE, APERTURES, KIND, SEGMENTS = 12, 13, 14, 15, 16, 26, 28
 KINDS = (20, 25, KIND)
-"""Positions in a surface's geometry numbers of those that encode a kind (of aperture, of surface)."""
+"""Positions, in a surface's row of the geometry table, of numbers that encode a kind (of aperture or of surface)."""
 
 CURVES = 2
 """Number of memory blocks that describe a curved surface: curvature, conic, and aspheric terms A4, A6, A8."""
@@ -248,18 +254,21 @@ ROWS_PER_SURFACE = 3
 """Number of finishes of a surface: met from +z, met from -z, outside its clear apertures."""
 
 SEGMENT = 8
-"""Count of numbers of a clear segment."""
+"""Count of numbers by which a clear segment is described, see ``segment_table``."""
 
 MOST_EVEN = 3
 MOST_BODIES = 255
 MOST_DETECTORS = 255
 
 NOMINAL_SUMS = 8
-"""Number of sums of the nominal family per detector, one of them unused."""
+"""Number of sums over the detections of nominal light per detector (``path_result.SUMS``), one of them unused."""
 
 
 class Kind:
-    """Bits of the number that encodes a surface's kind."""
+    """Bits of the number that describes a surface: face of a glass solid, ends at its clear apertures, curved.
+
+    Further bits hold the numbers of its glass body and of its detector.
+    """
 
     SOLID = 1
     ENDS = 2
@@ -297,7 +306,7 @@ class SurfaceForm:
 
     @classmethod
     def of(cls, surfaces: Sequence[SceneSurface]) -> SurfaceForm:
-        """Return the components that some surfaces need together."""
+        """Return the components of shape that at least one of the surfaces has."""
         shapes = [s.surface for s in surfaces]
         order = max((f.order for s in shapes if (f := s.zernike_figure) is not None), default=-1)
         grid = any(s.grid_figure is not None for s in shapes)
@@ -332,7 +341,7 @@ class SceneTables:
     detectors : Dr.Jit array
         (detectors * 8) pixels per metre in x and y, columns, rows, first pixel.
     nominal : Dr.Jit array
-        (detectors,) signature of the nominal family.
+        (detectors,) hash of the events of each detector's nominal light.
     pixels : Dr.Jit array
         Number of pixels of all detectors together.
     segments : Dr.Jit array
@@ -361,7 +370,7 @@ class SceneTables:
     measured: FinishTables | None = None
 
     def geometry(self, surface: Any, active: Any) -> list[Any]:
-        """Return the geometry of the surface that each path meets, ``ROW`` numbers."""
+        """Return the ``ROW`` numbers (pose, apertures, kind) of the surface that each path meets."""
         return self._row(self.rows, surface, BLOCKS, active)
 
     def surface(self, number: Any, form: SurfaceForm, active: Any) -> SurfaceNumbers:
@@ -432,7 +441,7 @@ def upload(
     scenery : Scenery
         Surfaces.
     nominal : Mapping[str, int]
-        Detector name -> signature of its nominal family.
+        Detector name -> hash of the events of its nominal light, see ``path_families.signature``.
     segments : Sequence[Segment]
         Clear segments.
 

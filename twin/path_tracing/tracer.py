@@ -94,10 +94,11 @@ class Sampling:
         is exact in every run. Above 0, weak directions are drawn more often and carry less weight each, which finds
         faint ghosts; the balance then holds on average.
     second : float or None
-        Floor of paths that have taken one direction that a floor made more likely; None uses ``floor``. A ghost comes
-        from two weak reflections: after the first the second is worth drawing, and after the second none is.
+        Smallest probability for paths that have taken one direction which ``floor`` made more likely; None uses
+        ``floor``. A ghost comes from two weak reflections: after the first the second is worth drawing, and after the
+        second none is.
     further : float or None
-        Floor of paths that have taken more such directions or have been scattered; None uses ``floor``.
+        Smallest probability for paths that have taken more such directions or have been scattered; None uses ``floor``.
     scatter_floor : float
         Smallest probability of scattering out of the specular direction; where ``second`` is given it ends with the
         first weak direction.
@@ -129,7 +130,7 @@ class Sampling:
 
     @property
     def floors(self) -> tuple[float, float, float]:
-        """Smallest probabilities of a direction after no, one, and more weak directions."""
+        """Smallest probabilities of a direction for paths that have taken no, one, and more weak directions before."""
         return (
             self.floor,
             self.floor if self.second is None else self.second,
@@ -138,7 +139,7 @@ class Sampling:
 
     @property
     def scatter_floors(self) -> tuple[float, float, float]:
-        """Smallest probabilities of scattering after no, one, and more weak directions."""
+        """Smallest probabilities of scattering for paths that have taken no, one, and more weak directions before."""
         later = self.scatter_floor if self.second is None else 0.0
         return self.scatter_floor, later, later
 
@@ -152,7 +153,7 @@ FAINT = Sampling(floor=0.1, second=0.5, further=0.0, scatter_floor=0.02, near=0.
 
 @dataclass(frozen=True, eq=False)
 class NominalPath:
-    """Data for tracing a launch's N paths along the nominal path.
+    """Data by which N paths of a launch are traced along the nominal path.
 
     Attributes
     ----------
@@ -224,7 +225,7 @@ So many save the time that recording its kernel takes, as measured. Fewer are tr
 the same.
 """
 MOST_FAMILIES = 200
-"""Number of families whose events are looked up, the strongest first."""
+"""Largest number of path families (paths with the same events) whose events are determined, the strongest first."""
 
 Progress = Callable[[int, int], None]
 """Function called with the number of paths done and the number of all."""
@@ -240,7 +241,7 @@ class PathTracer:
     scenery : Scenery
         Surfaces.
     nominal : Mapping[str, tuple of int] or None
-        Detector -> codes of the events of its nominal family.
+        Detector -> events of its nominal light, as the numbers of ``path_families.code``.
     sampling : Sampling
         Sampling of the paths.
     segments : bool
@@ -249,7 +250,7 @@ class PathTracer:
     Raises
     ------
     ValueError
-        A nominal family belongs to a detector that the scenery does not have.
+        Nominal events are given for a detector that the scenery does not have.
     """
 
     def __init__(
@@ -361,7 +362,7 @@ class PathTracer:
         source : Source
             Source of the paths.
         toward : str or None
-            Detector, see ``run``.
+            Name of the detector whose nominal light the source emits; None for the first one.
         paths : int
             Number of paths of the run.
         """
@@ -376,7 +377,7 @@ class PathTracer:
         return make_steps(self.scenery, known, codes, source.centre)[: self.sampling.steps - 1]
 
     def _with_first_segment(self, source: Source, toward: str | None) -> tuple[PreparedScene, Any]:
-        """Return the scene with the first segment of a source's light, and its row for all paths, 0 for none."""
+        """Return the scene with the clear segment from a source to its first surface, and its index; 0 for none."""
         import drjit as dr
 
         segment = self._clear.from_source(source.patch, toward) if isinstance(source, DiskSource) else None
@@ -410,7 +411,7 @@ class PathTracer:
         toward: str | None,
         learned: LearnedRoulette | None,
     ) -> dict[Key, tuple[SurfaceEvent, ...]]:
-        """Return the events of the families: nominal ones as given, others by tracing one path of each again."""
+        """Return the events of path families: nominal ones as given, others by tracing one path of each again."""
         names = [d.name for d in self.scenery.detectors]
         events = {
             key: surface_events(self.scenery, self.nominal[names[key.detector]])
@@ -438,7 +439,10 @@ class PathTracer:
         toward: str | None = None,
         learned: LearnedRoulette | None = None,
     ) -> list[tuple[int, ...]]:
-        """Return the codes of all events of the paths of given numbers of a run; the other arguments are the run's."""
+        """Return the numbers (``path_families.code``) of all events of selected paths of a run, which are traced again.
+
+        ``numbers`` are the paths' numbers in the run; the other arguments are those of the run.
+        """
         import drjit as dr
 
         count, steps_limit = len(numbers), self.sampling.steps

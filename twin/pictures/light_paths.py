@@ -42,7 +42,8 @@ class Beam:
         Points in the base frame, middle ray first, metres; imaging beams run from the scene to the line CCD, monitor
         beams from the pinhole to the area CCD.
     footprints : mapping
-        (mirror, pass) -> (1 + RIM, 2) points in the mirror's x, y, metres; pass 0 first, then 1.
+        (mirror, pass) -> (1 + RIM, 2) points where the rays meet the mirror, in its x, y, metres; pass is 0 when the
+        beam meets the mirror first, and 1 when it meets it again.
     """
 
     camera: str
@@ -52,7 +53,7 @@ class Beam:
 
     @property
     def is_monitor(self) -> bool:
-        """True for a beam of the monitor."""
+        """True for a beam of the autocollimation monitor, False for an imaging beam."""
         return self.name.startswith("monitor/")
 
 
@@ -72,7 +73,7 @@ class LightPaths:
     placed: PlacedBodies
 
     def of(self, camera: str, monitor: bool) -> tuple[Beam, ...]:
-        """Return the beams of one camera: those of its monitor, or its imaging beams."""
+        """Return the beams of one camera: of its autocollimation monitor if ``monitor`` is true, else imaging beams."""
         return tuple(b for b in self.beams if b.camera == camera and b.is_monitor == monitor)
 
 
@@ -111,14 +112,14 @@ def _length(instrument: Instrument, placed: PlacedBodies) -> float:
 
 
 def _circle(radius: float) -> np.ndarray:
-    """Return the centre and ``RIM`` points along the edge of a circle, (1 + RIM, 2), in the unit of the radius."""
+    """Return the centre and ``RIM`` points along the edge of a circle, (1 + RIM, 2), in the unit of its ``radius``."""
     angle = 2.0 * np.pi * np.arange(RIM) / RIM
     edge = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
     return np.concatenate([np.zeros((1, 2)), radius * edge])
 
 
 def _radius(aperture: Aperture | None) -> float:
-    """Return the radius of the circle inscribed in an aperture, metres."""
+    """Return the radius of the largest circle inside an aperture about its centre, metres."""
     assert aperture is not None
     return aperture.inscribed
 
@@ -160,7 +161,10 @@ def _imaging(instrument: Instrument, backend: Backend, state: State, placed: Pla
 
 
 def _monitor(instrument: Instrument, backend: Backend, state: State, placed: PlacedBodies) -> list[Beam]:
-    """Trace the monitor beams of all channels from the pinholes via the return faces to the area CCDs."""
+    """Trace the monitor beams of all channels from the pinhole via the return face to the area CCD.
+
+    The return face is the mirror surface that sends the light back.
+    """
     assembly, channels = instrument.assembly, instrument.channels
     guess = np.array([instrument.toward_optics(placed, c.camera)[0] for c in channels])[:, None]
     start = np.array([placed.pose(c.reticle_body).translation for c in channels])[:, None]

@@ -1,7 +1,7 @@
 """Pictures of an instrument, rendered by Mitsuba and denoised.
 
-Pixels are sampled in lists of equal sample count rather than picture by picture: those on matt surfaces need few
-samples, glass many. The samples of a pixel are averaged in a fixed order, so that a seed reproduces the same picture.
+Pixels are sampled in groups with the same number of samples: pixels on matt surfaces need few, those on glass many. The
+samples of a pixel are averaged in a fixed order, so that a seed reproduces the same picture.
 
 ``picture.png`` shows both cameras, ``picture_prisms.png`` the central prism and its neighbours, and
 ``picture_focal_plane.png`` the detectors of the first camera. They are illustrations and not for measuring: light beams
@@ -31,13 +31,13 @@ from twin.pictures.scene_file import build_scene
 VARIANTS = {"llvm": "llvm_ad_rgb", "cuda": "cuda_ad_rgb"}
 """Backend -> the colour variant of Mitsuba that its machine can run."""
 AT_ONCE = 4_000_000
-"""Number of paths per launch, between which the program can be interrupted."""
+"""Number of light paths that are traced at once; between these calls the program can be interrupted."""
 BRIGHTEST = 4.0
 """Radiance at which samples are clipped, so that single paths to a lamp through glass leave no white dots."""
 DEPTH = 14
-"""Largest number of path segments: light crosses two prisms and more."""
+"""Largest number of segments of a light path: light may cross two prisms and be reflected several times."""
 SOFT = 0.75
-"""Half width of the tent filter of a pixel, pixels."""
+"""Half-width of the tent-shaped weight with which samples around a pixel's middle are averaged, in pixels."""
 
 
 class PictureError(RuntimeError):
@@ -141,7 +141,8 @@ class Studio:
         Returns
         -------
         tuple of ndarray
-            Number of the part, (H, W), -1 where there is none; and unit normal of its surface, (H, W, 3).
+            Number of the part that each pixel of H rows and W columns shows, (H, W), -1 where there is none; and unit
+            normal of its surface, (H, W, 3).
         """
         import drjit as dr
 
@@ -182,7 +183,7 @@ def _sensor(mi: Any, view: View) -> Any:
 
 
 BLUR, BLUR_SHARE = (6.0, 16.0), 0.025
-"""Over how many pixels the light on a flat patch is averaged: limits, and share of the root of its area."""
+"""Width over which the light on a flat patch is averaged: limits in pixels, and ratio to the root of its area."""
 EXPOSURE = 0.88
 """Factor by which radiance is multiplied before the tone curve."""
 SHOULDER = 0.75
@@ -237,7 +238,7 @@ def denoised(image: np.ndarray, patches: np.ndarray) -> np.ndarray:
 
 
 def displayed(light: np.ndarray) -> np.ndarray:
-    """Convert radiance to sRGB grey values, uint8, with exposure and tone curve applied."""
+    """Convert radiance to sRGB values, uint8, after multiplication by the exposure and compression of highlights."""
     x = np.clip(EXPOSURE * light, 0.0, None)
     room = 1.0 - SHOULDER
     x = np.where(x > SHOULDER, SHOULDER + room * -np.expm1(-(x - SHOULDER) / room), x)
@@ -246,16 +247,19 @@ def displayed(light: np.ndarray) -> np.ndarray:
 
 
 def _patches(part: np.ndarray, normal: np.ndarray) -> np.ndarray:
-    """Return a number for every combination of part and surface direction, float32 (H, W); exact up to 16 000 parts."""
+    """Return a number for each pixel (H, W) that tells its part of the scene and its surface direction, float32.
+
+    Numbers are exact up to 16 000 parts.
+    """
     steps = np.rint(4.0 * normal).astype(int) + 5
     return (part * 1000 + steps @ np.array([1, 10, 100])).astype(np.float32)
 
 
 PICTURE = "render the pictures"
-"""Name of the work in the progress display."""
+"""Name of the rendering of pictures in the progress display."""
 
 LOOKS = ((0.0, 0.0), (-0.35, -0.25), (0.35, 0.25))
-"""Positions in a pixel at which it is tested for showing a single part, pixels from its middle."""
+"""Positions in a pixel, relative to its middle in pixels, where it is tested for showing one part of the scene only."""
 
 Advance = Callable[[str, int, int], None]
 

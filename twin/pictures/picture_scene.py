@@ -69,7 +69,10 @@ class View:
 
 
 def looking(azimuth: float, elevation: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return forward, right and up of a camera at an azimuth (from +X toward +Y) and elevation, degrees."""
+    """Return the forward, right and up vectors of a camera that looks at the scene from a given direction.
+
+    ``azimuth`` is from +X toward +Y and ``elevation`` toward +Z, both in degrees.
+    """
     a, e = np.radians([azimuth, elevation])
     forward = -np.array([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)])
     right = np.cross(forward, [0.0, 0.0, 1.0])
@@ -113,9 +116,9 @@ def framed(
 
 
 SMOOTH = 0.35
-"""Angle below which an edge is a facet boundary of a curved surface, radians."""
+"""Angle between two facets, radians, below which their common edge is not drawn, as they belong to a curved surface."""
 BEAM_PIXELS, EDGE_PIXELS = 1.0, 0.55
-"""Radius of beams and of the drawn edges of glass, in pixels at the middle of the picture."""
+"""Radius of drawn light beams and of drawn edges of glass, in picture pixels at the middle of the instrument."""
 GLOW = 1.3
 """Radiance of drawn beams; that of the floor is about 0.9."""
 FLOOR = "floor"
@@ -163,7 +166,7 @@ _MATERIALS = (
     (GLASS, "glass"),
     (BLOCK, "block"),
 )
-"""Material of a body in ``scene.glb``, and the corresponding material of the picture."""
+"""Pairs of a body's material in ``scene.glb`` and the name of the corresponding material of the rendered picture."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -252,7 +255,7 @@ def _paint(material: Any) -> dict[str, Any]:
 
 
 def _part_of(mesh: trimesh.Trimesh, faces: np.ndarray) -> trimesh.Trimesh:
-    """Return a mesh of the selected faces alone."""
+    """Return a mesh of the faces of another mesh that are selected by a mask or by indices."""
     return trimesh.Trimesh(mesh.vertices, mesh.faces[faces], process=False)
 
 
@@ -270,7 +273,7 @@ def _edges(mesh: trimesh.Trimesh, radius: float) -> trimesh.Trimesh:
 
 
 def _floor(height: float, half_size: float = 500.0) -> trimesh.Trimesh:
-    """Return the floor as a large square."""
+    """Return the floor as a square of half side ``half_size`` at the height z = ``height``, metres."""
     corners = half_size * np.array([[-1.0, -1.0, 0.0], [1.0, -1.0, 0.0], [1.0, 1.0, 0.0], [-1.0, 1.0, 0.0]])
     corners[:, 2] = height
     return trimesh.Trimesh(corners, [[0, 1, 2], [0, 2, 3]], process=False)

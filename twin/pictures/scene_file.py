@@ -36,13 +36,15 @@ from scenes.specs.instrument import BASE, Channel
 from twin.pictures.light_paths import RIM, Beam, LightPaths
 
 LINE_WIDTH = 0.002
+"""Width of a line CCD as drawn, metres; the true width would be invisible."""
 RETICLE = 0.0005
-"""Width of the line CCD and radius of the reticle as drawn, metres."""
+"""Radius of a reticle as drawn, metres."""
 SHEET = 0.001
 """Thickness of baffles as drawn, metres."""
 TUBE = 0.0015
+"""Radius of the tubes by which rays are drawn, metres."""
 TUBE_SIDES = 5
-"""Radius of drawn rays, metres, and their number of sides."""
+"""Number of sides of the tubes by which rays are drawn."""
 
 MIN_MOTION = 1e-12
 """Rotation (radians) or shift (metres) below which a motion is rounding."""
@@ -217,7 +219,7 @@ def _baffle_meshes(plates: tuple[Plate, ...]) -> dict[str, tuple[str, trimesh.Tr
 
 
 def _channel_meshes(instrument: Instrument, channel: Channel) -> dict[str, trimesh.Trimesh]:
-    """Return the meshes of a monitor channel's area CCD, reticle and return face."""
+    """Return the meshes of a monitor channel's area CCD, reticle and return face (mirror that sends the light back)."""
     ccd = instrument.spec.autocollimator.area_ccd
     face = instrument.assembly.elements[f"{channel.key}/return_face"].aperture
     assert isinstance(face, Circle)
@@ -243,13 +245,16 @@ def _box(size: tuple[float, float, float], z: float) -> trimesh.Trimesh:
 
 
 def _painted(mesh: trimesh.Trimesh, material: PBRMaterial) -> trimesh.Trimesh:
-    """Return the mesh with a material."""
+    """Return the mesh, drawn with the given glTF material."""
     mesh.visual = trimesh.visual.TextureVisuals(material=material)
     return mesh
 
 
 def _tubes(beam: Beam, camera: int, radius: float) -> trimesh.Trimesh:
-    """Return the middle ray and some edge rays of a beam as thin tubes."""
+    """Return the middle ray and some edge rays of a beam as tubes of the given radius, metres, in the camera's colour.
+
+    ``camera`` is the index of the camera.
+    """
     rays = beam.vertices[[0, *(1 + k * RIM // 4 for k in range(4))]]
     start, end = rays[:, :-1].reshape(-1, 3), rays[:, 1:].reshape(-1, 3)
     along = (end - start) / np.linalg.norm(end - start, axis=-1, keepdims=True)

@@ -1,4 +1,4 @@
-"""Measurement of one channel: its frames are searched for artefacts and its spot is located in every state."""
+"""Measurement of one monitor channel: its frames are searched for artefacts, and its spot is located in every state."""
 
 from __future__ import annotations
 
@@ -38,7 +38,9 @@ from twin.framework.frame_store import mean_of, release_memory
 from twin.recover.measured_frames import ChannelFrames, StateFrames, cannot_measure
 
 _MOST_GROWTH = 4.0
-"""Factor by which missing pixels may increase the position's sigma before a spot counts as lost."""
+"""Largest factor by which missing pixels may increase the sigma of a spot's position; beyond it the spot counts as
+lost.
+"""
 _REMEDIES = (
     ("(saturation", "frames with less light or a shorter exposure"),
     (
@@ -75,9 +77,9 @@ class SpotResult:
     core : tuple of (float, int) or None
         Reduced chi-square of the spot's core, and its number of pixels; None where no shape was fitted.
     fits : bool
-        True if the core has the calibrated shape.
+        True if the core of the spot has the calibrated shape, according to its chi-square.
     noise_ratio : float or None
-        Ratio of the frames' noise to the specified noise; None where they agree.
+        Ratio of the frames' temporal noise to that of the detector's data sheet; None where they agree.
     """
 
     frames: StateFrames
@@ -115,7 +117,7 @@ class ChannelResult:
     after: tuple[SpotResult, ...]
 
     def states(self) -> tuple[tuple[str, SpotResult], ...]:
-        """Return name and result of each state; the name is before, after, or after with its number."""
+        """Return name and measured spot of each state: "before" and "after", or "after" with a number in a series."""
         many = len(self.after) > 1
         return (
             ("before", self.before),
@@ -124,7 +126,7 @@ class ChannelResult:
 
 
 def remedy(reason: str) -> str:
-    """Return advice on what to do about a spot that cannot be measured, chosen by the reason."""
+    """Return advice on what to change when a spot cannot be measured, chosen by words of the ``reason``."""
     return next((remedy for word, remedy in _REMEDIES if word in reason), "other frames of this channel")
 
 
@@ -163,7 +165,7 @@ class ChannelMeasurement:
 
     @property
     def plain(self) -> bool:
-        """True if the main job could measure these frames without any correction."""
+        """True if these frames need no correction, so that the main job's computation can be used as it is."""
         channel = self.channel
         full_frames = all(state.shape == channel.ccd and not any(state.offset) for state in channel.states)
         equal_counts = len({len(state.frames) for state in channel.after}) == 1
@@ -181,7 +183,10 @@ class ChannelMeasurement:
         return self._templates[state.shape]
 
     def search(self) -> list[Issue]:
-        """Compare frames with each other and images with the spot's shape; return issues that forbid a measurement."""
+        """Search the frames for artefacts, by comparison with each other and with the spot's shape.
+
+        The result is the issues that make a measurement impossible.
+        """
         issues: list[Issue] = []
         try:
             self._show_level()
@@ -209,7 +214,7 @@ class ChannelMeasurement:
         return issues
 
     def _show_level(self) -> None:
-        """Lower the detector's dark level where a level was subtracted from the frames.
+        """Lower the detector's dark level in the noise model where a level was subtracted from the frames.
 
         Raises
         ------
@@ -239,7 +244,7 @@ class ChannelMeasurement:
         self._level = (Finding("subtracted level", text, corrects=False),)
 
     def _show_noise(self) -> None:
-        """Set the detector's noise to that of its noisiest frames, where that exceeds the specified noise."""
+        """Set the noise model to the noise of the noisiest frames where it exceeds that of the data sheet."""
         channel = self.channel
         dark_noises = []
         for state in channel.states:
@@ -254,7 +259,7 @@ class ChannelMeasurement:
             self._noisy = True
 
     def _lost(self, state: StateFrames, error: SpotError, saturation: str = "") -> Issue:
-        """Return the issue of a spot that cannot be measured; saturated pixels are named first."""
+        """Return the issue of a spot that cannot be measured; if pixels are saturated, ``saturation`` says so first."""
         reason = "; ".join(error.reasons.values())
         if saturation:
             reason = f"too much of the spot is missing (saturation: {saturation}): {reason}"
@@ -291,7 +296,7 @@ class ChannelMeasurement:
         )
 
     def _learn(self, screened: ScreenedFrames) -> tuple[ScreenedFrames, LearntTemplate]:
-        """Return frames without outlier pixels, and the shape of the spot that is learnt from them."""
+        """Return frames without outlier pixels, and the spot's shape (template) learnt from them."""
         if self._searches:
             outliers = outlier_pixels(screened, self.channel.noise)
             if np.any(outliers):
@@ -303,7 +308,7 @@ class ChannelMeasurement:
         return screened, learn_template(screened, self.channel.noise)
 
     def _examine(self, number: int, state: StateFrames) -> Examined | None:
-        """Search a state's mean image for artefacts; return None where no search is asked for."""
+        """Search the mean image of state ``number`` for artefacts; return None if no search is requested."""
         screened, test = self._screened[number], self._test
         fitted = test.vibration == "fitted"
         if not self._searches and not fitted and np.all(screened.good):
@@ -353,14 +358,14 @@ class ChannelMeasurement:
         return self._on_ccd(widened(positions, np.array(self._widened[-1:])), state)
 
     def _widening(self, number: int) -> float:
-        """Return the factor that increases a spot's sigma for a poor fit of its core; 1 if no shape was fitted."""
+        """Return the factor by which sigma is increased where a spot's core fits poorly; 1 without a fitted shape."""
         examined, first = self._examined[number], self._examined[0] if self._learnt else None
         if examined is None or (self._learnt and number == 0):
             return 1.0
         return examined.fit.core_widening(None if first is None else first.fit)
 
     def _as_fitted(self, positions: SpotPositions, number: int, state: StateFrames) -> FittedSpot:
-        """Return the data of a fit from which the noise of a learnt shape is computed."""
+        """Return the data of a spot's fit from which its noise is computed if the spot's shape was learnt."""
         examined, screened = self._examined[number], self._screened[number]
         counts, jitter = screened.counts, screened.jitter / float(np.median(screened.counts))
         others, smear = np.zeros((0, 3)), np.zeros((2, 2))
@@ -398,7 +403,7 @@ class ChannelMeasurement:
         return np.outer(shift - shape_shift - moved, shift - shape_shift - moved)
 
     def noise_parts(self, number: int) -> tuple[NoiseParts, NoiseParts]:
-        """Return the noise of the spot before and after, for the covariance of a series of shifts.
+        """Return the noise contributions of the spot before and after, for the covariance of a time series of shifts.
 
         Parameters
         ----------
@@ -416,7 +421,10 @@ class ChannelMeasurement:
         return self._centroid(screened.mean[None], screened.frames, self.channel.noise, state)
 
     def _repaired(self, examined: Examined, state: StateFrames) -> tuple[SpotPositions, float]:
-        """Return positions by a centroid that uses no shape, and the relative increase of sigma due to corrections."""
+        """Return positions by a centroid without a spot shape, and the relative increase of sigma due to corrections.
+
+        It is used for images whose artefacts were corrected.
+        """
         screened, noise, template = examined.screened, self.channel.noise, self._template(state)
 
         def measure(image: np.ndarray, own: NoiseModel) -> SpotPositions:
@@ -429,7 +437,7 @@ class ChannelMeasurement:
         return measure_spots(mean, frames, calibration, self._test.analysis.centroid)
 
     def _on_ccd(self, positions: SpotPositions, state: StateFrames) -> SpotPositions:
-        """Return positions in pixels of the whole CCD."""
+        """Return spot positions in pixels of the whole CCD instead of pixels of the recorded part."""
         if state.shape == self.channel.ccd:
             return positions
         assert positions.gain_maps is not None
@@ -442,10 +450,10 @@ class ChannelMeasurement:
         return replace(positions, row=row, column=column, gain_maps=gain, light_dn=light)
 
     def _core_excess(self, number: int, fit: ScreenedFit) -> float:
-        """Return the factor by which the variance in a spot's core exceeds the specified one, for noisy frames.
+        """Return the factor by which the variance in a spot's core exceeds that of the noise model, for noisy frames.
 
-        It is computed from differences of frames in the core, but is at most that beside the spot: in the light,
-        flicker and movement add to the differences.
+        It is computed from differences between frames in the core, but is at most the factor beside the spot, because
+        in the light, flicker and movement add to the differences.
         """
         ratio = self._noise_ratios[number]
         if ratio is None or ratio <= 1.0:
@@ -457,7 +465,7 @@ class ChannelMeasurement:
         return 1.0 if core_ratio is None else min(max(core_ratio, 1.0), ratio) ** 2
 
     def result(self) -> ChannelResult:
-        """Return the result of the channel."""
+        """Return the measured spots of the channel in all states."""
         spots = []
         # with a learnt shape the frames before were fitted as well, during the search
         first = self._examined[0] if self._learnt else None

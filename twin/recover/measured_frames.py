@@ -1,4 +1,4 @@
-"""Files of a measurement: reading the frames of every channel in every state, and checks of them."""
+"""Files of a measurement: reading and checking the frames of every monitor channel in every state."""
 
 from __future__ import annotations
 
@@ -27,9 +27,9 @@ from twin.framework.memory import Lowered, require_memory
 
 _OTHER_FILES = "different frames, each named once: the correct files of before and after"
 NOMINAL, PERTURBED = "nominal", "perturbed"
-"""Notes that the main job leaves in its frames."""
+"""Notes in the metadata of the main job's frames, which tell whether they show the nominal or the perturbed state."""
 _GREY, _MAPS = 2.0, 77.0
-"""Bytes per pixel of a frame, and of the maps of a state: of the search, of the fits and of their covariance."""
+"""Memory per pixel, in bytes: of a frame; and of all maps of a state (artefact search, fits and their covariance)."""
 
 
 def repeated_frames(test: Spec, channels: Sequence[ChannelFrames]) -> list[Issue]:
@@ -79,9 +79,9 @@ def _files(state: StateFrames) -> str:
 
 
 def order_warnings(channels: Sequence[ChannelFrames], times: Sequence[float] | None) -> tuple[str, ...]:
-    """Return warnings where the files' metadata contradict the order in which the measurement uses them.
+    """Return warnings where the files' metadata contradict the order of states in which the measurement uses them.
 
-    Only channels are checked whose files all have a recording time, or all a note of their state.
+    A channel is checked only if all its files have a recording time, or all have a note of their state.
 
     Parameters
     ----------
@@ -123,7 +123,7 @@ def _swapped(channel: ChannelFrames) -> bool:
 
 
 def _not_ascending(channel: ChannelFrames) -> int:
-    """Return the index of the first time that was recorded before its predecessor; 0 if there is none."""
+    """Return the index of the first state that was recorded before its predecessor; 0 if there is none."""
     times_by_state = [_recorded(state) for state in channel.after]
     if not all(times_by_state):
         return 0
@@ -166,12 +166,12 @@ class StateFrames:
         return self.frames.shape[1], self.frames.shape[2]
 
     def of_ccd(self, whole: np.ndarray) -> np.ndarray:
-        """Return the part of a map of the whole CCD, (rows, columns), that the frames show."""
+        """Return the part that the frames show of a map ``whole`` (rows, columns) of the whole CCD."""
         (row, column), (height, width) = self.offset, self.shape
         return whole[row : row + height, column : column + width]
 
     def bad_part(self, bad: np.ndarray | None) -> np.ndarray | None:
-        """Return the part of a map of bad pixels of the whole CCD that the frames show; None without a map."""
+        """Return the part that the frames show of the whole CCD's map of bad pixels; None without a map."""
         return None if bad is None else self.of_ccd(bad)
 
 
@@ -194,7 +194,8 @@ class ChannelFrames:
     correction : PixelCorrection or None
         Correction of its pixels by dark and flat frames; None without them.
     transfer : PhotonTransfer or None
-        Measured photon transfer; None where the data sheet's is used.
+        Gain and read noise measured from frames by the photon-transfer method; None where those of the data sheet are
+        used.
     noise : NoiseModel
         Noise model of the corrected frames.
     raw_noise : NoiseModel
@@ -213,7 +214,7 @@ class ChannelFrames:
 
     @property
     def states(self) -> tuple[StateFrames, ...]:
-        """The state before, then all states after."""
+        """Frames of the state before, then of all states after."""
         return (self.before, *self.after)
 
 
@@ -369,7 +370,7 @@ def _stacked(test: Spec, files: tuple[str, ...], key: KeyPath) -> np.ndarray:
 
 
 def _opened(test: Spec, file: str, key: KeyPath) -> ImageFile:
-    """Open an image file and read its header; only raw frames are allowed."""
+    """Open an image file and read its header; raise InputError unless it has raw grey values."""
     with _readable(test, file, key):
         image = ImageFile.open(Path(file), choose="")
         if image.header.orientation:
@@ -380,7 +381,7 @@ def _opened(test: Spec, file: str, key: KeyPath) -> ImageFile:
 
 
 def _pages(test: Spec, file: str, image: ImageFile, key: KeyPath) -> Iterator[np.ndarray]:
-    """Yield the frames of a file, and check that their grey values are in the range of a converter."""
+    """Yield the frames of an image file; raise InputError if grey values are beyond the range of any converter."""
     largest = 0.0
     with _readable(test, file, key):
         for page in image.pages():
@@ -415,7 +416,7 @@ def _check_place(test: Spec, state: StateFrames, ccd: Shape) -> None:
 
 
 def _check_part(test: Spec, state: StateFrames, known: bool, others: str, key: str) -> None:
-    """Check that the file of the measurement says which part of the CCD the frames of a state show.
+    """Check that the measurement's file gives the part of the CCD that a state's frames show, where it is not known.
 
     Raises
     ------
@@ -456,7 +457,10 @@ def _check_values(test: Spec, state: StateFrames, detector: DetectorSpec) -> Non
 
 
 def _maps(test: MeasurementSpec, what: str, name: str, ccd: Shape, before: StateFrames) -> np.ndarray | None:
-    """Return dark or flat frames of a channel, of the whole CCD or of the part that the frames before show."""
+    """Return the dark or flat frames of a channel, for the whole CCD or the part that the frames before show.
+
+    ``what`` tells which of the two; the result is None if the measurement has none.
+    """
     given: Any = getattr(test, what)
     files = per_channel(given, name)
     if not files:
@@ -472,7 +476,7 @@ def _maps(test: MeasurementSpec, what: str, name: str, ccd: Shape, before: State
 
 
 def _placed(correction: PixelCorrection, ccd: Shape, before: StateFrames) -> PixelCorrection:
-    """Return a pixel correction on the whole CCD, where pixels that were not calibrated are bad."""
+    """Return a pixel correction of the whole CCD from that of a part; pixels that were not calibrated count as bad."""
     dark, response, bad = np.zeros(ccd), np.ones(ccd), np.ones(ccd, dtype=bool)
     before.of_ccd(dark)[...] = correction.dark
     before.of_ccd(response)[...] = correction.response

@@ -18,11 +18,15 @@ from twin.recover.channel_measurement import SpotResult
 from twin.recover.recover_run import RecoverRun, state_name
 
 LIMIT = 5.0
-"""Limit of the colour scale of residuals, in sigmas."""
+"""Limit of the colour scale of fit residuals, in standard deviations of a pixel."""
 
 
 def _panels(run: RecoverRun, camera: str) -> list[tuple[str, list[tuple[str, SpotResult, np.ndarray]]]]:
-    """Return, for each channel, the states before and last after, with the spot centres on the CCD, in pixels."""
+    """Return the images to be drawn of a camera: for each channel the states before and last after.
+
+    An entry has the channel's name and, for each of the two states, its name, the measured spot, and the spot's centre
+    on the CCD, in pixels.
+    """
     out = []
     for i, result in enumerate(run.channels):
         name, channel = result.channel.name.split("/")
@@ -105,12 +109,12 @@ def _bar(figure: Figure, shown: Any, grid: Any, label: str) -> None:
 
 @dataclass(frozen=True, eq=False)
 class Line:
-    """One change over time, as the figure of a series draws it.
+    """One change of a camera over time, as the figure of a time series draws it.
 
     Attributes
     ----------
     camera : str
-        Name of the camera; empty for a change of both.
+        Name of the camera; empty for a change of both cameras together, such as that of their angle.
     name : str
         Name of the change with its unit.
     marks : (3, T) ndarray

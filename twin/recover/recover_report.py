@@ -1,4 +1,4 @@
-"""Verdict and report of a measurement."""
+"""Verdict and report of a measurement: changes of the cameras recovered from measured frames, and their sigmas."""
 
 from __future__ import annotations
 
@@ -27,9 +27,9 @@ def _name(run: RecoverRun) -> str:
 
 
 def _corrected(run: RecoverRun) -> tuple[int, int, SpotResult | None, str]:
-    """Return the number of corrected sets of frames, the number of all, and the one that lost most accuracy.
+    """Return how many sets of frames (one per channel and state) were corrected for artefacts, out of how many.
 
-    The last two values are that spot, or None, and its name.
+    The last two values are the spot that lost most accuracy, or None, and its name.
     """
     all_frames = [
         (result.channel.name, state_name(run.times, k), spot)
@@ -87,7 +87,7 @@ def _verdict(run: RecoverRun) -> tuple[str, tuple[str, ...]]:
 
 
 def recover_report(run: RecoverRun) -> Report:
-    """Return the report of ``python -m twin.recover``."""
+    """Return the report of ``python -m twin.recover``: verdict, changes, spots with their artefacts, estimators."""
     reading = run.last
     verdict, more = _verdict(run)
     facts = [
@@ -127,7 +127,7 @@ def _frames_text(run: RecoverRun) -> str:
 
 
 def _summary(run: RecoverRun) -> Table:
-    """Return the table of the changes by every estimator, with the sigma of the one that the verdict uses."""
+    """Return the table of the cameras' changes by every estimator, with the sigma of the one that the verdict uses."""
     reading = run.last
     heads = ["camera", "change", *(one.title for one in reading.estimators.values()), "σ", "σ of noise", "in σ"]
     rows: list[list[Cell]] = []
@@ -145,7 +145,7 @@ def _summary(run: RecoverRun) -> Table:
 
 
 def _spots(run: RecoverRun) -> Section:
-    """Return the section with artefacts, spot positions and figures."""
+    """Return the report's section with the frames' artefacts, the spots' positions and figures."""
     heads = ["channel", "state", "frames", "row [px]", "column [px]", "σ [px]", "artefacts", "increase of σ [%]"]
     rows: list[list[Cell]] = []
     for i, result in enumerate(run.channels):
@@ -204,7 +204,7 @@ def _of(run: RecoverRun, camera: str) -> list[ChannelResult]:
 
 
 def _estimators(run: RecoverRun) -> Section:
-    """Return the section with the changes by all estimators and their sigmas."""
+    """Return the section with the cameras' changes by every estimator, and their sigmas."""
     reading = run.last
     heads = ["camera", "change", "unit"]
     for estimator in reading.estimators.values():

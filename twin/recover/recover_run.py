@@ -55,13 +55,14 @@ class RecoverRun:
     setup : MeasurementSetup
         Measurement.
     readings : tuple of MonitorReading
-        Estimated changes of each state after.
+        Estimated changes of the cameras in each state after, relative to the state before.
     channels : tuple of ChannelResult
         Results of the channels, in the order of the spots.
     pitch : float
         Pixel pitch of the CCDs, in metres.
     smoothed : SmoothedCourse or None
-        Estimate from all times of a series; None for a single state, and without a prior.
+        Estimate of the changes over time from all times of a series together; None for a single state, and without a
+        prior.
     warnings : tuple of str
         Warnings to the user.
     """
@@ -85,7 +86,7 @@ class RecoverRun:
 
     @cached_property
     def worst(self) -> tuple[int, Consistency] | None:
-        """Index of the state whose spot shifts agree least with the prior, and its chi-square test.
+        """Number (from 0) of the state whose spot shifts agree least with the prior, and its chi-square test.
 
         None without a prior.
         """
@@ -99,7 +100,7 @@ class RecoverRun:
 
     @property
     def all_warnings(self) -> tuple[str, ...]:
-        """Warnings of the measurement, and of spot shifts that contradict the prior."""
+        """Warnings of the measurement, and of spot shifts that are inconsistent with the prior."""
         worst, when, rate = self.worst, "", f"{FALSE_ALARM:g}"
         if worst is None:
             return self.warnings
@@ -127,7 +128,7 @@ class _Calibrated:
 
     @property
     def motions(self) -> Mapping[str, MotionModel] | None:
-        """Estimator -> motions of bodies that it estimates; None without a model of the instrument."""
+        """Estimator -> motions of bodies that it estimates; None for an instrument without an optical model."""
         return None if self.experiment is None else self.experiment.motion_models
 
     def crosstalk(self, recovery: Recovery) -> Mapping[str, CameraCrosstalk]:
@@ -217,7 +218,10 @@ def _modelled(setup: MeasurementSetup, backend: Backend, experiment: MonitorExpe
 
 
 def _formulas(setup: MeasurementSetup) -> _Calibrated:
-    """Return the calibration by the geometry alone, with the Jacobians of the corrected formulas."""
+    """Return the calibration of an instrument that is described by its geometry alone, without an optical model.
+
+    The derivatives of the spots are those of closed formulas with corrections.
+    """
     cameras = {}
     for name, spec in (setup.test.geometry or {}).items():
         geometry = MonitorGeometry(
@@ -241,7 +245,7 @@ def _formulas(setup: MeasurementSetup) -> _Calibrated:
 def _measured(
     setup: MeasurementSetup, bench: _Calibrated, channels: Sequence[ChannelFrames], advance: Advance
 ) -> tuple[tuple[ChannelResult, ...], list[Recovery], SmoothedCourse | None]:
-    """Return the results of all channels, the recovery of each state, and the smoothed series."""
+    """Return the spots of all channels, the estimated changes of each state, and those over time of a series."""
     test = setup.test
     measurements: list[ChannelMeasurement] = []
     issues: list[Issue] = []
@@ -274,7 +278,7 @@ def _measured(
 def _recover_clean(
     setup: MeasurementSetup, bench: _Calibrated, calibration: MonitorCalibration, channels: Sequence[ChannelFrames]
 ) -> tuple[list[Recovery], SmoothedCourse | None]:
-    """Estimate the changes from frames without artefacts, with the same computation and batches as the main job."""
+    """Estimate the changes from frames without artefacts, computed in batches as in the main job."""
     states, count = len(channels[0].after), len(channels[0].after[0].frames)
     centroid = setup.test.analysis.centroid
 
@@ -325,7 +329,10 @@ def _recover_corrected(
 
 
 def _smoother(setup: MeasurementSetup, bench: _Calibrated) -> CourseSmoother | None:
-    """Return the smoother of a series whose prior has time laws; None for a single state or without a prior."""
+    """Return the estimator of changes over time for a series whose prior has time laws of the disturbances.
+
+    It is None for a single state or without a prior.
+    """
     times = setup.test.times
     if times is None or bench.disturbances is None:
         return None
@@ -334,7 +341,7 @@ def _smoother(setup: MeasurementSetup, bench: _Calibrated) -> CourseSmoother | N
 
 
 def _joint_noise(parts_of_spots: Sequence[NoiseParts]) -> NoiseParts:
-    """Return the joint noise of spots on different CCDs, whose noise is independent."""
+    """Return the noise contributions of spots on different CCDs, which are independent, as one object."""
     return NoiseParts(
         np.concatenate([parts.temporal for parts in parts_of_spots]),
         np.concatenate([parts.pattern for parts in parts_of_spots]),
@@ -342,7 +349,7 @@ def _joint_noise(parts_of_spots: Sequence[NoiseParts]) -> NoiseParts:
 
 
 def _joint_positions(positions: Sequence[SpotPositions]) -> SpotPositions:
-    """Return the positions of all spots in one object, without the images' maps, which may differ in size."""
+    """Return the positions of all spots in one object, without the maps of their images, which may differ in size."""
     names = ["row", "column", "temporal_covariance", "fixed_covariance", "flux", "background", "converged"]
     names.append("reduced_chi_square")
     values: dict[str, Any] = {
@@ -352,7 +359,7 @@ def _joint_positions(positions: Sequence[SpotPositions]) -> SpotPositions:
 
 
 def _spot_issues(setup: MeasurementSetup, channels: Sequence[ChannelFrames], error: SpotError) -> list[Issue]:
-    """Return the issues of spots that cannot be measured; the error numbers its spots state by state."""
+    """Return the issues of spots that cannot be measured, from the error's spot numbers, which count state by state."""
     issues = []
     for number, reason in error.reasons.items():
         channel = channels[number % len(channels)]
@@ -384,9 +391,10 @@ def _worst(
     suspect: Callable[[SpotResult], tuple[float, ...] | None],
     first: int = 0,
 ) -> Iterator[tuple[str, tuple[float, ...]]]:
-    """Yield the worst state of each channel that has suspect spots: its name, and the numbers that make it suspect.
+    """Yield, for each channel with suspect spots, the name of its worst state and the numbers that make it suspect.
 
-    ``suspect`` returns these numbers, largest for the worst, or None.
+    ``suspect`` is a function that returns these numbers for a spot, the largest for the worst, or None if it is not
+    suspect; ``first`` is added to the index of a state after to obtain its number in the series.
     """
     for result in results:
         judged = (
@@ -400,7 +408,10 @@ def _worst(
 
 
 def _reading_warnings(readings: Sequence[MonitorReading], times: Sequence[float] | None) -> tuple[str, ...]:
-    """Return doubts and notes of the estimates that the frames gave no warning of; for a series the first of each."""
+    """Return warnings of the estimates that were not yet given for the frames; for a series the first of each kind.
+
+    A warning that several states have is given once, with the number of states.
+    """
     texts: dict[str, list[str]] = {}
     for k, reading in enumerate(readings):
         for text in (*reading.doubts, *reading.notes):
@@ -417,7 +428,7 @@ def _reading_warnings(readings: Sequence[MonitorReading], times: Sequence[float]
 def _shape_warnings(results: Sequence[ChannelResult], times: Sequence[float] | None, first: int = 0) -> tuple[str, ...]:
     """Return warnings of spots whose core does not have the calibrated shape, for a series the worst of each channel.
 
-    ``first`` is the index of the first state after in the results.
+    ``first`` is added to the index of a state after to obtain its number in the series.
     """
     return tuple(
         f"{where}: the spot does not have the calibrated shape, reduced chi-square of its"
@@ -428,7 +439,10 @@ def _shape_warnings(results: Sequence[ChannelResult], times: Sequence[float] | N
 
 
 def _coarse_warnings(channels: Sequence[ChannelFrames], setup: MeasurementSetup) -> tuple[str, ...]:
-    """Return warnings of CCDs whose noise, specified or measured, is too small for the steps of their grey values."""
+    """Return warnings of CCDs whose noise, specified or measured, is too small for the steps of their grey values.
+
+    Rounding errors are then equal in all frames and do not average out.
+    """
     if setup.test.photon_transfer == "stated":
         return coarse_step_warnings(channels[0].raw_noise, f"area CCD {setup.detector.name}")
     whose = f"area CCD {setup.detector.name}, as measured,"
@@ -436,7 +450,7 @@ def _coarse_warnings(channels: Sequence[ChannelFrames], setup: MeasurementSetup)
 
 
 def _noise_causes(ratio: float) -> str:
-    """Return possible causes of noise other than specified, and its consequences, as text."""
+    """Return, as text, possible causes and the consequences of noise that is ``ratio`` times the specified noise."""
     if ratio > 1.0:
         return (
             "another gain or read-out, or interference; the noise σ and the search for artefacts treat the excess as"
@@ -451,9 +465,10 @@ def _noise_causes(ratio: float) -> str:
 def _noise_warnings(
     results: Sequence[ChannelResult], times: Sequence[float] | None, source: str, first: int = 0
 ) -> tuple[str, ...]:
-    """Return warnings of frames with noise other than specified, for a series the worst of each channel.
+    """Return warnings of frames whose noise differs from that specified, for a series the worst of each channel.
 
-    ``first`` is the index of the first state after in the results.
+    ``source`` names where the noise is specified; ``first`` is added to the index of a state after to obtain its number
+    in the series.
     """
 
     def apart(spot: SpotResult) -> tuple[float, ...] | None:
@@ -467,7 +482,7 @@ def _noise_warnings(
 
 
 def recover_numbers(run: RecoverRun) -> dict[str, Any]:
-    """Return the contents of recovered.json: the main job's keys for the last state, the artefacts, and all states."""
+    """Return the contents of recovered.json: the main job's keys for the last state, artefacts, and all states."""
     out: dict[str, Any] = {**stated(run.last.recovered_dict())}
     out["warnings"] = list(run.all_warnings)
     out["channels"] = {

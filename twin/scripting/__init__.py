@@ -1,1 +1,1 @@
-"""Library interface of the twin: implementation of the names that ``import twin`` offers."""
+"""Implementation of the names that ``import twin`` offers to Python scripts."""

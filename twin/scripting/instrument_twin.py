@@ -46,7 +46,7 @@ from twin.sensors.area_detector import coarse_warnings
 
 
 class Twin(Protocol):
-    """Instrument that a camera belongs to, as `twin.load` returns it."""
+    """Interface of the instrument that a camera belongs to: its model, its state, and perturbed copies of it."""
 
     @property
     def experiment(self) -> MonitorExperiment:
@@ -116,7 +116,7 @@ class CameraTwin(CameraView):
 
 
 class _Bench:
-    """Traceable model of an instrument, built once and shared by the instrument's perturbed copies."""
+    """Model of an instrument for ray tracing, built once and shared by all perturbed copies of the instrument."""
 
     def __init__(self, resolved: ResolvedJob, backend: str, like: _Bench | None = None) -> None:
         self._resolved, self._name, self._like = resolved, backend, like
@@ -134,7 +134,7 @@ class _Bench:
         return MonitorExperiment(self._resolved, self.backend)
 
     def stating(self, resolved: ResolvedJob) -> _Bench:
-        """Return the model of the same instrument with another disturbance prior."""
+        """Return the model of the same instrument with the disturbance prior of the job ``resolved``."""
         return _Bench(resolved, self._name, self)
 
 
@@ -195,7 +195,7 @@ class InstrumentTwin:
 
     @property
     def nodes(self) -> pd.DataFrame:
-        """Table of all bodies that can be perturbed, with the motions that they allow and their pivots."""
+        """Table of all bodies that can be perturbed, with the motions that they allow and their pivot points."""
         rows = {
             path: {"allows": ", ".join(sorted(info.allows)), "pivots": ", ".join(info.pivots)}
             for path, info in self._nodes.items()
@@ -204,7 +204,7 @@ class InstrumentTwin:
 
     @property
     def _nodes(self) -> Mapping[str, NodeInfo]:
-        """Path of each body -> motions and pivots that the body allows."""
+        """Path of each body -> the motions that a perturbation may give it, and the names of its pivots."""
         return self._bench.experiment.instrument.nodes
 
     @property
@@ -245,7 +245,7 @@ class InstrumentTwin:
         return InstrumentTwin(twin.resolved.with_job(job), twin._bench)
 
     def _given(self, perturb: Sequence[Mapping[str, Mapping[str, Any]] | str]) -> dict[str, Any]:
-        """Return the requested perturbations by the bodies' full paths; unknown names stay and are reported later."""
+        """Return full path of a body -> its requested perturbation; unknown names are kept and reported later."""
         try:
             asked: dict[str, Any] = perturbation_in_words(one for one in perturb if isinstance(one, str))
             for one in perturb:
@@ -373,7 +373,7 @@ class InstrumentTwin:
             Derivatives with respect to each motion, per um, arcsec, ppm or nm of it (coordinate ``per``): ``spots``
             (channel, axis, motion), spot positions in px; ``true`` (camera, parameter, motion), the camera parameters
             by exact tracing; ``readings`` (camera, estimator, parameter, motion), the parameters that each estimator
-            computes from the spots. Parameters are in arcsec and um, as their names end.
+            computes from the spots. Parameters are in arcsec or um, according to the end of their names.
 
         Raises
         ------
@@ -414,7 +414,7 @@ class InstrumentTwin:
         )
 
     def camera(self, name: str = "", obstruction: bool = True) -> CameraTwin:
-        """Return one of its cameras in this state, with the methods of an optical designer.
+        """Return one of the instrument's cameras in this state, for analysis as optical designers do.
 
         Parameters
         ----------
@@ -461,7 +461,10 @@ class InstrumentTwin:
 
 
 def _pivot(uses: Sequence[str], plain: Mapping[str, Any]) -> tuple[str, ...]:
-    """Return ``("pivot",)`` if a perturbation has a rotation or a scale and names its pivot; else an empty tuple."""
+    """Return ``("pivot",)`` if a perturbation has a rotation or a scale about a pivot that it names; else ``()``.
+
+    ``uses`` are the kinds of motion in the perturbation, and ``plain`` are its keys and values.
+    """
     return ("pivot",) if {"rotate", "scale"} & set(uses) and "pivot" in plain else ()
 
 
@@ -493,7 +496,7 @@ def load(
 
 
 def _load(what: str | Path, backend: str) -> InstrumentTwin:
-    """Load an instrument with the disturbance prior that its own file names."""
+    """Load an instrument with the disturbance prior that its file names."""
     text = str(what)
     if text not in library_names(INSTRUMENTS) or isinstance(what, Path):
         data = read_yaml(what).data if isinstance(what, Path) or "/" in text or text.endswith((".yaml", ".yml")) else {}
@@ -506,7 +509,7 @@ def _load(what: str | Path, backend: str) -> InstrumentTwin:
 
 
 def load_camera(what: str | Path, backend: str = "llvm") -> CameraTwin:
-    """Load a single camera, with the methods of an optical designer; its ``perturbed`` moves and heats its parts.
+    """Load a single camera for analysis as optical designers do; its method ``perturbed`` moves and heats its parts.
 
     Parameters
     ----------
@@ -569,5 +572,5 @@ def _motion_named(text: str, nodes: Mapping[str, NodeInfo]) -> ElementaryMotion:
 
 
 def _wrong(problem: str, found: str, allowed: str, suggestion: str | None = None) -> InputError:
-    """Return an error about a motion's text, with the nearest valid name as suggestion."""
+    """Return an error about a motion's text, with what is allowed and the nearest valid name as suggestion."""
     return InputError(Issue(problem, found=repr(found), allowed=allowed, suggestion=suggestion))

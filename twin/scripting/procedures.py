@@ -32,7 +32,7 @@ class TestResult:
     Attributes
     ----------
     name : str
-        Name as called, such as ``lab focus``.
+        Name of the test or procedure as given to ``perform``, such as ``lab focus``.
     numbers : Mapping[str, Any]
         Content of the result file of a run folder, such as ``focus.json``; keys end in their unit.
     report : Report
@@ -55,7 +55,7 @@ class TestResult:
 
     @property
     def summary(self) -> pd.DataFrame:
-        """Main table of the report, as a data frame."""
+        """Main table of the test's report, as a data frame."""
         table = self.report.summary
         return pd.DataFrame([[cell_text(cell) for cell in row] for row in table.shown()], columns=list(table.heads))
 
@@ -132,7 +132,7 @@ def perform(
 
 
 def _merged(base: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
-    """Return nested mappings with some values replaced; keys that ``changes`` does not have stay."""
+    """Return nested mappings with the values of ``changes`` replaced in ``base``; other keys keep their values."""
     out = dict(base)
     for key, value in changes.items():
         inner = out.get(key)

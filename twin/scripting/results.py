@@ -43,15 +43,17 @@ class Shot:
         Expected photons per pixel and frame, (state, channel, row, column), as in irradiance.nc; empty without a
         monitor.
     truth : xr.Dataset
-        True changes of every camera, by exact tracing: parameters of each ``camera``; for two cameras also
-        ``angle_change_arcsec``, and ``ground_along_m``, ``ground_across_m``, ``ground_height_m``, errors of points on
-        the ground that are located without correcting for the changes.
+        True changes of every ``camera`` by exact ray tracing: rotations and change of the principal distance. For two
+        cameras also ``angle_change_arcsec``, the change of the angle between them, and ``ground_along_m``,
+        ``ground_across_m``, ``ground_height_m``, the errors of ground points located without correcting for the
+        changes.
     verdict : str
         Result, its accuracy, and what limits it.
     warnings : tuple[str, ...]
         Warnings to read before using the numbers.
     run : JobRun
-        All results that the command ``twin.render`` would write: image quality, targets, stray light, course.
+        All results that the command ``twin.render`` would write: image quality, test targets, stray light, changes over
+        time.
     """
 
     before: xr.DataArray
@@ -140,7 +142,8 @@ class Found:
     Attributes
     ----------
     values : xr.DataArray
-        Readings, (camera, estimator, parameter), in arcsec and um as the parameters' names end.
+        Estimated changes, (camera, estimator, parameter), in arcsec or um according to the end of the parameters'
+        names.
     covariance : xr.DataArray
         Covariance of the total error, (camera, estimator, parameter, parameter_2), in products of these units: due to
         noise and to the disturbances of the prior; without a prior due to noise alone.
@@ -157,12 +160,12 @@ class Found:
     disturbances : str
         Name of the disturbance prior on which the total sigmas are based; empty if there is none.
     sigma_holds : bool
-        Whether all measurements are consistent with the sigmas.
+        True if all measurements are consistent with the sigmas.
     warnings : tuple[str, ...]
-        Reasons why they are not, and other warnings to read before using the numbers.
+        Reasons why measurements are inconsistent with the sigmas, and other warnings to read before using the numbers.
     from_statement : pd.Series
-        Fraction of each reading's variance, for the estimator ``posterior``, that would remain without image noise: due
-        to the prior alone, not to the spots; (row) with levels camera and parameter, empty without a prior.
+        Fraction of the variance of each change estimated by ``posterior`` that would remain without image noise: it is
+        due to the prior, not to the spots. The index has the levels camera and parameter; empty without a prior.
     """
 
     values: xr.DataArray
@@ -191,7 +194,7 @@ class Found:
 
     @property
     def judged(self) -> str:
-        """Estimator whose sigma and error ``compare`` lists: ``posterior`` with a prior, else ``model``."""
+        """Estimator whose sigma and error ``compare`` lists: ``posterior`` with a disturbance prior, else ``model``."""
         return preferred_estimator(self.values.estimator.values.tolist())
 
     def _root(self, covariance: xr.DataArray) -> xr.DataArray:
@@ -199,7 +202,7 @@ class Found:
         return self.values.copy(data=np.sqrt(np.diagonal(covariance.values, axis1=-2, axis2=-1)))
 
     def compare(self, truth: xr.Dataset) -> pd.DataFrame:
-        """Return a table of readings and true values.
+        """Return a table of estimated ("reading") and true values of the changes.
 
         Parameters
         ----------
@@ -232,7 +235,7 @@ class Found:
         return table
 
     def _row(self, true: float, readings: xr.DataArray, sigma: xr.DataArray, noise: xr.DataArray) -> dict[str, float]:
-        """Return one row of ``compare``: true value, readings, sigmas, error and error in sigmas of one quantity."""
+        """Return one row of ``compare``: true value, estimates, sigmas, and error of one quantity also in sigmas."""
         values = {str(name): float(readings.sel(estimator=name)) for name in readings.estimator.values}
         spread, error = float(sigma.sel(estimator=self.judged)), values[self.judged] - true
         noise_sigma = float(noise.sel(estimator=self.judged))
@@ -259,7 +262,10 @@ def _edge_row(place: PlaceTargets, direction: str) -> dict[str, float]:
 
 
 def _reading_frame(found: Found) -> pd.DataFrame:
-    """Return readings by camera and parameter, a column per estimator, with the sigmas of ``Found.judged``."""
+    """Return a table of the estimated changes by camera and parameter, with a column for each estimator.
+
+    Sigmas are those of the estimator ``Found.judged``.
+    """
     values = found.values.stack(row=("camera", "parameter")).transpose("row", "estimator").to_pandas()
     values.columns.name = None
     sigmas = {"sigma": found.sigma, "sigma_noise": found.sigma_noise}
@@ -268,7 +274,7 @@ def _reading_frame(found: Found) -> pd.DataFrame:
 
 
 def _truth_frame(truth: xr.Dataset) -> pd.DataFrame:
-    """Return a table of the true parameters, one row per camera."""
+    """Return a table of the true changes of the cameras (rotations, principal distance), one row per camera."""
     return truth[[one.key for one in parameters.CAMERA_PARAMETERS.values()]].to_dataframe()
 
 
@@ -302,7 +308,7 @@ def shot_of(run: JobRun, backend: Backend, started: float) -> Shot:
 
 
 def _truth(run: JobRun) -> xr.Dataset:
-    """Return the true changes of the cameras in a run, as the dataset ``Shot.truth``."""
+    """Return the true changes of the cameras in a run as a data set, the content of ``Shot.truth``."""
     truth = run.truth_dict()
     cameras = truth["cameras"]
     keys = list(next(iter(cameras.values())))
@@ -314,7 +320,7 @@ def _truth(run: JobRun) -> xr.Dataset:
 
 
 def found_table(reading: MonitorReading, warnings: Sequence[str] = ()) -> Found:
-    """Convert the reading of one perturbed state to the labelled arrays that a script gets.
+    """Convert the estimated changes of one perturbed state to the labelled arrays that a script gets.
 
     Parameters
     ----------
@@ -345,7 +351,7 @@ def found_table(reading: MonitorReading, warnings: Sequence[str] = ()) -> Found:
     about = {"reference_frames": frames_text("recovered")}
 
     def spread(of: Callable[[CameraParameters], np.ndarray]) -> xr.DataArray:
-        """Return covariances (camera, estimator, parameter, parameter_2) in the units of the readings."""
+        """Return covariances (camera, estimator, parameter, parameter_2) in products of the parameters' units."""
         rows = {camera: parameters.rows_of(calibrated) for camera, calibrated in reading.cameras.items()}
         blocks = [
             [matrix @ of(recovery.parameters[c][e])[0] @ matrix.T for e in estimators] for c, matrix in rows.items()
@@ -354,7 +360,7 @@ def found_table(reading: MonitorReading, warnings: Sequence[str] = ()) -> Found:
         return xr.DataArray(np.array(blocks), dims=(*dims, "parameter_2"), coords=both)
 
     def by_estimator(group: str) -> xr.Dataset:
-        """Return the quantities of a group (angle or ground) with their sigmas, by estimator."""
+        """Return the quantities of a group ("angle" or "ground") with their sigmas, for each estimator."""
         data: dict[str, list[float]] = {}
         for row in table:
             if row.group == group:
@@ -403,7 +409,7 @@ def as_frames(given: Any, name: str, channels: Sequence[str], shape: tuple[int, 
 
 
 def name_html(name: str, cameras: Sequence[str], perturbations: Mapping[str, Any]) -> str:
-    """Return an instrument as HTML for a notebook."""
+    """Return HTML that shows an instrument in a notebook: its name, cameras and perturbations."""
     head = f"<p><b>{escape(name)}</b>, cameras {escape(', '.join(cameras))}</p>"
     if not perturbations:
         return head + "<p>not perturbed</p>"

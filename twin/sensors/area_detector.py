@@ -9,9 +9,10 @@ The signal chain is the linear camera model of EMVA Standard 1288 (release 3.1, 
 
 QE is the quantum efficiency, K the gain in grey values per electron, prnu and dsnu_offset the fixed differences of the
 pixels' response and offset, and normal a standard normal number. PRNU scales the response to light only; DSNU is a
-fixed additive pattern in electrons that adds no shot noise. Further noise is what a data sheet lists beyond the model,
-term by term (``NOISE_TERMS``). The Poisson numbers are exact at every mean (``twin.sensors.poisson_numbers``); no
-normal approximation is used. Pixel coordinates are (row, column); arrays are (..., H, W).
+fixed additive pattern in electrons that adds no shot noise. "further" is the sum of noise terms that a data sheet lists
+in addition to this model (``NOISE_TERMS``), in electrons. The Poisson numbers are exact at every mean
+(``twin.sensors.poisson_numbers``); no normal approximation is used. Pixel coordinates are (row, column); arrays are
+(..., H, W).
 """
 
 from __future__ import annotations
@@ -42,7 +43,7 @@ from twin.sensors.poisson_numbers import poisson_pieces
 
 
 class NoiseTerm(FurtherNoise, Protocol):
-    """Noise term added to the electrons of a pixel after clipping at the well and before digitisation.
+    """Interface of noise added to the electrons of a pixel after clipping at the full well and before digitisation.
 
     It is independent from pixel to pixel and has mean zero; its variances are those of ``FurtherNoise``.
     """
@@ -57,8 +58,8 @@ class NoiseTerm(FurtherNoise, Protocol):
     def temporal_e(self, electrons: np.ndarray, rng: np.random.Generator) -> np.ndarray | None:
         """Return the electrons of a noise that is new in every frame, (frames, H, W); None without such noise.
 
-        ``electrons`` holds the collected ones, in the same shape. Many frames are passed in several calls, one after
-        the other with the same ``rng``.
+        ``electrons`` (frames, H, W) are the collected electrons on which the noise may depend. Frames of one exposure
+        may be passed in several calls, one after the other with the same ``rng``.
 
         Dimensions: H rows, W columns.
         """
@@ -101,7 +102,7 @@ class ReadNoise:
 
 @dataclass(frozen=True)
 class FixedOffsets:
-    """Normally distributed differences of the pixels' offsets.
+    """Normally distributed differences between the offsets (dark grey values) of pixels, the same in every frame.
 
     Attributes
     ----------
@@ -270,7 +271,7 @@ class EmvaDetector:
 
     @cached_property
     def _sheet(self) -> DetectorSpec:
-        """Data sheet with this detector's numbers, which checks their limits and derives further numbers."""
+        """Data sheet with this detector's numbers, which checks their limits and derives others from them."""
         return DetectorSpec.model_validate({"name": "detector", **self._numbers()})
 
     def _numbers(self) -> dict[str, Any]:
@@ -289,7 +290,7 @@ class EmvaDetector:
         return self._sheet.saturation_dn
 
     def noise_model(self, exposure_s: float) -> NoiseModel:
-        """Return the noise model for the analysis, for frames of exposure_s seconds."""
+        """Return the model of noise as a function of signal, for the analysis of frames of ``exposure_s`` seconds."""
         return NoiseModel(
             gain_dn_per_e=self.system_gain_dn_per_e,
             dark_noise_e=self.dark_noise_e,
@@ -465,13 +466,14 @@ class EmvaDetector:
 
     @property
     def _reading(self) -> Reading:
-        """Read-out of electrons to grey values, with this detector's numbers."""
+        """Detector's numbers for converting electrons to grey values: read noise, gain, full well, largest value."""
         return Reading(self.dark_noise_e, self.system_gain_dn_per_e, self.full_well_e, self.max_dn)
 
     def _read_out(self, level: np.ndarray, shift: np.ndarray, each: Sequence[np.random.Generator]) -> np.ndarray:
-        """Return grey values of frames (N, H, W) from electrons, in whose array they are written.
+        """Return grey values of frames (N, H, W) from their electrons ``level``; the array is overwritten.
 
-        Each noise term draws from its own generator.
+        ``shift`` is the black level with the pixels' offsets, in grey values; ``each`` has one generator per noise
+        term.
 
         Dimensions: N frames, H rows, W columns.
         """
@@ -505,7 +507,7 @@ class EmvaDetector:
 
 
 def _streams(seed: Seed | Sequence[Seed], lead: tuple[int, ...]) -> list[np.random.SeedSequence]:
-    """Return the random stream of each image; ``lead`` is the shape of the array of images."""
+    """Return the random stream of each image in an array of images with the shape ``lead``."""
     if not isinstance(seed, Sequence):
         root = _sequence(seed)
         return [stream(root, number) for number in range(math.prod(lead))]
@@ -515,7 +517,7 @@ def _streams(seed: Seed | Sequence[Seed], lead: tuple[int, ...]) -> list[np.rand
 
 
 def _sequence(seed: Seed) -> np.random.SeedSequence:
-    """Return a seed as a SeedSequence, or raise ValueError."""
+    """Return a seed as NumPy's SeedSequence; raise ValueError if it is not a seed."""
     if isinstance(seed, np.random.SeedSequence):
         return seed
     if isinstance(seed, bool) or not isinstance(seed, (int, np.integer)) or seed < 0:
@@ -524,14 +526,17 @@ def _sequence(seed: Seed) -> np.random.SeedSequence:
 
 
 def _exposure(exposure_s: float) -> float:
-    """Return an exposure time, or raise ValueError if it is out of range."""
+    """Return an exposure time in seconds; raise ValueError if it is outside 0 to 1e6 s."""
     if not (math.isfinite(exposure_s) and 0 <= exposure_s <= 1e6):
         raise ValueError(f"detector: exposure_s must be in [0, 1e6] s, found {exposure_s!r}")
     return float(exposure_s)
 
 
 def _photons(photons: ArrayLike) -> NDArray[np.float64]:
-    """Return photons as float64, or raise ValueError or UnphysicalError if they are out of range."""
+    """Return expected photons as float64; raise an error if they are negative, not finite or too many.
+
+    The error is UnphysicalError for too many photons, else ValueError.
+    """
     light = np.asarray(photons, dtype=np.float64)
     if light.ndim < 2 or light.size == 0:
         raise ValueError(f"detector: photons must be (..., H, W), found shape {light.shape}")
@@ -545,9 +550,10 @@ def _photons(photons: ArrayLike) -> NDArray[np.float64]:
 
 
 def coarse_step_warnings(noise: NoiseModel, detector_name: str) -> tuple[str, ...]:
-    """Return a warning if the noise does not cover the steps of the grey values at low signal; otherwise none.
+    """Return a warning if a grey value's step is large compared with the noise at low signal; otherwise none.
 
-    It depends on the detector's numbers alone.
+    Rounding errors are then equal in all frames and do not average out. The warning depends on the detector's numbers
+    alone.
 
     Parameters
     ----------
@@ -568,7 +574,7 @@ def coarse_step_warnings(noise: NoiseModel, detector_name: str) -> tuple[str, ..
 
 
 def coarse_warnings(setup: Spec) -> tuple[str, ...]:
-    """Return the warnings about coarse grey values for the area CCDs that a job or test refers to.
+    """Return warnings for area CCDs of a job or test whose grey-value steps are large compared with their noise.
 
     Parameters
     ----------

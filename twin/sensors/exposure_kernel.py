@@ -3,11 +3,11 @@
 The result is the same as that of ``EmvaDetector`` pixel by pixel, but faster.
 
 The frames are bit for bit those that NumPy would make from the same streams: a Poisson number is the quantile of its
-mean (``twin.sensors.poisson_numbers``), and any number that a kernel cannot determine with certainty is computed
-there. A first kernel looks up every number of a small mean in the table of quantiles, which determines nineteen of
-twenty, computes those of larger means by Giles' expansion in single precision, and reads the electrons out. A second
-kernel compares the open ones with the distribution function between the table's rows. A few of ten thousand numbers
-remain, within the error bounds of these approximations.
+mean (``twin.sensors.poisson_numbers``), and any number that a kernel cannot determine with certainty is computed there.
+A first kernel looks up every number of a small mean in the table of quantiles, which determines nineteen of twenty,
+computes those of larger means by Giles' expansion in single precision, and converts the electrons to grey values. A
+second kernel determines the undetermined ones by the distribution function, interpolated between the table's rows. A
+few of ten thousand numbers remain undetermined, within the error bounds of these approximations.
 
 All frames of a pixel share its mean, so a kernel runs over the pixels of some images, frame after frame; then only
 table values have to be gathered. Images with the same stream share their random numbers, which are drawn once.
@@ -41,28 +41,28 @@ from twin.sensors.poisson_numbers import (
 )
 
 FEWEST = 50_000
-"""Number of random numbers of an exposure from which kernels are used: for fewer the transfer takes as long as the
-work.
+"""Smallest number of random numbers of an exposure for which kernels are used.
+
+For fewer, the transfer to the kernels takes as long as the work without them.
 """
 
 _TOGETHER = 1 << 20
-"""Random numbers drawn and read out at once; their words and normal numbers take 16 MiB, and as much again while the
-next ones are drawn.
+"""Count of random numbers that are drawn and read out at once.
+
+Their words and normal numbers take 16 MiB, and as much again while the next ones are drawn.
 """
 
 _MOST_KEPT = 1 << 22
-"""Largest number of random numbers kept for streams of several images, until all of these are exposed; they take 64
-MiB.
-"""
+"""Largest number of random numbers that are kept because several images share their stream; they take 64 MiB."""
 
 _LANES = 16
-"""Numbers of pixels are rounded up to a multiple of this, so that each frame begins at an aligned address."""
+"""Multiple to which the number of pixels is rounded up, so that each frame begins at an aligned memory address."""
 
 _NORMAL_ERROR = 4e-6
 """Upper bound of the error of the normal quantile in single precision, for arguments up to 6."""
 
 _SINGLE = 4e-7
-"""Upper bound of single-precision rounding of a distribution function and of the uniform number u."""
+"""Upper bound of the rounding error, in single precision, of a distribution function and of the uniform number u."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,8 +124,8 @@ class Reading:
             Function of the number of an image that returns its expected electrons, and the black level with the pixels'
             own offsets (grey values), P numbers each.
         streams : sequence of SeedSequence
-            Random streams of the I images, each for words, Poisson numbers of huge means and normal numbers; some may
-            be equal.
+            Random streams of the I images; each serves for 64-bit random words, for Poisson numbers of means above
+            ``poisson_numbers.SERIES_END`` and for normal numbers. Some may be equal.
         out : (I, F, P) ndarray of uint16
             Frames to fill.
         together : int
@@ -176,6 +176,8 @@ def exposing_bytes(frames: int, pixels: int) -> int:
 class _Numbers:
     """Means and random numbers of a group of images; the memory is reused by the next group.
 
+    A lane is an entry of the kernels' arrays: one pixel of one image, and some of padding.
+
     Attributes
     ----------
     mean : (lanes,) ndarray
@@ -195,7 +197,10 @@ class _Numbers:
 
     @classmethod
     def room(cls, frames: int, pixels: int, noisy: bool) -> _Numbers:
-        """Allocate memory for the random numbers of a number of frames of all pixels of a group."""
+        """Return memory for the random numbers of ``frames`` frames of ``pixels`` pixels.
+
+        ``noisy`` is True if there is read noise, for which normal numbers are needed.
+        """
         lanes = -(-pixels // _LANES) * _LANES
         mean, shift = _aligned(np.float64, 2, lanes)
         normals = _aligned(np.float64, frames, lanes) if noisy else None
@@ -210,12 +215,14 @@ class _Numbers:
 
 @dataclass(eq=False)
 class _SharedNumbers:
-    """Random numbers of a stream shared by several images without huge means; the first image draws them.
+    """Random numbers of a stream that several images share; they are drawn for the first image and kept.
+
+    None of these images has means above ``poisson_numbers.SERIES_END``.
 
     Attributes
     ----------
     words, normals : (frames, pixels) ndarray | None
-        Random numbers of all frames; None before they are drawn, normals also without read noise.
+        Random words and normal numbers of all frames; None before they are drawn, normals also without read noise.
     """
 
     words: np.ndarray | None = None
@@ -223,7 +230,7 @@ class _SharedNumbers:
     drawing: threading.Lock = field(default_factory=threading.Lock)
 
     def put(self, numbers: _Numbers, lanes: slice, count: int, draw: Callable[[], None]) -> None:
-        """Copy the random numbers to the lanes of an image.
+        """Copy the random numbers to an image's lanes (entries of the kernels' arrays, one per pixel).
 
         Parameters
         ----------
@@ -234,7 +241,7 @@ class _SharedNumbers:
         count : int
             Number of frames.
         draw : callable
-            Draws the numbers into these lanes.
+            Function that draws the numbers into these lanes; called for the first image only.
         """
         with self.drawing:
             if self.words is None:
@@ -252,18 +259,21 @@ _Key = tuple[str, tuple[int, ...], int]
 
 
 def _key(stream: np.random.SeedSequence) -> _Key:
-    """Return a key that is equal for streams with the same numbers."""
+    """Return a key that is equal for random streams that give the same numbers."""
     return str(stream.entropy), tuple(stream.spawn_key), stream.pool_size
 
 
 def _shared_numbers(streams: Sequence[np.random.SeedSequence], most: int) -> dict[_Key, _SharedNumbers]:
-    """Return memory for the random numbers of each stream that several images share, ``most`` streams at most."""
+    """Return stream -> (still empty) memory for the random numbers of each stream that several images share.
+
+    At most ``most`` streams get such memory.
+    """
     several = [key for key, times in Counter(map(_key, streams)).items() if times > 1]
     return {key: _SharedNumbers() for key in several[:most]}
 
 
 class _Group:
-    """Images whose frames are drawn together, with their streams."""
+    """Group of images whose frames are exposed together by one call of a kernel, with their random streams."""
 
     def __init__(
         self,
@@ -291,7 +301,10 @@ class _Group:
         return slice(image * self.pixels, (image + 1) * self.pixels)
 
     def draw(self, numbers: _Numbers, out: np.ndarray, pool: ThreadPoolExecutor) -> _Drawn:
-        """Start drawing the random numbers of the next frames (images, frames, pixels)."""
+        """Start drawing the random numbers of the group's next frames, which will fill ``out``.
+
+        ``out`` has the shape (images, frames, pixels).
+        """
         work = [pool.submit(self._drawn, numbers, image, out.shape[1], self.last[image]) for image in range(len(out))]
         self.last = list(work)
         return _Drawn(self, numbers, out, work)
@@ -299,12 +312,13 @@ class _Group:
     def _drawn(
         self, numbers: _Numbers, image: int, count: int, before: Future[np.ndarray | None] | None
     ) -> np.ndarray | None:
-        """Draw the random numbers of an image.
+        """Draw the random numbers of an image for ``count`` frames, after those of ``before``.
 
         Returns
         -------
         (count, huge) ndarray | None
-            Poisson numbers of huge means; None if there are none.
+            Poisson numbers of the pixels with means from ``poisson_numbers.SERIES_END`` on, which kernels do not
+            compute; None if there are none.
         """
         if before is not None:
             before.result()  # another thread may still draw the image's previous frames from the same streams
@@ -362,7 +376,10 @@ class _Drawn:
                 self._put(frame, image * group.pixels + which[lane], huge_numbers.astype(np.float64).reshape(-1))
 
     def _put(self, frame: np.ndarray, lane: np.ndarray, electrons: np.ndarray) -> None:
-        """Convert electrons to grey values and write them into some pixels of some frames."""
+        """Write the grey values of given electrons into some pixels of some frames.
+
+        ``frame`` and ``lane`` are the frame, and the entry of the kernels' arrays, of each pixel.
+        """
         numbers, how = self.numbers, self.group.how
         noise = [] if numbers.normals is None else [numbers.normals[frame, lane] * how.sigma_e]
         image, pixel = np.divmod(lane, self.group.pixels)
@@ -387,14 +404,14 @@ def kernels_available() -> bool:
 
 @dataclass(frozen=True, eq=False)
 class _Table:
-    """Table of quantiles in the kernels' memory.
+    """Table of Poisson quantiles over cells of the mean and of the uniform number u, in the kernels' memory.
 
     Attributes
     ----------
     known : UInt32
-        Four cells per word: the smallest quantile of each, and in its highest bit whether it has others.
+        Four cells per word: the smallest quantile of each cell, and in its highest bit whether the cell has others.
     law : Float32
-        Distribution functions at the rows' means.
+        Poisson distribution functions at the means at which the table's rows begin.
     bound : Float32
         For each row, bound of the error of their interpolation.
     """
@@ -417,9 +434,9 @@ def _table() -> _Table:
 
 
 def _kernels(how: Reading, numbers: _Numbers, out: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Fill frames (images, frames, pixels) by kernels, and return which numbers are still uncertain.
+    """Fill frames (images, frames, pixels) by kernels, and return which of their numbers are still undetermined.
 
-    The two arrays are the frames and the lanes (entries of the kernels' arrays) of these numbers.
+    The two returned arrays hold the frame and the lane (entry of the kernels' arrays) of each of these numbers.
     """
     import drjit as dr
     from drjit.llvm import Float64, UInt32, UInt64
@@ -454,7 +471,11 @@ def _kernels(how: Reading, numbers: _Numbers, out: np.ndarray) -> tuple[np.ndarr
 
 
 def _grey(electrons: Any, normal: Any, shift: Any, numbers: Sequence[Any]) -> Any:
-    """Return grey values of electrons with read noise and black level, as the detector's read-out gives them."""
+    """Return grey values of electrons with read noise and black level, as the detector's read-out gives them.
+
+    ``normal`` are standard normal numbers, ``shift`` the black level with the pixel's offset, in grey values, and
+    ``numbers`` the detector's read noise, gain, full well and largest grey value.
+    """
     import drjit as dr
     from drjit.llvm import UInt32
 
@@ -466,7 +487,10 @@ def _grey(electrons: Any, normal: Any, shift: Any, numbers: Sequence[Any]) -> An
 
 
 def _cell(mean: Any, word: Any) -> tuple[Any, Any, Any]:
-    """Return the table's row for a mean, the smallest quantile in its cell, and whether the cell has others."""
+    """Return the table's row for a mean, the smallest quantile in its cell, and whether the cell has others.
+
+    The cell is that of the mean and of the uniform number u of the 64-bit random ``word``.
+    """
     import drjit as dr
     from drjit.llvm import UInt32
 
@@ -477,9 +501,9 @@ def _cell(mean: Any, word: Any) -> tuple[Any, Any, Any]:
 
 
 def _looked_up(mean: Any, word: Any, normal: Any, shift: Any, numbers: Sequence[Any]) -> tuple[Any, Any]:
-    """Return the grey values of one frame as far as the table or the expansion determines them.
+    """Return the grey values of one frame whose electrons are quantiles from the table or from Giles' expansion.
 
-    The second result is True for each number that they leave open.
+    The second result is True for each number that these do not determine.
     """
     import drjit as dr
     from drjit.llvm import Float64
@@ -498,7 +522,9 @@ def _looked_up(mean: Any, word: Any, normal: Any, shift: Any, numbers: Sequence[
 def _compared(
     mean: Any, word: Any, normal: Any, shift: Any, numbers: Sequence[Any], at: tuple[Any, Any]
 ) -> tuple[Any, Any]:
-    """Return grey values of the numbers that ``_looked_up`` left open, and whether each is still uncertain.
+    """Return grey values of numbers that ``_looked_up`` did not determine, by interpolated distribution functions.
+
+    The second result is True for each number that is still undetermined.
 
     Parameters
     ----------
@@ -509,11 +535,11 @@ def _compared(
     normal : Float64 | None
         Normal numbers of all frames, one after the other.
     shift : Float64
-        Black levels of all lanes.
+        Black levels of all lanes, in grey values.
     numbers : sequence
-        Parameters of the read-out.
+        Read noise, gain, full well and largest grey value of the detector.
     at : tuple
-        Positions in all frames, and lanes, of the open numbers.
+        Position among the words of all frames, and lane, of each undetermined number.
     """
     import drjit as dr
     from drjit.llvm import Bool, Float32, Float64, UInt32, UInt64
@@ -545,9 +571,9 @@ def _compared(
 
 
 def _by_series(mean: Any, word: Any) -> tuple[Any, Any]:
-    """Return Poisson quantiles of means from ``TABLE_END`` on, and whether each is uncertain.
+    """Return Poisson quantiles of means from ``TABLE_END`` on by Giles' expansion, and whether each is uncertain.
 
-    The method is Giles' expansion of the quantile for large means.
+    A quantile is uncertain if a whole number lies within the error bound of the expansion.
     """
     import drjit as dr
     from drjit.llvm import Float32, Float64
@@ -576,13 +602,18 @@ _TAIL = (
     -0.000200214257, 0.000100950558, 0.00134934322, -0.00367342844, 0.00573950773, -0.0076224613, 0.00943887047,
     1.00167406, 2.83297682,
 )  # fmt: skip
-"""Coefficients of Giles, Approximating the erfinv function, GPU Computing Gems (2012), single precision: polynomials of
-w - 2.5 and of sqrt(w) - 3, with w = -log(4 t (1 - t)).
+"""Coefficients of the inverse error function in single precision, for the tails; ``_CENTRAL`` has those of the middle.
+
+They are of polynomials of sqrt(w) - 3 (tails) and of w - 2.5 (middle), with w = -log(4 t (1 - t)) for a probability t.
+Source: Giles, Approximating the erfinv function, GPU Computing Gems (2012).
 """
 
 
 def _normal_quantile(tail: Any) -> tuple[Any, Any]:
-    """Return the normal quantile of a probability up to 1/2, and whether it is too far out for single precision."""
+    """Return the standard normal quantile of a probability up to 1/2, and whether it is too far in the tail.
+
+    Too far means that single precision does not suffice.
+    """
     import drjit as dr
 
     def polynomial(coefficients: Sequence[float], at: Any) -> Any:

@@ -130,14 +130,14 @@ class LineCcd:
         return out
 
     def white_photons(self, share: float) -> float:
-        """Return the photons per pixel, summed over all stages, that fill the well to a fraction ``share``."""
+        """Return the photons per pixel, summed over all TDI stages, that fill the well to a fraction ``share``."""
         return share * self.detector.full_well_e / self.detector.quantum_efficiency
 
     @property
     def largest_white(self) -> float:
-        """Fraction of the full well up to which no pixel of an even field saturates.
+        """Largest signal of a uniform white area, as a fraction of the full well, at which no pixel saturates.
 
-        It allows five sigma of the pixels' response and of their noise.
+        It allows for five sigma of the pixels' response and of their noise.
         """
         sheet, noise = self.detector, self.noise
         level = (sheet.saturation_dn - sheet.offset_dn) / sheet.system_gain_dn_per_e - noise.dark_signal_e
@@ -157,7 +157,7 @@ class LineCcd:
 
     @property
     def noise(self) -> NoiseModel:
-        """Noise model of one frame (sum over all stages), for the analysis."""
+        """Noise model of one frame (sum over all TDI stages): variance as a function of signal, for the analysis."""
         return self.detector.noise_model(self.exposure)
 
     def pattern(self, seed: np.random.SeedSequence) -> FixedPattern:
@@ -167,9 +167,9 @@ class LineCcd:
     def expose(
         self, photons: np.ndarray, column: int, pattern: FixedPattern, frames: int, seed: np.random.SeedSequence
     ) -> np.ndarray:
-        """Return frames of images (..., H, W), uint16 (..., frames, H, W).
+        """Return recorded frames, uint16 grey values (..., frames, H, W), of images (..., H, W) in photons per pixel.
 
-        ``column`` is the pixel of the line at their first column.
+        ``column`` is the number of the line's pixel that records the images' first column.
 
         Dimensions: H rows, W columns.
 
@@ -186,14 +186,14 @@ class LineCcd:
 
 
 _BEYOND = 30
-"""Number of terms of the Jacobi-Anger expansion that are kept beyond its argument.
+"""Number of terms of the Jacobi-Anger expansion (sum of Bessel functions J_n(z)) that are computed beyond n = z.
 
-With the argument z, the term n falls off faster than (e z / 2 n)^n.
+The term n falls off faster than (e z / 2 n)^n.
 """
 _PER_STEP = 8
-"""Number of integration nodes per step, if light falls in during only a part of the step."""
+"""Number of integration nodes per step of the charge, if light is collected during only a part of the step."""
 _PER_CYCLE = 6
-"""Number of Gauss points per cycle of a function that is averaged over a step."""
+"""Number of Gauss nodes per cycle of an oscillating function that is averaged over the collection."""
 
 
 @dataclass(frozen=True)
@@ -232,7 +232,7 @@ class Collection:
         return self.steps * self.step
 
     def mean(self, frequency: np.ndarray | float) -> np.ndarray:
-        """Return the mean of exp(2 pi i f t) over the times t of the collection, for frequencies f in hertz.
+        """Return the mean of exp(2 pi i f t) over the times t at which light is collected, for frequencies f in hertz.
 
         It is real, since the times are symmetric about the middle of the collection, and 1 at frequency 0.
         """
@@ -246,7 +246,9 @@ class Collection:
         return np.asarray(np.sinc(self.open_share * cycles) * np.where(np.abs(near) < 1e-9, aligned, ratio))
 
     def gauss_rule(self, count: int) -> tuple[np.ndarray, np.ndarray]:
-        """Return a Gauss rule for means over the collection: times (K,), s from its middle, and weights with sum 1.
+        """Return a Gauss rule for means over the times of collection: times (K,), in seconds, and weights with sum 1.
+
+        Times are counted from the middle of the collection.
 
         Polynomials in time up to degree 2 K - 1 are averaged exactly; K is ``count``, or the number of nodes of the
         collection if that is smaller.
@@ -372,7 +374,7 @@ class Motion:
 
     @property
     def speed(self) -> float:
-        """Speed of the image that the motion hardly exceeds, in pixels per second."""
+        """Upper estimate of the image's speed, in pixels per second, which the motion rarely exceeds."""
         square = self.level @ (self.last**3 - self.first**3) / 3.0
         return float(2.0 * np.pi * (self.frequency @ self.amplitude + 4.0 * np.sqrt(square)))
 

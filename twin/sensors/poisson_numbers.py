@@ -4,8 +4,8 @@ The number for a mean m and a uniform u is the quantile, the smallest n whose di
 
     F(n; m) = Q(n + 1, m)        (Q: regularised upper incomplete gamma function)
 
-is at least u. No other distribution replaces Poisson's: the fast methods below only locate the quantile, and wherever
-they leave a choice, F itself decides.
+is at least u. No other distribution is used instead of Poisson's: the fast methods below only bracket the quantile, and
+where more than one number remains possible, F itself is compared with u.
 
 - Means below ``TABLE_END``: a guide table (Chen and Asau 1974; Devroye, Non-Uniform Random Variate Generation, III.2.4)
   over cells of the mean and of u. The quantile grows with both, so if it is equal at a cell's two opposite corners it
@@ -31,20 +31,23 @@ import numpy as np
 from scipy.special import gammainc, gammaincc, ndtri
 
 TABLE_END = 32.0
-"""Smallest mean for which no table of quantiles is used."""
+"""Mean below which Poisson quantiles are taken from a table."""
 SERIES_END = 65536.0
-"""Smallest mean for which NumPy's own generator is used.
+"""Mean below which Poisson quantiles are computed by Giles' expansion; above, NumPy's generator draws the numbers.
 
 SciPy's incomplete gamma functions keep full precision in the tails up to means of 1e5.
 """
 
 CELLS_PER_UNIT = 32
-"""Cells of the table per unit of the mean, in electrons."""
+"""Number of cells of the table of quantiles per unit of the mean (one electron)."""
 TABLE_BITS = 10
-"""Number of bits of u that select a cell of the table."""
+"""Number of bits of the uniform number u that select a cell of the table of quantiles."""
 _SHIFT = np.uint64(64 - TABLE_BITS)
 MOST_IN_TABLE = 120
-"""Numbers in the table: beyond it lies 1e-31 of the largest mean's distribution, less than the last cell of u."""
+"""Count of whole numbers, from 0, for which the table has the distribution function.
+
+Larger ones have a probability of 1e-31 for the largest mean, less than the last cell of u.
+"""
 _UNDECIDED = 255
 _LAST = 2**64 - 1
 _INTERPOLATED = 1.01 * (1.0 / CELLS_PER_UNIT) ** 2 / 8.0
@@ -54,7 +57,10 @@ With the probability p(n) of the number n, dF/dm = -p(n) for the mean m, so the 
 nowhere larger than 1.
 """
 _ROOM = 1 << 17
-"""Numbers drawn at once, for arrays of a megabyte: with fewer, the calls take as long as the work."""
+"""Count of random numbers drawn at once, for arrays of a megabyte.
+
+With fewer, the function calls take as long as the work.
+"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,7 +76,8 @@ class _Guide:
     least : ndarray of uint8
         Smallest quantile in the cell.
     law : ndarray
-        Distribution function of the numbers below ``MOST_IN_TABLE`` at the cells' means and at the table's end.
+        Poisson distribution function of the whole numbers below ``MOST_IN_TABLE``, for the means at which cells begin
+        and for that at the table's end.
     """
 
     known: np.ndarray
@@ -80,7 +87,10 @@ class _Guide:
 
 @cache
 def _guide() -> _Guide:
-    """Return the guide table of Poisson quantiles for all means below ``TABLE_END``, made once."""
+    """Return the table of the smallest Poisson quantile in each cell of mean and uniform number u, computed once.
+
+    It covers all means below ``TABLE_END``.
+    """
     means = np.arange(round(TABLE_END * CELLS_PER_UNIT) + 1) / CELLS_PER_UNIT
     buckets = 1 << TABLE_BITS
     law = gammaincc(np.arange(1.0, MOST_IN_TABLE + 1.0), means[:, None])
@@ -99,14 +109,15 @@ def _guide() -> _Guide:
 
 @cache
 def quantile_table() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the guide table of Poisson quantiles in the form that compiled kernels read.
+    """Return the table of Poisson quantiles over cells of mean and uniform number u, as compiled kernels read it.
 
     Returns
     -------
     cells : ndarray of uint8
         Smallest quantile in each cell of mean and u, row-major, with the highest bit set if the cell has others.
     law : ndarray
-        F of the numbers below ``MOST_IN_TABLE`` at the cells' means, one after the other.
+        Poisson distribution function F of the whole numbers below ``MOST_IN_TABLE`` for the mean at which each row of
+        cells begins, row by row.
     bound : ndarray
         For each row, error bound of a linear interpolation of F between its mean and the next. The second derivative of
         F by the mean is p(n) - p(n - 1), whose own derivative is a difference of two such terms.
@@ -176,7 +187,10 @@ def poisson_pieces(mean: np.ndarray, count: int, rng: np.random.Generator, toget
 
 
 def _steps(first: int, last: int, size: int) -> Iterator[tuple[int, int]]:
-    """Return ranges (start, end) of draws that are made at once."""
+    """Return successive ranges (start, end), from ``first`` to ``last``, of draws that are made at once.
+
+    ``size`` is the number of means; a range has about ``_ROOM`` numbers.
+    """
     step = max(1, _ROOM // max(size, 1))
     return ((start, min(start + step, last)) for start in range(first, last, step))
 
@@ -184,9 +198,9 @@ def _steps(first: int, last: int, size: int) -> Iterator[tuple[int, int]]:
 def split_stream(
     rng: np.random.Generator, huge: np.ndarray, count: int, size: int, together: int
 ) -> tuple[np.random.Generator, np.random.Generator]:
-    """Return two random generators: one for 64-bit words, one for the numbers of huge means.
+    """Return two random generators: one for 64-bit words, one for Poisson numbers of means from ``SERIES_END`` on.
 
-    Their streams follow each other in that of ``rng``.
+    The stream of the second follows that of the first in the stream of ``rng``.
 
     Dimensions: H means.
 
@@ -277,13 +291,15 @@ class _Plan:
 
     @classmethod
     def of(cls, mean: np.ndarray) -> _Plan:
-        """Return which method each of some means needs, and where the table has it."""
+        """Return the means sorted by the method that each needs: table, series, or NumPy's generator."""
         small = np.where(mean < TABLE_END, mean, 0.0)
         row = (small * CELLS_PER_UNIT).astype(np.int64) << TABLE_BITS
         return cls(mean, row, np.flatnonzero((mean >= TABLE_END) & (mean < SERIES_END)))
 
     def fill(self, out: np.ndarray, word: np.ndarray) -> None:
-        """Write quantiles of words (K, N) into ``out``; entries of means beyond ``SERIES_END`` are meaningless.
+        """Write the Poisson quantiles of random words (K, N) into ``out``.
+
+        Entries of means from ``SERIES_END`` on are meaningless.
 
         Dimensions: K draws, N means.
         """
@@ -300,7 +316,19 @@ class _Plan:
             out[:, self.large] = _by_series(self.mean[self.large], word.take(self.large, axis=1))
 
     def _decided(self, guide: _Guide, which: np.ndarray, cell: np.ndarray, word: np.ndarray) -> np.ndarray:
-        """Return the Poisson quantiles that the table leaves open, for the means of the given indices."""
+        """Return the Poisson quantiles of random words whose cell of the table has more than one quantile.
+
+        Parameters
+        ----------
+        guide : _Guide
+            Table of quantiles.
+        which : ndarray of int
+            Indices of their means.
+        cell : ndarray of int
+            Indices of their cells.
+        word : ndarray of uint64
+            Random words.
+        """
         mean = self.mean[which]
         mean[mean >= TABLE_END] = 0.0
         number = guide.least.take(cell).astype(np.int64)
@@ -321,7 +349,7 @@ class _Plan:
 
 
 def _tail(word: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return whether each word's uniform number u is in the upper half, and its distance from the nearer end."""
+    """Return, for 64-bit words, whether u = (word + 1/2) / 2^64 exceeds 1/2, and the smaller of u and 1 - u."""
     sign = word.view(np.int64) >> 63  # -1 in the upper half
     tail = (word.view(np.int64) ^ sign).astype(np.float64)
     tail += 0.5
@@ -330,7 +358,10 @@ def _tail(word: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _beyond(number: np.ndarray, mean: np.ndarray, upper: np.ndarray, tail: np.ndarray) -> np.ndarray:
-    """Return True where u exceeds the Poisson distribution function at a number."""
+    """Return True where the uniform number u exceeds the Poisson distribution function at ``number``.
+
+    u is given as in the result of ``_tail``: whether it is in the ``upper`` half, and its distance from the nearer end.
+    """
     below = np.empty(number.shape, bool)
     low = ~upper
     below[low] = gammaincc(number[low] + 1.0, mean[low]) < tail[low]
@@ -339,7 +370,9 @@ def _beyond(number: np.ndarray, mean: np.ndarray, upper: np.ndarray, tail: np.nd
 
 
 def _climbed(number: np.ndarray, mean: np.ndarray, word: np.ndarray) -> np.ndarray:
-    """Return Poisson quantiles (N,), searched upwards from lower bounds ``number``, which are overwritten.
+    """Return Poisson quantiles (N,) of random words, found by counting upward from lower bounds ``number``.
+
+    The lower bounds are overwritten.
 
     Dimensions: N means.
     """

@@ -9,7 +9,7 @@ from typing import Any
 
 
 class _Study(ModuleType):
-    """Callable package, so that ``python -m twin.study`` and ``twin.study(...)`` have one name."""
+    """Module type of this package that makes it callable: a script can write ``twin.study(...)``."""
 
     def __call__(self, *arguments: Any, **options: Any) -> Any:
         """Run a study from a script; the arguments are those of `twin.study.scripted.study`."""

@@ -1,4 +1,4 @@
-"""Studies from a script: ranges instead of numbers in the perturbation of an instrument."""
+"""Studies from a script: the perturbation of an instrument with ranges instead of numbers."""
 
 from __future__ import annotations
 
@@ -37,11 +37,11 @@ _FORMS = "'(-5 .. 5) um' for an even spread, '(0 +- 2) um' for a normal one, als
 
 
 class Perturbed(Protocol):
-    """Instrument that can be perturbed, as `twin.load` returns it."""
+    """Interface of an instrument that can be perturbed, such as `twin.load` returns."""
 
     @property
     def resolved(self) -> ResolvedJob:
-        """Job (instrument, perturbation and settings) that the instrument stands for."""
+        """Job that describes the instrument, with its perturbation and settings."""
 
     def perturbed(self, perturb: Mapping[str, Mapping[str, Any]]) -> Perturbed:
         """Return the instrument with these bodies perturbed; raise InputError if that is impossible."""
@@ -49,14 +49,14 @@ class Perturbed(Protocol):
 
 @dataclass(frozen=True)
 class Spread:
-    """Number of a perturbation that is given as a range, and so varies in a study.
+    """Number of a perturbation for which a range is given instead, so that it varies in a study.
 
     Attributes
     ----------
     key : KeyPath
         Key path of the number below ``perturb`` of the job.
     factor : dict
-        Distribution of the number, as a study's file states it.
+        Distribution of the number, in the form of a study's file.
     """
 
     key: KeyPath
@@ -102,12 +102,12 @@ def study(
     design : str
         ``latin_hypercube``, ``sobol`` or ``monte_carlo``.
     responses : dict, optional
-        Name -> ``{"key": [...], "sigma": [...], "noise": [...]}`` as in a study's file. By default the readings of the
-        model and the true values of every camera's parameters and of the angle between two cameras.
+        Name -> ``{"key": [...], "sigma": [...], "noise": [...]}`` as in a study's file. By default the estimates of the
+        estimator `model` and the true values of every camera's parameters and of the angle between two cameras.
     workers : int, optional
         Number of processes; one for each core by default.
     out : str or Path, optional
-        Folder in which the study with its report is kept; none by default.
+        Folder in which the study with its report is stored; none by default.
     quiet : bool
         True to show neither progress nor warnings.
     progress : bool or callable
@@ -143,7 +143,7 @@ def study(
 
 
 def _run(command: list[str], quiet: bool, progress: bool | ProgressCallback) -> tuple[int, str]:
-    """Run a study's command to its end and return its exit code and, if quiet, its messages."""
+    """Run a study's command to its end; return its exit code and, if ``quiet``, the messages that it printed."""
     callback = progress if callable(progress) else _progress_bar() if progress and not quiet else _silent
     reading, writing = os.pipe()
     with os.fdopen(reading) as lines, tempfile.TemporaryFile("w+") as messages:
@@ -246,7 +246,7 @@ def config_text(
 
 
 def _by_node(vary: Mapping[str, Mapping[str, Any] | str]) -> dict[str, dict[str, Any]]:
-    """Return the perturbation of each body by key, with motions given as text ("M2 shift z") expanded."""
+    """Return body -> its perturbation by key; motions given as text ("M2 shift z") are expanded."""
     out: dict[str, dict[str, Any]] = {}
     for name, motion in vary.items():
         if isinstance(motion, Mapping):
@@ -276,13 +276,13 @@ QUALITY = {
     "mtf_line": ("mtf_along_line", "centre"),
     "mtf_track": ("mtf_along_track", "centre"),
 }
-"""Responses about the images of a camera without a monitor, and their keys in quality.json."""
+"""Name of an image quality response of a camera without a monitor -> its key in quality.json."""
 
 
 def _responses(resolved: ResolvedJob) -> Tree:
-    """Return the default responses: readings of every camera with their sigmas, and true values.
+    """Return the default responses: estimated changes of every camera with their sigmas, and true changes.
 
-    The readings are those of the estimator by which a run is judged. Without a monitor the responses are true values
+    The estimates are those of the estimator by which a run is judged. Without a monitor the responses are true values
     and image quality.
     """
     out: Tree = {}
@@ -310,13 +310,16 @@ def _responses(resolved: ResolvedJob) -> Tree:
 
 
 def _with_sigmas(read: Sequence[str]) -> Tree:
-    """Return the response of a monitor reading, with its total sigma and that of noise alone."""
+    """Return the response for one estimated change, with the keys of its total sigma and its noise sigma.
+
+    ``read`` is the key path of the change in the results.
+    """
     *path, key = read
     return {"key": [*read], **{name: [*path, f"{key}{end}"] for name, end in (("sigma", TOTAL), ("noise", NOISE))}}
 
 
 def _with_middle_values(value: Any, key: KeyPath, spreads: list[Spread]) -> Any:
-    """Return the value with each range replaced by its middle; the ranges are appended to ``spreads``."""
+    """Return ``value`` with each range in it replaced by the range's middle; the ranges are appended to ``spreads``."""
     if isinstance(value, Mapping):
         return {name: _with_middle_values(part, (*key, name), spreads) for name, part in value.items()}
     if isinstance(value, Sequence) and not isinstance(value, str):

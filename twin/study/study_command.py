@@ -1,4 +1,4 @@
-"""Body of ``python -m twin.study``: runs a study and writes its folder."""
+"""Implementation of ``python -m twin.study``: run a study and write its folder."""
 
 from __future__ import annotations
 
@@ -18,18 +18,18 @@ from twin.study.runs.plan import Plan, require_study_memory, run_count
 from twin.study.runs.setup import PROGRAM, StudySetup, base_of
 
 START = "start the workers and do the first runs"
-"""Name of the first part of the work in the progress display."""
+"""Name of the first stage in the progress display."""
 
 
 def check_size(setup: StudySetup, confirmed: bool) -> None:
-    """Raise InputError if a study has more runs than its limit or than fit in memory.
+    """Raise InputError if a study has more runs than its limit allows or than fit in memory.
 
     Parameters
     ----------
     setup : StudySetup
         Study with its base job, factors and responses.
     confirmed : bool
-        True if the limit of runs may be exceeded.
+        True if the user has confirmed that the limit may be exceeded.
 
     Raises
     ------
@@ -63,9 +63,9 @@ def run_study(
     session : Session
         Session of the command.
     store : Path
-        Folder in which finished blocks are kept.
+        Folder in which finished blocks of runs are stored.
     chosen : tuple
-        Number of local processes, None for one per core; address of a running cluster, None for none.
+        Number of local processes (None: one per core), and address of a running cluster (None: none).
     say : callable
         Function that receives the estimate of the computing time.
     progress : callable

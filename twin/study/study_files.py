@@ -1,4 +1,4 @@
-"""Result of a study as a data set with one dimension, ``run``, and the files of its folder."""
+"""Result of a study as a data set with one dimension, ``run``, and the files of the study's folder."""
 
 from __future__ import annotations
 
@@ -21,17 +21,17 @@ from twin.study.runs.plan import Plan
 RUN = "run"
 FAILED, MESSAGE, SEED = "failed", "message", "seed"
 DOUBT, MONITOR = "doubt", "render"
-"""Variable with the reason why sigma does not hold, and the base command whose runs have it."""
+"""Name of the variable with the reason why a run's sigma is not valid, and the base command whose runs have it."""
 ROLE = "role"
-"""Attribute of every variable: factor, response, sigma or bookkeeping."""
+"""Name of the attribute of every variable of the data set that says: factor, response, sigma or bookkeeping."""
 
 
 def make_dataset(plan: Plan, result: BlockResult) -> xr.Dataset:
     """Return factors, responses, their sigmas and the failed runs as an xarray data set with the dimension ``run``.
 
-    The data set depends neither on the time nor on the workers of the computation. Every variable has the attributes
-    ``units`` (empty for pure numbers and texts), ``role`` and, for factors and responses, ``key``, its position in the
-    base or in the results.
+    The data set depends neither on the computing time nor on the workers. Every variable has the attributes ``units``
+    (empty for pure numbers and texts), ``role`` and, for factors and responses, ``key``, its key path in the base job
+    or in the results.
 
     Parameters
     ----------
@@ -86,7 +86,10 @@ def _path(key: tuple[str | int, ...]) -> str:
 
 
 def _as_table(ending: str, data: xr.Dataset) -> bytes | None:
-    """Return the data set as a table file with a line for each run; None if a package is missing."""
+    """Return the data set as a table file with a row for each run; None if a required package is missing.
+
+    ``ending`` is the file's suffix, which determines its format.
+    """
     columns = []
     for name in (RUN, *map(str, data.data_vars)):
         about = data[name].attrs
@@ -112,7 +115,7 @@ A new format is added here.
 
 
 def summary(data: xr.Dataset, plan: Plan) -> dict[str, Any]:
-    """Return the contents of study.json but the times: statistics of each response over the successful runs.
+    """Return the contents of study.json without the times: statistics of each response over the successful runs.
 
     They are mean, standard deviation and quantiles; null where there are no values.
 
@@ -156,7 +159,7 @@ def _span(values: np.ndarray) -> dict[str, Any]:
 
 
 def _statistics(values: np.ndarray) -> dict[str, Any]:
-    """Return count, mean, standard deviation (n - 1) and the 95 % and 99.7 % quantiles of the finite values."""
+    """Return count, mean, standard deviation (n - 1) and the 95 % and 99.7 % quantiles of the n finite values."""
     description = describe(values, False)
     return {
         "count": description.count,

@@ -1,13 +1,14 @@
 """Images of test targets at infinity on the cameras' line CCDs, and of slanted edges at any defocus.
 
 The image of a straight edge depends only on the optical transfer function along the edge's normal. It is computed once
-for every site and edge, over frequency and defocus, and interpolated: a displacement of the detector along its normal
-by micrometres, or of the collimator's target through focus, changes nothing else that matters (a tilt of the detector
-by arcminutes scales the direction cosines by 1e-6).
+for every position in the field and every edge, over frequency and defocus, and interpolated. A displacement of the
+detector along its normal by micrometres, or of the collimator's target through focus, has no other significant effect
+on the function (a tilt of the detector by arcminutes scales the direction cosines by 1e-6).
 
-A target is fixed in the direction that a position on the line sees in the nominal state. Coordinates in an image are
-(along, across) = (Y', X') of the focal plane: columns run along the line, rows along the track. The recorded window
-follows the image by whole pixels, so that the image lies on the pixels as it does in the camera.
+A target is fixed in the direction in object space that a position on the line CCD sees in the nominal state.
+Coordinates in an image are (along, across) = (Y', X') of the focal plane: columns run along the line, rows along the
+track. The recorded window follows the image by whole pixels, so that the image lies on the pixels as it does in the
+camera.
 
 The pupils of an image in the light of a band are one for all wavelengths, or, with lenses, one for each wavelength.
 """
@@ -42,7 +43,7 @@ WORST_CHANGE = 5e-4
 """Largest accepted change of an MTF when more wavelengths are used in the quadrature over the band."""
 
 LARGEST_RULE = 65
-"""Number of wavelengths of the finest quadrature rule over a band; if the MTF still changes there, it is an error."""
+"""Number of wavelengths of the finest quadrature over a band; an MTF that still changes there raises an error."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,7 +118,7 @@ def wavelengths_enough(
     first : int
         Number of wavelengths to start with.
     values : callable
-        Function of the number of wavelengths that returns MTF values, or other numbers of this kind.
+        Function of the number of wavelengths that returns MTF values, which are compared from one number to the next.
     largest : int
         Largest number of wavelengths that is tried.
 
@@ -150,22 +151,28 @@ DIRECTION_NAMES: Mapping[str, str] = {ALONG: "along the line", TRACK: "along the
 """Names of the directions in reports."""
 
 EDGE_RUNS: Mapping[str, Literal["x", "y"]] = {ALONG: "y", TRACK: "x"}
-"""Axis of the image along which the edge runs that measures the MTF in each direction."""
+"""Direction in which the MTF is measured -> axis of the image (x or y) along which the measured knife edge runs."""
 
 FREQUENCIES = 97
-"""Number of samples of a transfer function from frequency 0 to the cut-off."""
+"""Number of frequencies, from 0 to the cut-off, at which the transfer function along an edge's normal is sampled."""
 
 DEFOCUS_STEP = 25e-6
-"""Step of the table over defocus, in metres. The phase of the transfer function of an F/9 beam changes by one cycle in
-250 µm or more, and quintic splines through ten samples per cycle are accurate to 2e-4.
+"""Step in defocus of the table of transfer functions, in metres.
+
+The phase of the transfer function of an F/9 beam changes by one cycle in 250 µm or more, and quintic splines through
+ten samples per cycle are accurate to 2e-4.
 """
 
 TABLE_REACH = 0.6e-3
-"""Largest absolute defocus of the table of transfer functions, in metres; images beyond it are computed singly."""
+"""Largest absolute defocus of the table of transfer functions, in metres; beyond it they are computed one by one."""
 
 
 def knife_edge(direction: str, angle: float) -> HalfPlane:
-    """Return the knife edge, on the target, that measures in a direction and is rotated by ``angle``, in radians."""
+    """Return the knife edge, in target coordinates, by which the MTF in a direction is measured.
+
+    ``direction`` is ``ALONG`` (the line) or ``TRACK`` (along the track); ``angle`` is the rotation of the edge from its
+    axis, in radians.
+    """
     shape = slanted_edge(angle, EDGE_RUNS[direction]).parts[0][1]
     assert isinstance(shape, HalfPlane)
     return shape
@@ -244,9 +251,15 @@ def _samples(light: BandPupils, normal: np.ndarray, cutoff: float, defocus: np.n
 
 
 _ROUND_CUTOFF = 10e3
-"""Step to which cut-off frequencies are rounded up, in cycles/m."""
+"""Step, in cycles/m, to which cut-off frequencies are rounded up.
+
+All positions in a band's field then share one sampling of the edge profile.
+"""
 _ROUND_REACH = 4.0
-"""Step to which the extents of computed images are rounded up, in pixels."""
+"""Step, in pixels, to which the extents of edge profiles are rounded up.
+
+All positions in a band's field then share one sampling of the edge profile.
+"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -268,7 +281,10 @@ class EdgeImager:
     region: int
 
     def transfer(self, defocus: float, frequency: np.ndarray) -> np.ndarray:
-        """Return the complex transfer function of optics, pixel, diffusion and TDI along the edge's normal."""
+        """Return the complex transfer function of optics, pixel, charge diffusion and TDI along the edge's normal.
+
+        ``defocus`` is in metres and ``frequency`` in cycles/m.
+        """
         x, y = self.optics.normal
         return self.optics.at(defocus, frequency) * self.ccd.transfer(frequency * x, frequency * y)
 
@@ -280,7 +296,7 @@ class EdgeImager:
         return float(np.abs(self.transfer(defocus, np.array([frequency])))[0])
 
     def image(self, defocus: float, offset: float) -> np.ndarray:
-        """Return the image of the edge, as fractions of the signal of a white area, (region, region).
+        """Return the recorded image of the edge, as fractions of the signal of a white area, (region, region).
 
         Parameters
         ----------
@@ -306,23 +322,23 @@ PLACES = {"left": 1.0, "centre": 0.0, "right": -1.0}
 """Positions on the line as fractions of its usable half; left is the +Y' end."""
 
 MARGIN = 0.02
-"""Distance between each end of the line and the nominal windows, as a fraction of the line's pixels, so that an image
-can move.
-"""
+"""Part of the line's pixels at each end in which no window lies nominally, as a fraction, so that images can move."""
 
 BAR_TILT = float(np.radians(7.0))
-"""Tilt of the bars' normal from the axis, in radians: within the group every sampling phase occurs four times, even in
-112 pixels.
+"""Tilt of the bars' normal from the axis, in radians.
+
+With it, every phase of the bars relative to the pixels occurs four times in the bar group, even in a window of 112
+pixels.
 """
 
 BAR_SHARE = 0.45
-"""Side of the bar group, as a fraction of the region's side."""
+"""Side of the bar group's image relative to the side of the window."""
 
 CLEARANCE = 6.0
 """Margin between the border of the bar group and the part of it that is measured, in pixels."""
 
 _FOCUS = 1e-6
-"""Defocus range of the edges' tables, in metres; they are used at 0 only."""
+"""Range of defocus, in metres, of the tables of transfer functions for targets; only their value at 0 is used."""
 
 
 class TargetLostError(PhysicalError):
@@ -375,13 +391,13 @@ class View:
         return np.asarray(optics * self.ccd.transfer(frequency[:, 0], frequency[:, 1]))
 
     def edge(self, direction: str, angle: float) -> EdgeImager:
-        """Return the imager of the knife edge that measures in a direction and is rotated by ``angle``, in radians."""
+        """Return the imager of the knife edge that measures the MTF in a direction, rotated by ``angle``, radians."""
         normal = knife_edge(direction, angle).mapped(self.local).normal
         optics = EdgeOptics.build(self.light, self.band, normal, _FOCUS)
         return EdgeImager(optics, self.ccd, self.region)
 
     def edge_image(self, imager: EdgeImager) -> np.ndarray:
-        """Return the image of a knife edge, as fractions of the signal of a white area, (region, region)."""
+        """Return the recorded image of a knife edge, as fractions of a white area's signal, (region, region)."""
         return imager.image(0.0, float(self.offset @ imager.optics.normal))
 
     def image(self, target: Target) -> np.ndarray:
@@ -411,18 +427,18 @@ class View:
 
 @dataclass(frozen=True, eq=False)
 class BarDesign:
-    """Bar target whose nominal image has the Nyquist frequency, and the region of the image that is measured.
+    """Bar target whose nominal image has the pixels' Nyquist frequency, and the region of the image that is measured.
 
     Attributes
     ----------
     target : Target
         Bars.
     frequency : (2,) ndarray
-        Frequency on the target, in cycles/m.
+        Frequency vector (along, across) of the bars on the target, in cycles/m.
     nominal : (2,) ndarray
-        Frequency on the nominal image, in cycles/m.
+        Frequency vector (along, across) of the bars in the nominal image, in cycles/m.
     group : tuple of slice
-        (rows, columns) of the window that are well inside the group.
+        Rows and columns of the window in which the image shows bars only, at a distance from the group's border.
     """
 
     target: Target
@@ -432,7 +448,10 @@ class BarDesign:
 
     @classmethod
     def build(cls, view: View, direction: str) -> BarDesign:
-        """Return the design for the nominal view of a position."""
+        """Return the bar target whose image in the nominal view of a position has the Nyquist frequency.
+
+        ``direction`` is that in which the MTF is measured: along the line or along the track.
+        """
         pitch, jacobian = view.band.pitch, view.local.jacobian
         rotation = BAR_TILT if direction == ALONG else BAR_TILT + 0.5 * np.pi
         nominal = view.band.nyquist * np.array([np.cos(rotation), np.sin(rotation)])
@@ -450,7 +469,7 @@ class BarDesign:
         return cls(target, frequency, nominal, (sides, sides))
 
     def seen(self, view: View) -> np.ndarray:
-        """Return the bars' frequency vector (along, across) in the image of a view, in cycles/m."""
+        """Return the frequency vector (along, across) that the bars have in the image of a view, in cycles/m."""
         return np.asarray(np.linalg.solve(view.local.jacobian.T, self.frequency))
 
     @property
@@ -493,11 +512,11 @@ class TargetCamera:
         self.region = region
         along = 0.5 * usable * band.pitch * np.array(list(PLACES.values()))
         self.places = np.stack([along, np.full(len(along), band.offset)], axis=-1)
-        """Nominal (along, across) of PLACES, metres."""
+        """Nominal positions (along the line, across it) on the detector of the targets of PLACES, metres."""
         self.directions = path.directions(self.places)
 
     def views(self, state: State) -> dict[str, View]:
-        """Return the view of every position on the line (left, centre, right) in a state of the camera.
+        """Return name of each position on the line (left, centre, right) -> its view in a state of the camera.
 
         Raises
         ------
@@ -514,9 +533,9 @@ class TargetCamera:
         return {name: self._view(name, hits[i], self.places[i], lights[i], maps[i]) for i, name in enumerate(PLACES)}
 
     def _lights(self, state: State, hits: np.ndarray, count: int | None = None) -> list[BandPupils]:
-        """Return the pupils of every position in the band's light.
+        """Return the pupil functions of every position on the line at the wavelengths of the camera's band.
 
-        With lenses there is one pupil for each of ``count`` wavelengths, or of the number that the MTF needs.
+        With lenses there is one pupil for each of ``count`` wavelengths, or of as many as the MTF needs.
         """
         band = self.ccd.band
         if not lenses(self.path.model.spec):

@@ -1,4 +1,7 @@
-"""Test targets of the main job: rendering, exposure and measurement for every camera before and after; mtf.json."""
+"""Test targets of the main job: images, exposure and MTF of every camera before and after its perturbation.
+
+The results are the contents of mtf.json.
+"""
 
 from __future__ import annotations
 
@@ -32,19 +35,20 @@ NYQUIST = 0.5
 
 @dataclass(frozen=True, eq=False)
 class TargetReading:
-    """MTF measured from the image of one target, with the true MTF.
+    """MTF measured in the image of one target, with the true MTF computed from the traced pupil.
 
     Attributes
     ----------
     reason : str
         Reason why the frames cannot be measured; empty if they can.
     true_nyquist : float
-        MTF of the traced pupil and the detector at ``at_nyquist``.
+        True MTF, of the traced pupil and the detector, at ``at_nyquist``.
     at_nyquist : tuple of float
-        Frequency of the result called MTF at Nyquist, (along, track), in cycles/pixel.
+        Frequency vector (along, track), in cycles/pixel, for which the result "MTF at Nyquist" holds; its magnitude is
+        about 0.5.
     true_axis : float
-        True MTF without the target's tilt, exactly along the line or along the track at the Nyquist frequency; it
-        equals that of image quality at this position.
+        True MTF exactly along the line or along the track at the Nyquist frequency, which the tilted target does not
+        measure; it equals that of the image quality at this position.
     """
 
     reason: str
@@ -55,7 +59,7 @@ class TargetReading:
 
 @dataclass(frozen=True, eq=False)
 class EdgeReading(TargetReading):
-    """MTF measured from the image of one knife edge, with the true MTF.
+    """MTF measured in the image of one knife edge, with the true MTF computed from the traced pupil.
 
     Attributes
     ----------
@@ -78,14 +82,14 @@ class EdgeReading(TargetReading):
 
     @property
     def nyquist_bias(self) -> float | None:
-        """Mean increase of the measured MTF at the Nyquist frequency due to noise; None if it was not measured."""
+        """Mean amount by which noise increases the measured MTF at the Nyquist frequency; None if not measured."""
         edge = self.measured
         return None if edge is None else float(np.interp(NYQUIST, edge.frequency, edge.noise_bias))
 
 
 @dataclass(frozen=True, eq=False)
 class BarReading(TargetReading):
-    """MTF measured from the image of one bar target near the Nyquist frequency, with the true MTF.
+    """MTF measured in the image of one bar target near the Nyquist frequency, with the true MTF from the traced pupil.
 
     Attributes
     ----------
@@ -103,16 +107,16 @@ class BarReading(TargetReading):
 
 @dataclass(frozen=True, eq=False)
 class TargetShots:
-    """Images of all targets at one position in one state.
+    """Recorded images of all test targets at one position on the line, before or after the perturbation, and their MTF.
 
     Attributes
     ----------
     frames : mapping of str to ndarray
-        Grey values of N frames of H x W pixels, uint16 (N, H, W), by name of the image.
+        Name of an image -> grey values of N frames of H x W pixels, uint16 (N, H, W).
     column : int
-        Position of the windows' first pixels on the line.
+        Number of the line's pixel at the windows' first column.
     edges, bars : mapping
-        Measurements by direction; empty if the target was not rendered.
+        Direction (along the line, along the track) -> measured MTF; empty if the target was not rendered.
     light_lost : float
         Fraction of the light that bodies in the beam block.
     """
@@ -126,14 +130,15 @@ class TargetShots:
 
 @dataclass(frozen=True, eq=False)
 class PlaceTargets:
-    """Targets before and after the perturbation at one position of a line.
+    """Images of test targets before and after the perturbation at one position on a camera's line CCD.
 
     Attributes
     ----------
     place : (2,) ndarray
-        Nominal (along, across) on the focal plane, in metres.
+        Nominal position (along, across) on the focal plane, in metres.
     shift : (2,) ndarray
-        True displacement of the image of a fixed direction on the focal plane, (along, across), in metres.
+        True displacement of the image of a fixed direction on the focal plane due to the perturbation, (along, across),
+        in metres.
     before, after : TargetShots
         Images in both states.
     """
@@ -145,7 +150,7 @@ class PlaceTargets:
 
     @property
     def shots(self) -> dict[str, TargetShots]:
-        """Images and measurements by the names of the states, as in files and results."""
+        """Name of the state ("before", "after"), as in files and results -> its images and measurements."""
         return {"before": self.before, "after": self.after}
 
 
@@ -187,7 +192,10 @@ class TargetRun:
     obstruction: bool = True
 
     def images(self) -> Iterator[tuple[str, str, np.ndarray, FrameFacts]]:
-        """Yield every image: stem of its file, name, N frames (N, H, W) and their description."""
+        """Yield every image: its file name without suffix, target, N frames (N, H, W) and description.
+
+        Frames have H rows and W columns.
+        """
         for camera, targets_of_camera in self.cameras.items():
             for place, targets in targets_of_camera.places.items():
                 for when, shots in targets.shots.items():
@@ -201,7 +209,7 @@ class TargetRun:
 
     @property
     def has_edges(self) -> bool:
-        """True if there are MTF curves of knife edges."""
+        """True if knife edges were rendered, so that there are MTF curves."""
         return any(place.before.edges for camera in self.cameras.values() for place in camera.places.values())
 
     @property
@@ -224,8 +232,8 @@ class TargetRun:
     def to_dict(self) -> dict[str, Any]:
         """Return the contents of mtf.json.
 
-        Values that could not be measured are null. ``truth`` has the shape of ``cameras`` and adds the MTF on the axes,
-        which tilted edges and bars do not measure.
+        Values that could not be measured are null. ``truth`` has the same structure as ``cameras``, with true values,
+        and also the MTF exactly along the line and along the track, which tilted edges and bars do not measure.
         """
         cameras, truth = {}, {}
         for name, camera in self.cameras.items():
@@ -250,7 +258,10 @@ class TargetRun:
 
 
 def _directions(targets: PlaceTargets, say: Any) -> dict[str, Any]:
-    """Return the results of ``say`` for the measurements, by direction and by state (before, after)."""
+    """Return direction -> state (before, after) -> plain data of its measurement, as made by the function ``say``.
+
+    ``say`` is called with the knife edge's and the bars' measurement, either of which may be None.
+    """
     out: dict[str, Any] = {}
     for when, shots in targets.shots.items():
         for direction in sorted({*shots.edges, *shots.bars}):
@@ -259,7 +270,7 @@ def _directions(targets: PlaceTargets, say: Any) -> dict[str, Any]:
 
 
 def _measured(edge: EdgeReading | None, bars: BarReading | None) -> dict[str, Any]:
-    """Return the measured values of one direction as plain data."""
+    """Return the measured MTF of one direction, from knife edge and bars, as plain data for mtf.json."""
     out: dict[str, Any] = {}
     if edge is not None:
         value, sigma = edge.nyquist or (None, None)
@@ -273,7 +284,7 @@ def _measured(edge: EdgeReading | None, bars: BarReading | None) -> dict[str, An
 
 
 def _true(edge: EdgeReading | None, bars: BarReading | None) -> dict[str, Any]:
-    """Return the true values of one direction as plain data."""
+    """Return the true MTF of one direction, for knife edge and bars, as plain data for mtf.json."""
     out: dict[str, Any] = {}
     if edge is not None:
         out |= {"mtf_nyquist": edge.true_nyquist, "curve": _curve(edge, edge.true)}
@@ -285,7 +296,7 @@ def _true(edge: EdgeReading | None, bars: BarReading | None) -> dict[str, Any]:
 
 
 def _curve(edge: EdgeReading, mtf: np.ndarray) -> dict[str, list[float]]:
-    """Return an MTF curve as plain data."""
+    """Return an MTF curve of a knife edge as plain data: frequencies and values."""
     return {"frequency_per_mm": (1e-3 * edge.frequency).tolist(), "mtf": mtf.tolist()}
 
 
@@ -296,14 +307,15 @@ LARGEST_FRAMES = 400_000_000
 """Largest number of pixels of all frames together, which stay in memory: 0.8 GB."""
 
 EVEN_FIELDS = {"dark": 0.0, "bright": 1.0}
-"""Uniform fields that are recorded with bars, as fractions of the signal of a white area."""
+"""Name -> signal of the uniform fields recorded with bar targets, as a fraction of that of a white area."""
 
 _PATTERN, _EXPOSURE = 3, 4
-"""Random streams of the job's seed, beside those of the monitor."""
+"""Numbers of random streams of the job's seed: pixel patterns and exposures of test targets; others are the monitor's.
+"""
 
 
 def target_pixels(resolved: ResolvedJob) -> int:
-    """Return the number of pixels of all frames of a job's test targets, before and after.
+    """Return the number of pixels of all frames of a job's test targets, before and after the perturbation.
 
     Parameters
     ----------
@@ -350,12 +362,12 @@ def check_targets(resolved: ResolvedJob) -> None:
 
 
 def _band(resolved: ResolvedJob, name: str) -> str:
-    """Return the name of the band whose line CCD images targets."""
+    """Return the name of the spectral band of a camera whose line CCD records the test targets."""
     return target_band(resolved.cameras[resolved.instrument.cameras[name].camera])
 
 
 def target_camera(resolved: ResolvedJob, instrument: Instrument, name: str, backend: Backend) -> TargetCamera:
-    """Return a camera for targets, with the line CCD, windows and obstruction of a job.
+    """Return a camera that images test targets, with the line CCD, window size and beam obstruction of a job.
 
     Parameters
     ----------
@@ -431,7 +443,7 @@ def render_targets(
 
 
 class _TargetRecorder:
-    """Recorder of the images of all targets at one position."""
+    """Renders, exposes and measures all test targets at one position on a line CCD."""
 
     def __init__(
         self, settings: TargetsSpec, frames: int, images: tuple[str, ...], nominal: View, pattern: FixedPattern
@@ -443,7 +455,7 @@ class _TargetRecorder:
         self.bars = {d: BarDesign.build(nominal, d) for d in DIRECTIONS} if "bars" in images else {}
 
     def shoot(self, view: View, seed: np.random.SeedSequence) -> TargetShots:
-        """Expose and measure every target in one state."""
+        """Expose every target in one state of the camera, given by its ``view``, and measure the MTF."""
         frames: dict[str, np.ndarray] = {}
         edges: dict[str, EdgeReading] = {}
         bars: dict[str, BarReading] = {}
@@ -473,13 +485,16 @@ class _TargetRecorder:
 
 
 def on_axis(view: View, direction: str) -> float:
-    """Return the MTF of traced pupil and detector at the Nyquist frequency along the line or along the track."""
+    """Return the true MTF of optics and detector at the Nyquist frequency exactly along the line or along the track."""
     axis = np.eye(2)[DIRECTIONS.index(direction)]
     return float(np.abs(view.transfer(NYQUIST / view.band.pitch * axis[None]))[0])
 
 
 def read_edge(view: View, direction: str, normal: np.ndarray, mean: np.ndarray, frames: int) -> EdgeReading:
-    """Measure the MTF from the mean (H, W) of frames of a knife edge, and compute the true MTF."""
+    """Measure the MTF in the mean (H, W) of frames of a knife edge, and compute the true MTF from the traced pupil.
+
+    ``normal`` (2,) is the unit normal of the edge in the image.
+    """
     frequency = CURVE / view.band.pitch
     wanted = np.append(frequency, NYQUIST / view.band.pitch)
     true = np.abs(view.transfer(wanted[:, None] * normal))
@@ -497,7 +512,9 @@ def read_edge(view: View, direction: str, normal: np.ndarray, mean: np.ndarray, 
 def read_bars(
     view: View, direction: str, design: BarDesign, mean: np.ndarray, dark: np.ndarray, bright: np.ndarray, frames: int
 ) -> BarReading:
-    """Measure the MTF from the mean of frames of a bar target, and compute the true MTF.
+    """Measure the MTF in the mean of frames of a bar target, and compute the true MTF from the traced pupil.
+
+    Images have H rows and W columns.
 
     Parameters
     ----------

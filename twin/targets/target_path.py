@@ -37,12 +37,13 @@ from scenes.models.camera_model import LAUNCH_DISTANCE, CameraModel, coloured, l
 from scenes.models.shadow import ImagingShadows, PupilEdges, TracedBeams
 
 RINGS = 14
-"""Number of rings of the pupil's quadrature: exact for wavefronts to order 55, far beyond those of mirrors and figures.
+"""Number of rings of the pupil's quadrature.
+
+Integrals are exact for wavefronts to degree 55, far beyond those of mirrors and figure errors.
 """
 
 MORE_RINGS = 28
-"""Number of rings of the quadrature for a vignetted pupil whose wavefront is not described by polynomials fitted to
-fewer rays.
+"""Number of rings of the pupil's quadrature if polynomials fitted to fewer rays do not describe a vignetted wavefront.
 """
 
 SMOOTH = 1e-6
@@ -51,11 +52,15 @@ wavelengths.
 """
 
 WORST_PLACED = 5e-3
-"""Largest fraction of the quadrature's rays that the outlines of edges may misjudge: four rays, close to an edge."""
+"""Largest fraction of the quadrature's rays whose blocking by edges the outlines of the edges may predict wrongly.
+
+It is four rays, close to an edge.
+"""
 
 MAP_POINTS = 7
+"""Number of chief rays per axis that are traced to fit the local mapping from target to image coordinates."""
 MAP_ORDER = 4
-"""Order of the polynomial of the local mapping from target to image, and number of chief rays per axis for its fit."""
+"""Degree of the polynomial that maps target to image coordinates near a field direction."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,7 +116,7 @@ class LineRays:
 
 
 def _monomials(q: np.ndarray) -> np.ndarray:
-    """Return the monomials of two scaled target coordinates, of which the local mapping is a polynomial."""
+    """Return all monomials, to the degree ``MAP_ORDER``, of two scaled target coordinates, for the local mapping."""
     powers = [(a - b, b) for a in range(MAP_ORDER + 1) for b in range(a + 1)]
     return np.stack([q[..., 0] ** a * q[..., 1] ** b for a, b in powers], axis=-1)
 
@@ -162,10 +167,10 @@ class TargetPath:
 
     @property
     def target_distance(self) -> float:
-        """Distance that converts target coordinates to angles, in metres.
+        """Distance by which target coordinates are divided to obtain tangents of angles, in metres.
 
-        It is the collimator's focal length, or the principal distance of the camera along its line, so that a distant
-        target is measured on the image.
+        It is the collimator's focal length. Without a collimator it is the principal distance of the camera along its
+        line, so that coordinates of a distant target are those of its nominal image.
         """
         return self.model.line_principal_distance if self.collimator is None else self.collimator.focal_length
 
@@ -192,9 +197,7 @@ class TargetPath:
         return np.asarray(-sight[0])
 
     def coloured(self, state: State, wavelength: float) -> State:
-        """Return the state with the refractive indices of the lenses at a given wavelength, in metres.
-
-        See ``scenes.models.camera_model.coloured``.
+        """Return the state with the refractive indices of the camera's lenses at a given wavelength, in metres.
 
         Raises
         ------
@@ -260,14 +263,14 @@ class TargetPath:
         return LineRays(position, leaving, path, valid, float(systems.size[0]))
 
     def shadow_pieces(self, state: State, directions: np.ndarray) -> np.ndarray:
-        """Return the shadows of bodies in F beams as K convex polygons of V vertices each, (F, K, V, 2).
+        """Return the shadows that bodies cast in F beams, as K convex polygons of V vertices on the stop, (F, K, V, 2).
 
         Vertices are on the stop's unit disk; ``directions`` (F, 3) are those of the light.
 
         Raises
         ------
         AimError, BeamMissedError
-            Light is lost, see ``rays``.
+            A beam does not reach the stop, or none of its rays reaches the line CCD.
         """
         if self.shadows is None:
             return np.zeros((len(directions), 0, 3, 2))
@@ -298,7 +301,7 @@ class TargetPath:
     ) -> tuple[PupilFunction, ...]:
         """Return the pupil function of the image of each of F directions, about its position on the line CCD.
 
-        Its lengths are in the units of ``places``.
+        Lengths in the image are in metres of the nominal (unexpanded) line CCD, as in ``places``.
 
         Parameters
         ----------
@@ -307,10 +310,10 @@ class TargetPath:
         directions : (F, 3) ndarray
             Directions of the light, world.
         places : (F, 2) ndarray
-            Positions from ``places`` for the same state; those at the design wavelength are the reference for all
-            colours of an image.
+            Image points about which the pupils are computed, from the method ``places`` for the same state; for all
+            colours of an image those at the design wavelength.
         target_shift : float
-            Displacement of the collimator's target, see ``Collimator.path``.
+            Displacement of the collimator's target from its focus, along the light, in metres.
         wavelength : float | None
             Wavelength, in metres; None for the design wavelength.
 
@@ -336,7 +339,11 @@ class TargetPath:
     def _field(
         self, rays: ImagingRays, systems: SystemBatch, places: np.ndarray, wavelength: float, target_shift: float = 0.0
     ) -> PupilField:
-        """Return the optical path and amplitude of traced beams in the pupil, for images along and across the line."""
+        """Return the plane waves of traced beams at the line CCD: optical path and amplitude over direction cosines.
+
+        The image axes are along the line and across it; ``places`` are the image points of reference, and
+        ``target_shift`` is the displacement of the collimator's target from its focus, in metres.
+        """
         origin = systems.size[:, None] * np.stack([places[:, 1], places[:, 0], np.zeros(len(places))], axis=-1)
         collimator = self.collimator
         incoming = None if collimator is None else lambda point: collimator.path(point, target_shift)
@@ -347,12 +354,28 @@ class TargetPath:
     def vignetted_pupils(
         self, state: State, directions: np.ndarray, places: np.ndarray, wavelength: float | None = None
     ) -> tuple[VignettedPupil, ...]:
-        """Return pupil functions of a camera whose surface edges vignette its beams, for ``line_transfer``.
+        """Return the pupil functions of a camera whose surface edges vignette its beams, with the edges as polygons.
 
-        Arguments and exceptions are those of ``pupils``.
+        They are for ``optics.waves.line_transfer``. A smooth wavefront needs no more nodes than that of a pupil without
+        vignetting; any other is traced at those of ``nodes``, and at more if polynomials through these do not fit it.
 
-        A smooth wavefront needs no more nodes than that of a free pupil; any other is traced at those of ``nodes``, and
-        at more if polynomials through these do not fit it.
+        Parameters
+        ----------
+        state : State
+            State of the assembly.
+        directions : (F, 3) ndarray
+            Directions of the light, world frame.
+        places : (F, 2) ndarray
+            Image points (along, across) on the line CCD, in metres.
+        wavelength : float | None
+            Wavelength, in metres; None for the design wavelength.
+
+        Raises
+        ------
+        BeamMissedError, AimError
+            The beam is lost.
+        ValueError
+            The wavefront cannot be described, or the index of a glass is unknown at that wavelength.
         """
         colour = self.model.spec.wavelength if wavelength is None else wavelength
         for nodes, tolerance in ((quadrature.disk(RINGS), SMOOTH), (self.nodes, VIGNETTED_RESIDUAL)):
@@ -365,7 +388,7 @@ class TargetPath:
     def _cut_pupils(
         self, state: State, directions: np.ndarray, places: np.ndarray, colour: float, nodes: PupilNodes
     ) -> tuple[VignettedPupil, ...]:
-        """Return vignetted pupils from rays traced through given nodes of the stop."""
+        """Return vignetted pupils from rays traced through given nodes of the stop, for the wavelength ``colour``."""
         state = self.coloured(state, colour)
         placed, systems, rays = self._imaging(state, directions, nodes)
         owner = np.zeros(len(directions), dtype=int)
@@ -405,7 +428,7 @@ class TargetPath:
         Raises
         ------
         AimError, BeamMissedError
-            Light is lost, see ``rays``.
+            A beam does not reach the stop, or none of its rays reaches the line CCD.
         UnphysicalError
             Polygons cannot follow the edges.
         """
@@ -415,7 +438,10 @@ class TargetPath:
     def _taken(
         self, placed: PlacedBodies, systems: SystemBatch, rays: ImagingRays, directions: np.ndarray
     ) -> tuple[np.ndarray | None, float]:
-        """Return the shadows on the stop in traced beams, and their accuracy; None if nothing blocks the beams."""
+        """Return polygons of the stop that edges and bodies shadow in traced beams, or None if nothing blocks them.
+
+        The second value is the accuracy of the fraction of the stop's area that they cover.
+        """
         owner = np.zeros(len(directions), dtype=int)
         beams = TracedBeams(self.assembly, placed, owner, systems, rays, directions, self.nodes)
         shadows = None if self.shadows is None else self.shadows.cast(beams).pieces
@@ -452,7 +478,7 @@ class TargetPath:
         return np.asarray(first - LAUNCH_DISTANCE * directions)
 
     def _systems(self, state: State, count: int, placed: PlacedBodies | None = None) -> tuple[SystemBatch, SystemBatch]:
-        """Return the optical systems to the line CCD and to the stop, repeated ``count`` times for a batch of beams."""
+        """Return the optical systems to the line CCD and to the stop, repeated ``count`` times, once for each beam."""
         placed = self.assembly.place([state]) if placed is None else placed
         zeros = np.zeros(count, dtype=int)
         systems, to_stop = (

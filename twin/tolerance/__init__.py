@@ -1,1 +1,1 @@
-"""Tolerances of a camera with compensators: sensitivities, limits, yield, allocation."""
+"""Tolerances of a camera with compensators: sensitivities, limits, yield, and allocation of limits."""

@@ -1,10 +1,11 @@
-"""Allocation of tolerance limits: the limits that reach a required yield at the least cost.
+"""Allocation of tolerance limits: the limits that reach a required yield at the lowest cost.
 
-The same random draws serve all limits: each varied parameter is its limit times a fixed random number, the merits
-follow from their second-order model, and the quantile of the worst margin at the required yield (the share of cameras
-that pass) has a gradient with respect to the limits. The limits change by a bounded factor in each round. Then the
-model is computed again about the new limits, and exact traces of some of the cameras correct its quantile by an offset.
-A Monte Carlo run of independent cameras validates the result.
+The same random numbers serve all limits: each varied parameter of a random camera is its limit times a fixed random
+number, the merits follow from their second-order model, and the quantile of the worst margin at the required yield (the
+fraction of cameras that pass) has a gradient with respect to the limits. A margin is the excess of a merit over its
+requirement, relative to the requirement. The limits change by a bounded factor in each round. Then the model is
+computed again about the new limits, and exact traces of some of the cameras correct its quantile by an offset. A Monte
+Carlo run of independent cameras validates the result.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ from twin.tolerance.samples import Samples, adjustment_errors
 from twin.tolerance.tolerance_bench import ToleranceBench
 
 DRAWS = 2000
-"""Number of cameras (random draws) from which the limits are chosen."""
+"""Number of random cameras from which the limits are chosen."""
 CHECKED = 1000
 """Number of the ``DRAWS`` cameras that are traced exactly in every round."""
 ROUNDS = 6
@@ -35,15 +36,18 @@ BOUND = 2.0
 _STEPS = 60
 """Largest number of iterations of the optimiser in a round."""
 _STEP = 1e-5
-"""Step of the numerical derivative of the margins with respect to the natural logarithm of a limit."""
+"""Step, in the natural logarithm of a limit, of the numerical derivative of the margins."""
 _SETTLED = 0.1
-"""Change of the natural logarithms of the limits, largest over the limits, below which no further round is made."""
+"""Largest change of the natural logarithm of any limit in a round that ends the iteration."""
 _LAST = 4
 """Largest number of final rounds that tighten all limits together while exact traces miss the required yield."""
 _NEAR = 0.02
-"""Share of all cameras, on either side of the quantile of the worst margin, whose gradients are averaged."""
+"""Fraction of all cameras, on either side of the quantile of the worst margin, whose gradients are averaged."""
 _SAFE = 1.0
-"""Number of standard deviations of the sampled yield by which the chosen limits exceed the required yield."""
+"""Margin of the chosen limits: the yield exceeds the required one by this many standard deviations.
+
+The standard deviation is that of a yield estimated from a sample of cameras.
+"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,13 +59,15 @@ class Allocation:
     Attributes
     ----------
     scales, rounded : (E,) ndarray
-        Ratio of the new to the specified limit of every tolerance, before and after rounding to the grades.
+        Ratio of the new to the specified limit of every tolerance, before and after rounding to the grades (preferred
+        values).
     limits : dict
-        New limit of every tolerance by name, as a budget file states it: a quantity with its unit, or a pure number.
+        New limit of every tolerance by name, in the notation of a budget file: a quantity with its unit, or a pure
+        number.
     costs : (2, E) ndarray
         Cost of every limit in the budget's unit of cost, before and after the allocation.
     predicted : tuple of float
-        Yield (share of cameras that meet all requirements) of the specified and of the new limits, by the corrected
+        Yield (fraction of cameras that meet all requirements) of the specified and of the new limits, by the corrected
         model.
     reached : bool
         True if the yield of the rounded limits reaches the required yield.
@@ -92,7 +98,7 @@ def allocate(
     spec: AllocationSpec,
     advance: Advance = silent,
 ) -> Allocation:
-    """Choose the limits that reach the required yield at the least cost.
+    """Choose the limits that reach the required yield at the lowest cost.
 
     Parameters
     ----------
@@ -162,7 +168,9 @@ def allocate(
 
 
 class CostCurve:
-    """Cost of a limit against the limit: straight-line extrapolation and monotone interpolation, both in logarithms.
+    """Cost of a tolerance limit as a function of the limit, interpolated monotonically in logarithms of both.
+
+    Beyond the given points the curve continues as a straight line in logarithms.
 
     Parameters
     ----------
@@ -176,7 +184,10 @@ class CostCurve:
         self._slope = self._line.derivative()
 
     def __call__(self, level: float) -> tuple[float, float]:
-        """Return the logarithm of the cost and its derivative at ``level``, the logarithm of the limit's ratio."""
+        """Return the natural logarithm of the cost, and its derivative with respect to ``level``.
+
+        ``level`` is the natural logarithm of the ratio of the limit to the specified one.
+        """
         x, y = self._x, self._y
         if x[0] <= level <= x[-1]:
             return float(self._line(level)), float(self._slope(level))
@@ -187,9 +198,7 @@ class CostCurve:
 
 @dataclass(frozen=True, eq=False)
 class _Costs:
-    """Costs of all limits of a budget.
-
-    Array dimensions: E tolerances.
+    """Costs of all limits of a budget with E tolerances.
 
     Attributes
     ----------
@@ -213,10 +222,7 @@ class _Costs:
         return cls(tuple(CostCurve(tolerance.cost_points) for tolerance in entries), np.array(fixed))
 
     def of_each(self, level: np.ndarray) -> np.ndarray:
-        """Return the cost of every limit, (E,), with limits at exp(level) times the specified ones.
-
-        Array dimensions: E tolerances.
-        """
+        """Return the cost of every limit, (E,) for E tolerances, with limits at exp(level) times the specified ones."""
         return np.exp([curve(x)[0] for curve, x in zip(self.curves, level.tolist(), strict=True)])
 
     def of_level(self, level: np.ndarray) -> float:
@@ -224,13 +230,15 @@ class _Costs:
         return float(np.sum(self.of_each(level)))
 
     def slope(self, level: np.ndarray) -> np.ndarray:
-        """Return the derivative of each limit's cost with respect to the logarithm of the limit, one per tolerance."""
+        """Return the derivative of each limit's cost with respect to the limit's natural logarithm."""
         values = np.array([curve(x) for curve, x in zip(self.curves, level.tolist(), strict=True)])
         return np.asarray(np.exp(values[:, 0]) * values[:, 1])
 
 
 class _MarginModel:
-    """Model of each camera's worst margin as a function of the limits, about the limits of a budget.
+    """Model of each random camera's worst margin as a function of the limits, about the limits of a budget.
+
+    A margin is the excess of a merit over its requirement, relative to the requirement.
 
     Array dimensions: S cameras, M merits.
 
@@ -245,7 +253,7 @@ class _MarginModel:
     costs : _Costs
         Costs of the limits.
     share : float
-        Share of the cameras that must pass.
+        Fraction of the cameras that must pass (required yield).
     values : (S, M) ndarray, optional
         Merits of the first cameras by exact traces; traced here by default.
     """
@@ -273,20 +281,18 @@ class _MarginModel:
     def at(
         cls, bench: ToleranceBench, total: np.ndarray, samples: Samples, costs: _Costs, share: float
     ) -> _MarginModel:
-        """Build the model of the margins about limits at exp(total) times those of a bench (the camera of a budget).
+        """Build the model of the margins about new limits, exp(total) times those of a budget's camera.
 
-        Array dimensions: ``total`` has one entry per tolerance.
+        ``total`` has one entry for each tolerance.
         """
         now = bench.scaled(np.exp(total))
         return cls(now, sensitivities(now).model, samples, costs, share)
 
     def _margins(self, values: np.ndarray) -> np.ndarray:
-        """Return the worst margin of every camera, (S,), from merits (S, M).
+        """Return the worst margin of every camera, (S,), from M merits of S cameras, (S, M).
 
-        A margin is the excess over the requirement in units of it, negative where it is met; large but finite without
-        light.
-
-        Array dimensions: S cameras, M merits.
+        A margin is the excess of a merit over its requirement, relative to the requirement, negative where it is met;
+        it is large but finite for a camera without light.
         """
         worst = self.bench.worst_margins(values)
         return np.asarray(np.where(np.isinf(worst), 1e3, worst))
@@ -295,13 +301,17 @@ class _MarginModel:
         return self._margins(self.bench.values(parts))
 
     def passing(self, level: np.ndarray) -> float:
-        """Return the share of cameras that meet all requirements, with limits at exp(level) times the present ones."""
+        """Return the fraction of cameras that pass, with limits at exp(level) times the present ones.
+
+        A camera passes if it meets all requirements.
+        """
         return float(np.mean(self._worst(self.model.parts(np.exp(level))) + self.offset <= 0.0))
 
     def quantile(self, level: np.ndarray) -> tuple[float, np.ndarray]:
-        """Return the worst margin at the required yield, and its gradient with respect to the logarithms of the limits.
+        """Return the quantile of the worst margin at the required yield, and its gradient.
 
-        The gradient is averaged over cameras near the quantile.
+        The gradient, with respect to the natural logarithms of the limits, is averaged over cameras near the quantile.
+        ``level`` holds the logarithms of the ratios of the limits to the present ones.
         """
         parts = self.model.parts(np.exp(level))
         margin = self._worst(parts)
@@ -319,12 +329,12 @@ class _MarginModel:
     def cheapest(self, low: np.ndarray, high: np.ndarray, total: np.ndarray) -> np.ndarray:
         """Return the step to the cheapest limits that reach the required yield, or else to the tightest limits.
 
-        Array dimensions: E tolerances.
+        A step is a change of the natural logarithms of the limits of E tolerances.
 
         Parameters
         ----------
         low, high : (E,) ndarray
-            Bounds of the step in the logarithms of the limits.
+            Bounds of the step.
         total : (E,) ndarray
             Logarithms of the ratios of the present limits to the specified ones.
 
@@ -353,7 +363,9 @@ class _MarginModel:
         return self._between(start, np.clip(solution.x, low, high), total)
 
     def tightened(self, low: np.ndarray) -> np.ndarray:
-        """Return the first step towards the tightest limits that reaches the required yield, or the whole step.
+        """Return the shortest step towards the tightest limits that reaches the required yield.
+
+        If none does, it is the whole step.
 
         ``low`` and the result are changes of the logarithms of the limits, one per tolerance.
         """
@@ -363,9 +375,9 @@ class _MarginModel:
         return low
 
     def _between(self, inside: np.ndarray, outside: np.ndarray, total: np.ndarray) -> np.ndarray:
-        """Return the cheapest passing step on the line from ``inside``, which passes, to ``outside``.
+        """Return the cheapest passing step on the line between two steps, of which only ``inside`` passes.
 
-        A step of the limits passes if it reaches the required yield.
+        A step is a change of the logarithms of the limits; it passes if it reaches the required yield.
         """
         best = inside
         for part in np.linspace(0.0, 1.0, 17)[1:]:
@@ -379,14 +391,14 @@ class _MarginModel:
 def _rounded_to_grades(
     setup: ToleranceSetup, trade: _MarginModel, total: np.ndarray, spec: AllocationSpec, looser: bool
 ) -> tuple[dict[str, str | float], np.ndarray]:
-    """Round limits down to grades (preferred values); if ``looser``, raise them again where the yield allows.
+    """Round limits down to grades (preferred values); if ``looser``, raise them again while the yield suffices.
 
     Array dimensions: E tolerances.
 
     Returns
     -------
     limits : dict
-        Limit of every tolerance by name, as a budget file states it.
+        Limit of every tolerance by name, in the notation of a budget file.
     scales : (E,) ndarray
         Ratios of the limits to the specified ones.
     """
@@ -420,9 +432,9 @@ def _rounded_to_grades(
 def _grades_near(
     limit: str | float, kind: str, value: float, grades: Sequence[float]
 ) -> list[tuple[str | float, float]]:
-    """Return the grade at or below a value and the next ones above it, each as text of a file and in SI units.
+    """Return the preferred value (grade) at or below a value and the next ones above it.
 
-    Grades are preferred values of a limit, in the unit of the old limit.
+    Each is given in the notation of a file, in the unit of the old limit, and in SI units.
     """
     parts = split_quantity(limit)
     unit = amount_si(f"1 {parts[1]}", kind) if parts is not None else 1.0

@@ -1,4 +1,4 @@
-"""Spectrum in which a budget evaluates wavefronts and MTFs, and matrices that all its cameras share."""
+"""Spectrum in which a budget evaluates wavefronts and MTFs, and matrices that all its random cameras share."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from twin.camera.camera_optics import CameraOptics
 from twin.tolerance.monitor_merit import Merit
 
 TRANSFER = 1e-3
-"""Largest allowed error of an MTF computed at fixed points of the pupil, against that of the nominal pupil."""
+"""Largest allowed error of the nominal pupil's MTF when it is computed at fixed points of the pupil."""
 
 
 def budget_spectrum(test: ToleranceBudgetSpec, camera: CameraSpec) -> SpectrumSpec | None:
@@ -27,7 +27,7 @@ def budget_spectrum(test: ToleranceBudgetSpec, camera: CameraSpec) -> SpectrumSp
     Raises
     ------
     InputError
-        The budget asks for a spectrum that the camera does not have.
+        The budget requests a spectrum that the camera does not have.
     """
     if test.light == "spectrum" and camera.light is None:
         raise test.error(
@@ -40,14 +40,15 @@ def budget_spectrum(test: ToleranceBudgetSpec, camera: CameraSpec) -> SpectrumSp
 
 @dataclass(frozen=True, eq=False)
 class WavefrontNorm:
-    """Matrices from polynomial coefficients of a wavefront to residuals whose squares sum to its mean square.
+    """Matrices that map wavefront coefficients to residuals whose squares sum to the mean square wavefront.
 
     The mean square is over the illuminated pupil. Array dimensions: T polynomial coefficients, F fields.
 
     Attributes
     ----------
     rest : (F, T, T) ndarray
-        Matrices whose products with the coefficients have squares that sum to the mean square without piston and tilt.
+        Matrices for the wavefront without piston and tilt: the squares of their product with the coefficients sum to
+        its mean square.
     tilt : (F, 2, T) ndarray
         Matrices that give the two components of the tilt in the same way.
     """
@@ -57,12 +58,12 @@ class WavefrontNorm:
 
     @classmethod
     def of(cls, lit: Sequence[tuple[np.ndarray, np.ndarray, np.ndarray]], degree: int) -> WavefrontNorm:
-        """Compute the matrices for the illuminated pupils of several fields.
+        """Compute the matrices for the illuminated pupils of F fields.
 
         Parameters
         ----------
         lit : sequence of tuple
-            For each of F fields the nodes x, y and the weights of a quadrature over the illuminated pupil.
+            For each field the nodes x, y and the weights of a quadrature over the illuminated pupil.
         degree : int
             Degree of the polynomials over the stop.
         """
@@ -80,16 +81,16 @@ class WavefrontNorm:
         return cls(np.stack(rest), np.stack(tilt))
 
     def residuals(self, terms: np.ndarray, shares: np.ndarray) -> np.ndarray:
-        """Return residuals whose squares sum to the mean squares over all fields and over the spectrum.
+        """Return residuals whose squares sum to the mean square wavefront over all fields and the spectrum.
 
         The mean tilt of all wavelengths is removed; a tilt that differs between wavelengths blurs the image and stays.
 
-        Array dimensions: S cameras, F fields, T polynomial coefficients, R residuals.
+        Array dimensions: S cameras, F fields, K wavelengths, T polynomial coefficients, R residuals.
 
         Parameters
         ----------
         terms : (S, F, K, T) ndarray
-            Coefficients of K wavelengths about a common image point.
+            Polynomial coefficients of the wavefronts about a common image point.
         shares : (K,) ndarray
             Weights of the wavelengths in the spectrum; they sum to 1.
 
@@ -115,7 +116,7 @@ def fixed_transfers(
     cosines: np.ndarray,
     degree: int,
 ) -> dict[int, list[list[VariedTransfer]]]:
-    """Return the operators that give the MTF of every merit of kind mtf from the wavefront, by field and direction.
+    """Return the operators that give the MTF of every merit of kind ``mtf`` from the wavefront.
 
     Array dimensions: F fields, C wavelengths, N rays.
 
@@ -128,7 +129,7 @@ def fixed_transfers(
     merits : sequence of Merit
         Merits of the budget.
     fields : (F, 2) ndarray
-        Fields of the bench.
+        Field points of the budget.
     light : tuple of ndarray
         Wavelengths, metres, and their weights in the spectrum, (C,) each.
     cosines : (C or 1, F, N, 2) ndarray
@@ -139,7 +140,7 @@ def fixed_transfers(
     Returns
     -------
     dict
-        Index of the merit -> transfer functions by field and direction.
+        Index of the merit -> operators by field and direction.
 
     Raises
     ------

@@ -1,7 +1,7 @@
-"""Warnings about the instrument of a tolerance budget, as other commands give them.
+"""Warnings about the instrument of a tolerance budget that other commands give too.
 
-They concern cameras that are not sharp, own parts in a beam that the file does not model, coarse grey values, and
-bodies that move into beams of the monitor.
+They concern cameras that are not sharp, parts of the instrument in a beam that the file does not model as obstructions,
+coarse grey values, and bodies that move into beams of the monitor.
 """
 
 from __future__ import annotations
@@ -17,11 +17,11 @@ from twin.sensors.area_detector import coarse_warnings
 from twin.tolerance.tolerance_bench import ToleranceBench
 
 FAR = 1e-3
-"""Relative error of a monitor's sigma by interpolated derivatives, above which a warning is given."""
+"""Relative error of a monitor's sigma due to interpolated derivatives above which a warning is given."""
 
 
 def instrument_warnings(setup: ToleranceSetup, bench: ToleranceBench) -> tuple[str, ...]:
-    """Return the warnings about the nominal instrument."""
+    """Return the warnings about the nominal instrument, such as unsharp cameras or parts in a beam."""
     model = bench.optics.model
     shadow = unmodelled_obscuration(model, obscuration(model, bench.backend))
     return (
@@ -32,7 +32,7 @@ def instrument_warnings(setup: ToleranceSetup, bench: ToleranceBench) -> tuple[s
 
 
 def beam_warnings(bench: ToleranceBench, states: Sequence[State]) -> tuple[str, ...]:
-    """Return warnings about bodies that block beams of the monitor in some cameras, once for each body and beam.
+    """Return warnings about bodies that block monitor beams in some random cameras, once for each body and beam.
 
     Parameters
     ----------
@@ -51,7 +51,7 @@ def beam_warnings(bench: ToleranceBench, states: Sequence[State]) -> tuple[str, 
 
 
 def interpolation_warnings(errors: Mapping[str, float], cameras: int) -> tuple[str, ...]:
-    """Return warnings about monitor merits whose interpolated derivatives are too coarse.
+    """Return warnings about monitor merits for which interpolated derivatives are too inaccurate.
 
     Parameters
     ----------

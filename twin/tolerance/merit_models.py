@@ -1,8 +1,8 @@
 """Second-order models of merits, sensitivities, and inverse limits (tolerance sizes for a specified loss).
 
-Where a camera is at its optimum the first derivative vanishes, and the second derivative gives the cost of a motion. So
-the models describe the merits' smooth parts to the second order, and every sensitivity and every inverse limit is
-traced exactly.
+Where a camera is at its optimum the first derivative of a merit with respect to a motion vanishes, and the second
+derivative determines the loss. So the models describe smooth parts of the merits (such as the MTF at one field) to the
+second order, and every sensitivity and every inverse limit is traced exactly.
 """
 
 from __future__ import annotations
@@ -20,20 +20,20 @@ from twin.tolerance.tolerance_bench import AdjustedCameras, ToleranceBench
 MOST_PAIRED = 600
 """Largest number of varied parameters for which the second-order model has mixed derivatives.
 
-More of them would fill the memory.
+With more parameters the mixed derivatives would not fit in memory.
 """
 FARTHEST = 10.0
-"""Largest and, inverted, smallest ratio to its limit at which a tolerance is traced."""
+"""Largest ratio of a tolerance to its limit at which it is traced; its inverse is the smallest."""
 _MOST_TURNS = 40
-"""Largest number of iterations when the inverse limit of a tolerance is searched."""
+"""Largest number of iterations in the search for the inverse limit of a tolerance."""
 _GRID = 241
-"""Number of ratios to its limit, in geometric steps, at which the model of a tolerance is searched for a loss."""
+"""Number of ratios of a tolerance to its limit, in geometric steps, at which the model's loss is evaluated."""
 _CLOSE = 1e-4
-"""Relative accuracy, in the loss of a merit, with which an inverse limit is found."""
+"""Relative accuracy of the loss of a merit at a computed inverse limit."""
 _AT_ONCE = 8_000_000
-"""Largest number of elements of a product that are held in memory at a time."""
+"""Largest number of array elements that a matrix product holds in memory at a time."""
 _MOST_HELD, _FEWEST = 25_000_000, 500
-"""Largest number of elements of a scaled model in memory, and its smallest number of draws."""
+"""Largest number of array elements of a scaled model in memory, and smallest number of draws that it uses."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,7 +41,7 @@ class MeritModel:
     """Second-order model of the parts of the merits: parts = nominal + slope x + x curvature x / 2.
 
     x are the varied parameters in units of their sizes (the limit of a tolerance, the standard deviation of a figure
-    term); the compensators are adjusted ideally.
+    term); the compensators are adjusted ideally for each x.
 
     Array dimensions: P parts of the merits (smooth quantities, such as the MTF at one field), K varied parameters.
 
@@ -89,10 +89,9 @@ class MeritModel:
 
 @dataclass(frozen=True, eq=False)
 class ScaledModel:
-    """Second-order model at fixed random draws in which every tolerance can be scaled.
+    """Second-order model of the merits of S fixed random cameras, as a function of a scale factor of each tolerance.
 
-    Array dimensions: P parts of the merits (smooth quantities, such as the MTF at one field), S cameras (random draws),
-    E tolerances.
+    Array dimensions: P parts of the merits (smooth quantities, such as the MTF at one field), S cameras, E tolerances.
 
     Attributes
     ----------
@@ -110,16 +109,14 @@ class ScaledModel:
 
     @classmethod
     def of(cls, model: MeritModel, x: np.ndarray, entries: Sequence[Sequence[int]]) -> ScaledModel:
-        """Evaluate a model at random draws.
-
-        Array dimensions: S cameras (random draws), K varied parameters.
+        """Evaluate the contributions of each tolerance in a model at the random parameters of S cameras.
 
         Parameters
         ----------
         model : MeritModel
             Model in the varied parameters.
         x : (S, K) ndarray
-            Random parameters of each camera in units of their sizes; only as many cameras are used as fit in memory.
+            K random parameters of each camera in units of their sizes; only as many cameras are used as fit in memory.
         entries : sequence of sequence of int
             Indices of the parameters of each of E tolerances.
         """
@@ -143,11 +140,9 @@ class ScaledModel:
         return np.asarray(self.nominal + (self.first + self.second @ scales) @ scales)
 
     def slope(self, scales: np.ndarray, rows: np.ndarray) -> np.ndarray:
-        """Return the derivatives (W, P, E) of the parts of the merits with respect to the logarithms of the scales.
+        """Return the derivatives of the parts of the merits with respect to the logarithms of the scales, (W, P, E).
 
-        ``rows`` selects the cameras.
-
-        Array dimensions: W selected cameras, P parts of the merits (smooth quantities, such as the MTF at one field), E
+        ``rows`` selects W cameras; P parts of the merits (smooth quantities, such as the MTF at one field), E
         tolerances.
         """
         return np.asarray((self.first[rows] + 2.0 * (self.second[rows] @ scales)) * scales)
@@ -162,12 +157,12 @@ class Sensitivities:
     Attributes
     ----------
     nominal : (M,) ndarray
-        Merits of the nominal camera, adjusted, SI.
+        Merits of the nominal camera, adjusted, SI units.
     values : (E, 2, M) ndarray
-        Merits with each tolerance at its lower and upper limit, SI; for a figure error the average over its random
-        Zernike terms.
+        Merits with each tolerance at its lower and upper limit, SI units; for a figure error the average over its
+        random Zernike terms.
     moves : (E, 2, C) ndarray
-        Compensator moves with each tolerance at these limits, SI; NaN for a figure error.
+        Compensator moves with each tolerance at these limits, SI units; NaN for a figure error.
     problems : tuple of str
         Reason why no light reaches the image with a tolerance at its limits, (E,); empty where it does.
     model : MeritModel
@@ -182,9 +177,10 @@ class Sensitivities:
 
 
 def sensitivities(bench: ToleranceBench, advance: Advance = silent) -> Sensitivities:
-    """Trace every parameter at plus and minus its size and derive the second-order model of the merits.
+    """Trace every varied parameter at plus and minus its size and derive the second-order model of the merits.
 
-    Mixed second derivatives follow from the first derivatives of the wavefronts.
+    The size is the limit of a tolerance, or the standard deviation of a figure term. Mixed second derivatives follow
+    from the first derivatives of the wavefronts.
     """
     count = len(bench.numbers)
     x = np.concatenate([np.zeros((1, count)), np.eye(count), -np.eye(count)])
@@ -218,10 +214,21 @@ def sensitivities(bench: ToleranceBench, advance: Advance = silent) -> Sensitivi
 
 
 def _figure_error_parts(bench: ToleranceBench, model: MeritModel, rows: np.ndarray, share: np.ndarray) -> np.ndarray:
-    """Return the parts of the merits (L, P) that represent a figure error at L shares of its limit.
+    """Return the parts of the merits that represent a figure error at L fractions of its limit, (L, P).
 
     Parts that depend quadratically on the wavefront get their mean over the random Zernike terms, the others their rms.
     P counts the parts (smooth quantities, such as the MTF at one field).
+
+    Parameters
+    ----------
+    bench : ToleranceBench
+        Camera of the budget.
+    model : MeritModel
+        Second-order model of the merits.
+    rows : ndarray
+        Indices of the figure error's Zernike terms among the varied parameters.
+    share : (L,) ndarray
+        Fractions of the limit.
     """
     mean = 0.5 * np.outer(share**2, model.curvature[:, rows, rows].sum(axis=1))
     rms = np.outer(share, np.sqrt(np.sum(model.slope[:, rows] ** 2, axis=1)))
@@ -233,14 +240,16 @@ def _figure_error_parts(bench: ToleranceBench, model: MeritModel, rows: np.ndarr
 
 @dataclass(frozen=True, eq=False)
 class InverseLimits:
-    """Inverse limits: ratio to its limit at which each tolerance alone degrades each merit by the allowed loss.
+    """Inverse limits: size at which each tolerance alone causes each merit's allowed loss.
+
+    Sizes are relative to the tolerance's limit.
 
     Array dimensions: M merits, E tolerances.
 
     Attributes
     ----------
     losses : (M,) ndarray
-        Allowed loss of each merit, SI.
+        Allowed loss of each merit, SI units.
     shares : (E, M) ndarray
         Ratios to the limits; infinite where the loss is not reached at ``FARTHEST`` times the limit, NaN where no loss
         is defined.
@@ -251,12 +260,10 @@ class InverseLimits:
 
 
 def default_losses(bench: ToleranceBench, nominal: np.ndarray) -> np.ndarray:
-    """Return the loss by which one tolerance may degrade each merit, SI, (M,).
+    """Return the loss by which one tolerance may degrade each of M merits, SI units, (M,).
 
-    The loss is the one specified in the file, or the margin between the nominal camera and the requirement over the
-    square root of the number of tolerances; NaN where there is no margin.
-
-    Array dimensions: M merits.
+    The loss is the one specified in the file, or else the margin between the nominal camera and the requirement divided
+    by the square root of the number of tolerances; NaN where there is no margin.
     """
     share = 1.0 / np.sqrt(len(bench.entries))
     out = []
@@ -268,7 +275,7 @@ def default_losses(bench: ToleranceBench, nominal: np.ndarray) -> np.ndarray:
 
 
 def inverse_limits(bench: ToleranceBench, sensitivity: Sensitivities, advance: Advance = silent) -> InverseLimits:
-    """Find the size of each tolerance that alone causes each merit's loss, by exact traces of both signs.
+    """Find the size of each tolerance that alone causes each merit's allowed loss, by exact traces of both signs.
 
     For figure errors the second-order model is used instead of traces.
     """
@@ -301,7 +308,10 @@ def inverse_limits(bench: ToleranceBench, sensitivity: Sensitivities, advance: A
 
 
 def _loss(bench: ToleranceBench, sensitivity: Sensitivities, values: np.ndarray, m: int) -> np.ndarray:
-    """Return by how much a merit's values are worse than the nominal camera's, SI; infinite where the light is lost."""
+    """Return by how much values of merit number ``m`` are worse than the nominal camera's, SI units.
+
+    The loss is infinite where the light is lost.
+    """
     loss = bench.merits[m].worse(values, sensitivity.nominal[m])
     return np.asarray(np.where(np.isnan(loss), np.inf, loss))
 
@@ -311,7 +321,7 @@ def _model_ratio(
 ) -> float:
     """Return the ratio to its limit at which a tolerance causes a merit's loss in the model, at most ``FARTHEST``.
 
-    Infinite if the loss is not reached.
+    The result is infinite if the loss is not reached.
     """
     if not losses[m] > 0.0:
         return np.nan
@@ -328,12 +338,10 @@ def _model_ratio(
 
 
 def _roots(excess: Callable[[np.ndarray, np.ndarray], np.ndarray], start: np.ndarray, advance: Advance) -> np.ndarray:
-    """Find the zeros of increasing functions from individual starting levels; infinite beyond ``FARTHEST``.
+    """Find the zeros of R increasing functions from individual starting levels; infinite beyond ``FARTHEST``.
 
     Steps grow threefold until two levels bracket the zero; then the method of false position (Illinois variant)
     converges.
-
-    Array dimensions: R functions.
 
     Parameters
     ----------

@@ -1,10 +1,10 @@
-"""Merits of a camera out of tolerance: smooth parts, obstruction of beams, and variances of the monitor.
+"""Merits of a camera out of tolerance: smooth parts, obstruction of beams, and variances of the monitor's estimates.
 
 **Monitor.** Everything is linear about the instrument as it is built and adjusted: the disturbances of the prior move
 spots and cameras by the derivatives of that state, and the images before and after have the noise of that state. So the
-sigma is that of ``twin.uncertainty`` for that instrument. The gain of the posterior estimator is that of the instrument
-as built; other estimators use the gain of the nominal instrument. The area CCDs have been set to their spots when it
-was built.
+sigma is that of ``twin.uncertainty`` for that instrument. The gain of the posterior estimator, its linear map from spot
+shifts to camera parameters, is that of the instrument as built; other estimators use the gain of the nominal
+instrument. The area CCDs are assumed to have been centred on their spots when the instrument was built.
 
 The derivatives change by about 1e-4 within tolerances. The change due to each tolerance and each adjustment is traced
 once, and changes of several are added. The terms of a whole figure error are omitted: 10 nm of a term change the
@@ -12,7 +12,7 @@ derivatives by less than 1e-5. The noise of every camera is that of its own imag
 ``MonitorMerit.interpolation_errors`` gives the resulting error of the sigmas.
 
 **Obstruction.** Prisms, housings, baffles and parts of other cameras block part of the beams of a camera, each where
-the state puts it. The camera's own mirrors belong to its prescription.
+the state puts it. The camera's own mirrors belong to its prescription, which models their obstruction.
 """
 
 from __future__ import annotations
@@ -46,15 +46,15 @@ from twin.tolerance.variations import VariedParameter, states_of
 ROTATIONS = ("d_alpha", "d_beta", "d_gamma")
 """Keys of the three rotations of a camera's line of sight."""
 STEP = 0.1
-"""Step of the numerical derivatives with respect to compensators, as a share of their range."""
+"""Step of the numerical derivatives with respect to a compensator, as a fraction of its range."""
 
 
 @dataclass(frozen=True, eq=False)
 class MonitorMerit:
-    """Monitor of the instrument of a budget, with the merits that are standard deviations of its readings.
+    """Monitor of the instrument of a budget, with the merits that are standard deviations of its estimates.
 
     Array dimensions: D spot coordinates, K varied parameters and compensators, M independent motions, J cameras with 4
-    parameters each, Q readings.
+    parameters each, Q estimated quantities.
 
     Attributes
     ----------
@@ -69,11 +69,11 @@ class MonitorMerit:
     noise : (D, D) ndarray
         Covariance of the nominal instrument's spot shifts due to image noise, px^2.
     changes : tuple of ndarray
-        Changes of the derivatives of spots (K, D, M) and camera parameters (K, 4 J, M), with respect to the independent
-        motions, per SI unit of each varied parameter and compensator.
+        Changes, per SI unit of each varied parameter and compensator, of the derivatives of spots (K, D, M) and camera
+        parameters (K, 4 J, M) with respect to the independent motions.
     asked : dict
-        Name of a merit -> matrix (Q, 4 J) from camera parameters to its readings, and the matrix from spot shifts to
-        camera parameters of its estimator; None for the posterior estimator.
+        Name of a merit -> matrix (Q, 4 J) from camera parameters to its quantities, and the matrix of its estimator
+        from spot shifts to camera parameters; None for the posterior estimator.
     """
 
     experiment: MonitorExperiment
@@ -95,8 +95,6 @@ class MonitorMerit:
     ) -> MonitorMerit | None:
         """Return the monitor of a budget; None if no merit is about a monitor.
 
-        Array dimensions: C compensators.
-
         Parameters
         ----------
         setup : ToleranceSetup
@@ -108,12 +106,12 @@ class MonitorMerit:
         numbers : sequence of VariedParameter
             K varied parameters, the compensators last.
         ranges : (C,) ndarray
-            Ranges of the compensators, SI.
+            Ranges of the C compensators, SI units.
 
         Raises
         ------
         InputError
-            The instrument has no monitor or no disturbances, or there is no such reading or estimator.
+            The instrument has no monitor or no disturbances, or there is no such quantity or estimator.
         """
         wanted = {name: merit for name, merit in setup.test.merits.items() if merit.kind in OF_MONITOR}
         if not wanted:
@@ -158,14 +156,12 @@ class MonitorMerit:
         return cls(experiment, path, images, stated, noise, (per_unit[0], per_unit[1]), asked)
 
     def variances(self, amounts: np.ndarray, states: Sequence[State]) -> dict[str, np.ndarray]:
-        """Return the variances (S, Q) of all readings of every merit, SI.
-
-        Array dimensions: Q readings, K varied parameters and compensators.
+        """Return name of each merit -> variances of its Q estimated quantities in S states, (S, Q), SI units squared.
 
         Parameters
         ----------
         amounts : (S, K) ndarray
-            Amounts of the varied parameters and the compensators, SI.
+            Amounts of the K varied parameters and compensators, SI units.
         states : sequence of State
             The S states that they add up to.
 
@@ -180,7 +176,7 @@ class MonitorMerit:
         return self._read(spots, parameters, noise)
 
     def exact(self, states: Sequence[State]) -> dict[str, np.ndarray]:
-        """Return the variances of all readings of every merit, with derivatives that are traced in every state."""
+        """Return the variances of every merit's estimates, with derivatives that are traced in every state."""
         motions = self.experiment.stated
         assert motions is not None
         known = self.experiment
@@ -190,12 +186,12 @@ class MonitorMerit:
         return self._read(changes[0] @ root, changes[1] @ root, self._noise(states))
 
     def interpolation_errors(self, amounts: np.ndarray, states: Sequence[State]) -> dict[str, float]:
-        """Return the largest relative error of each merit's sigma by interpolated instead of traced derivatives.
+        """Return merit -> largest relative error of its sigma due to interpolated instead of traced derivatives.
 
         Parameters
         ----------
         amounts : (S, K) ndarray
-            Amounts of K varied parameters and compensators in S states, SI.
+            Amounts of K varied parameters and compensators in S states, SI units.
         states : sequence of State
             The S states that they add up to.
         """
@@ -221,7 +217,9 @@ class MonitorMerit:
         return out
 
     def _read(self, spots: np.ndarray, parameters: np.ndarray, noise: np.ndarray) -> dict[str, np.ndarray]:
-        """Return the variances of all readings of every merit, SI, from the derivatives and noise of given states.
+        """Return the variances of every merit's estimates from the derivatives and noise of given states.
+
+        They are in SI units squared.
 
         Parameters
         ----------
@@ -258,7 +256,10 @@ def _require_monitor(setup: ToleranceSetup, experiment: MonitorExperiment, name:
 
 
 def readings_of(merit: MeritSpec, cameras: Sequence[str]) -> tuple[str, ...]:
-    """Return the readings of which a merit takes the worst: ``angle``, or such as ``d_alpha`` of one camera."""
+    """Return the estimated quantities of which a merit takes the worst.
+
+    The quantity is ``angle`` (between two cameras), or such as ``d_alpha`` of one camera.
+    """
     if merit.kind == "monitor_focus":
         return ("d_f",)
     if merit.reading is None:
@@ -269,7 +270,7 @@ def readings_of(merit: MeritSpec, cameras: Sequence[str]) -> tuple[str, ...]:
 def _readings(
     setup: ToleranceSetup, experiment: MonitorExperiment, name: str, merit: MeritSpec, camera: str
 ) -> list[str]:
-    """Return the names of a merit's readings in ``quantity_rows``; raise InputError where there is no angle."""
+    """Return the names of a merit's quantities in ``quantity_rows``; raise InputError if there is no angle."""
     cameras = tuple(experiment.instrument.cameras)
     if merit.reading == "angle" and len(cameras) != 2:
         wrong = f"an angle is between the lines of sight of two cameras, and there are {len(cameras)}"
@@ -279,13 +280,11 @@ def _readings(
 
 @dataclass(frozen=True, eq=False)
 class Merit:
-    """Merit of a tolerance budget.
+    """Merit of a tolerance budget: a quantity of the camera for which the budget has a requirement.
 
     The **parts** of a merit change smoothly with small motions; its value, as the worst of several fields, does not.
     Parts are mean square wavefront errors by field, MTF by field and direction, components of a rotation, residual
-    positions along the line, obstructed shares of a beam by field, or variances of readings.
-
-    Array dimensions: F fields.
+    positions along the line, obstructed fractions of a beam by field, or variances of the monitor's estimates.
 
     Attributes
     ----------
@@ -294,7 +293,7 @@ class Merit:
     spec : MeritSpec
         Kind, fields and requirement.
     fields : (F,) ndarray of int
-        Indices of its fields among all fields of the budget.
+        Indices of its F fields among all fields of the budget.
     parts : slice
         Columns of this merit in the array of the parts of all merits.
     """
@@ -305,9 +304,9 @@ class Merit:
     parts: slice
 
     def values(self, parts: np.ndarray) -> np.ndarray:
-        """Return the value of this merit, SI, from the parts of all merits, the last axis of ``parts``.
+        """Return the value of this merit, SI units, from the parts of all merits, the last axis of ``parts``.
 
-        A change counts by its absolute value; of several parts the worst counts.
+        For a change its absolute value counts; of several parts the worst counts.
         """
         selected = parts[..., self.parts]
         match self.spec.kind:
@@ -325,29 +324,32 @@ class Merit:
                 return np.asarray(np.max(np.abs(selected), axis=-1))
 
     def passes(self, values: np.ndarray) -> np.ndarray:
-        """Return True where values of the merit, SI, meet the requirement; NaN does not."""
+        """Return True where values of the merit, SI units, meet the requirement; NaN does not."""
         if self.spec.more_is_better:
             return np.asarray(values >= self.spec.requirement)
         return np.asarray(values <= self.spec.requirement)
 
     def margin(self, values: np.ndarray) -> np.ndarray:
-        """Return how far values of the merit exceed the requirement, relative to it; negative where they meet it."""
+        """Return the excess of values of the merit over the requirement, relative to it.
+
+        It is negative where they meet the requirement.
+        """
         ratio = values / self.spec.requirement
         return np.asarray(1.0 - ratio if self.spec.more_is_better else ratio - 1.0)
 
     def worse(self, values: np.ndarray, than: float | np.ndarray) -> np.ndarray:
-        """Return by how much values of the merit are worse than a reference value, SI."""
+        """Return by how much values of the merit are worse than the reference value ``than``, SI units."""
         return np.asarray(than - values if self.spec.more_is_better else values - than)
 
 
 PART_COUNTS = {"boresight": 2, "roll": 1, "principal_distance": 1}
-"""Number of parts (smooth quantities) of those kinds of merits for which it does not depend on fields."""
+"""Kind of merit -> number of its parts (smooth quantities), for kinds whose number does not depend on fields."""
 AT_FIELDS = ("wavefront", "mtf", "chief_ray", "obstruction")
 """Kinds of merits that are evaluated at several fields of a camera."""
 
 
 def part_count(spec: MeritSpec, line_points: int, cameras: Sequence[str] = ()) -> int:
-    """Return the number of parts of a merit, smooth quantities such as the MTF at one field."""
+    """Return the number of parts of a merit; parts are smooth quantities such as the MTF at one field."""
     match spec.kind:
         case "monitor_angle" | "monitor_focus":
             return len(readings_of(spec, cameras))
@@ -366,9 +368,7 @@ def part_count(spec: MeritSpec, line_points: int, cameras: Sequence[str] = ()) -
 def merits_of(
     specs: dict[str, MeritSpec], line_points: int, cameras: Sequence[str] = ()
 ) -> tuple[tuple[Merit, ...], np.ndarray]:
-    """Return the merits of a budget and all fields (F, 2) that they use.
-
-    Array dimensions: F fields.
+    """Return the merits of a budget and all F fields that they use, (F, 2).
 
     Parameters
     ----------
@@ -391,7 +391,7 @@ def merits_of(
 
 
 def shown_merit(value: float, merit: Merit) -> float | None:
-    """Return a value in the unit in which the merit is reported; None if it is not finite."""
+    """Return a merit's value, given in SI units, in the unit in which it is reported; None if it is not finite."""
     return float(value / merit_unit(merit)[1]) if np.isfinite(value) else None
 
 
@@ -410,15 +410,15 @@ def merit_unit(merit: Merit) -> tuple[str, float]:
 
 
 KIND = "obstruction"
-"""Kind of the merit that is the obstructed share of a beam."""
+"""Kind of the merit that is the obstructed fraction of a beam."""
 RINGS = 7
-"""Number of rings of rays over the stop by which an obstructed share is computed, as for image quality."""
+"""Number of rings of rays over the stop with which an obstructed fraction is computed, as for image quality."""
 AT_ONCE = 40
-"""Number of states traced in one launch, to bound memory."""
+"""Number of states traced in one launch, to limit memory."""
 
 
 def require_bodies(setup: ToleranceSetup, path: TargetPath) -> None:
-    """Raise InputError if a budget asks for an obstruction and no body can block the beams of the camera."""
+    """Raise InputError if a budget has a merit about obstruction although no body can block the camera's beams."""
     for name, merit in setup.test.merits.items():
         if merit.kind == KIND and (path.shadows is None or not path.shadows.casters):
             problem = f"no body of {setup.base.instrument.name} can block the beams of {path.name}"
@@ -429,9 +429,7 @@ def require_bodies(setup: ToleranceSetup, path: TargetPath) -> None:
 def obstructed_shares(
     path: TargetPath, states: Sequence[State], directions: np.ndarray, start: np.ndarray
 ) -> np.ndarray:
-    """Return the share of the stop's area that all bodies together block in every beam, (S, F).
-
-    Array dimensions: F fields.
+    """Return the fraction of the stop's area that all bodies together block in every beam, (S, F).
 
     Parameters
     ----------
@@ -440,7 +438,7 @@ def obstructed_shares(
     states : sequence of State
         S states.
     directions : (F, 3) ndarray
-        Directions of the light in the world frame.
+        Directions of the light of F fields in the world frame.
     start : (F, 3) ndarray
         A point of each beam before the first mirror, world frame, metres.
 

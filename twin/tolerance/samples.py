@@ -1,4 +1,7 @@
-"""Monte Carlo cameras of a tolerance budget, drawn by the engine of studies on all cores."""
+"""Monte Carlo cameras of a tolerance budget: random cameras within the tolerances, computed on all cores.
+
+They are computed as the runs of a study (``twin.study``).
+"""
 
 from __future__ import annotations
 
@@ -26,13 +29,13 @@ from twin.study.runs.setup import StudySetup
 from twin.tolerance.tolerance_bench import ToleranceBench
 
 KIND = "tolerance"
-"""Name of the base command in the study that draws the cameras."""
+"""Name of the base command in the study that computes the random cameras."""
 DRAWS = "draws"
 """Key of the random parameters of the cameras in the study's input data."""
 
 
 class ToleranceBase:
-    """Base job of the study that draws cameras; it computes merits and compensator moves of every camera."""
+    """Base job of the study of random cameras; it computes merits and compensator moves of every camera."""
 
     model: type[Spec] = ToleranceSetup
     block = AT_ONCE
@@ -49,7 +52,7 @@ class ToleranceBase:
         self._bench(tree, backend)
 
     def evaluate(self, tree: Tree, runs: Sequence[Run], backend: Backend) -> list[Outcome]:
-        """Return merits and compensator moves of every run, or the reason why a camera has no light."""
+        """Return merits and compensator moves of every random camera, or the reason why it has no light."""
         out: list[Outcome] = [Failure("not done")] * len(runs)
         groups: dict[str, list[int]] = {}
         others: dict[str, tuple[Any, ...]] = {}
@@ -78,7 +81,7 @@ class ToleranceBase:
         return outcomes(bench, x, seeds)
 
     def _bench(self, tree: Tree, backend: Backend) -> ToleranceBench:
-        """Return the camera of a budget given as plain data, kept between blocks of runs with the same data."""
+        """Return the nominal camera of a budget given as plain data; it is kept between blocks with the same data."""
         known = self._benches.get(id(tree))
         if known is None or known[0] is not tree:
             setup = validate(ToleranceSetup, YamlFile("", tree, {}))
@@ -89,14 +92,13 @@ class ToleranceBase:
 def outcomes(bench: ToleranceBench, x: np.ndarray, seeds: Sequence[int]) -> list[Outcome]:
     """Trace and adjust cameras and return their merits and compensator moves.
 
-    Array dimensions: K varied parameters.
-
     Parameters
     ----------
     bench : ToleranceBench
         Camera of the budget with its varied parameters, compensators and merits.
     x : (S, K) ndarray
-        Varied parameters in units of their sizes.
+        K varied parameters of S cameras in units of their sizes (the limit of a tolerance, the standard deviation of a
+        figure term).
     seeds : sequence of int
         Seeds of the adjustment errors of the S cameras.
     """
@@ -120,7 +122,7 @@ def outcomes(bench: ToleranceBench, x: np.ndarray, seeds: Sequence[int]) -> list
 
 
 def adjustment_errors(bench: ToleranceBench, seeds: Sequence[int]) -> np.ndarray | None:
-    """Return errors of the compensator moves in standard deviations, (S, C); None for exact moves.
+    """Return random errors of the compensator moves in standard deviations, (S, C); None for exact moves.
 
     Array dimensions: S cameras, C compensators.
     """
@@ -143,7 +145,7 @@ def distribution_of(tolerance: ToleranceSpec) -> dict[str, Any]:
 
 
 def sampling_study(setup: ToleranceSetup, bench: ToleranceBench, samples: int, seed: int) -> StudySetup:
-    """Return the study that draws cameras of a budget.
+    """Return the study that computes random cameras of a budget.
 
     Parameters
     ----------
@@ -154,7 +156,7 @@ def sampling_study(setup: ToleranceSetup, bench: ToleranceBench, samples: int, s
     samples : int
         Number of cameras.
     seed : int
-        Seed of the random draws.
+        Seed of the random numbers.
     """
     test = setup.test
     factors: dict[str, Any] = {}
@@ -183,18 +185,18 @@ def sampling_study(setup: ToleranceSetup, bench: ToleranceBench, samples: int, s
 
 @dataclass(frozen=True, eq=False)
 class Samples:
-    """Monte Carlo cameras of a budget.
+    """Monte Carlo cameras of a budget with their merits and compensator moves.
 
     Array dimensions: S cameras, K varied parameters, M merits, C compensators.
 
     Attributes
     ----------
     x : (S, K) ndarray
-        Varied parameters in units of their sizes.
+        Varied parameters in units of their sizes (the limit of a tolerance, the standard deviation of a figure term).
     values : (S, M) ndarray
-        Merits, SI; NaN for a camera without light.
+        Merits, SI units; NaN for a camera without light.
     moves : (S, C) ndarray
-        Moves of the compensators, SI.
+        Moves of the compensators, SI units.
     settled : (S,) ndarray
         Change of the rms wavefront error by a further step of the adjustments, waves; it shows convergence.
     seeds : (S,) ndarray of int
@@ -216,7 +218,7 @@ class Samples:
 
 @dataclass(frozen=True)
 class Workforce:
-    """Processes that trace the cameras.
+    """Processes that trace the random cameras.
 
     Attributes
     ----------
@@ -225,8 +227,8 @@ class Workforce:
     scheduler : str or None
         Address of a running Dask cluster; None for local processes.
     journal : Path or None
-        Folder of the journal of finished work, from which a run can be resumed; None for no journal, in this process
-        alone.
+        Folder of the journal of finished work, from which a run can be resumed; None to compute without a journal in
+        this process alone.
     warn : callable
         Function that receives warnings about the computation.
     """
@@ -247,7 +249,7 @@ def draw_samples(
     part: str = "samples",
     advance: Advance = silent,
 ) -> Samples:
-    """Draw cameras and trace them; the results do not depend on the number of workers.
+    """Generate random cameras and trace them; the results do not depend on the number of workers.
 
     Parameters
     ----------
@@ -260,11 +262,11 @@ def draw_samples(
     samples : int
         Number of cameras.
     seed : int
-        Seed of the random draws.
+        Seed of the random numbers.
     force : Workforce
         Processes that trace the cameras.
     part : str
-        Name of this part of the work, for the journal and the progress.
+        Name of this stage of the work, for the journal and the progress.
     advance : Advance
         Callback that reports progress.
 

@@ -36,10 +36,10 @@ from twin.tolerance.variations import VariedParameter, compensator_parameters, s
 
 
 def residual_change(slopes: np.ndarray, change: np.ndarray) -> np.ndarray:
-    """Return the linear change (S, R) of the wavefront residuals due to a change of the compensator moves (S, C).
+    """Return the linear change of the wavefront residuals due to a change of the compensator moves, (S, R).
 
-    ``slopes`` (S, R, C) are the derivatives of the residuals with respect to the moves. Array dimensions: S cameras, R
-    residuals, C compensators.
+    ``change`` (S, C) is the change of the moves and ``slopes`` (S, R, C) are the derivatives of the residuals with
+    respect to them, for S cameras, R residuals and C compensators.
     """
     return np.asarray((slopes @ change[..., None])[..., 0])
 
@@ -53,11 +53,11 @@ class Adjustments:
     Attributes
     ----------
     ranges : (C,) ndarray
-        Largest moves in either direction, SI; zero fixes a compensator.
+        Largest moves in either direction, SI units; zero fixes a compensator.
     steps : (C,) ndarray
-        Step sizes of the moves, SI; 0 for continuous moves.
+        Step sizes of the moves, SI units; 0 for continuous moves.
     accuracies : (C,) ndarray
-        Standard deviations of the moves, SI.
+        Standard deviations of the moves, SI units.
     slope : (R, C) ndarray
         Derivatives of the nominal camera's residuals with respect to the moves, waves per SI unit; 0 where the range is
         zero.
@@ -80,14 +80,14 @@ class Adjustments:
         residuals : (S, R) ndarray
             Wavefront residuals at the current moves, waves.
         moves : (S, C) ndarray
-            Current moves, SI.
+            Current moves, SI units.
         free : (C,) ndarray of bool
             True for the compensators that may move.
 
         Returns
         -------
         (S, C) ndarray
-            Moves, SI.
+            Moves, SI units.
         """
         size = np.where(self.ranges > 0.0, self.ranges, 1.0)
         slope = slopes * size
@@ -113,7 +113,7 @@ class Adjustments:
         return np.asarray(target * size)
 
     def corrected(self, slopes: np.ndarray, change: np.ndarray, miss: np.ndarray) -> np.ndarray:
-        """Return the derivatives of the residuals (S, R, C) after Broyden's rank-one update by the outcome of a step.
+        """Return the residuals' derivatives (S, R, C) after Broyden's rank-one update with the outcome of a step.
 
         Array dimensions: S cameras, R residuals, C compensators.
 
@@ -122,7 +122,7 @@ class Adjustments:
         slopes : (S, R, C) ndarray
             Derivatives of the residuals with respect to the moves before the step, waves per SI unit.
         change : (S, C) ndarray
-            Change of the moves, SI.
+            Change of the moves, SI units.
         miss : (S, R) ndarray
             Residuals after the step minus those predicted by the derivatives, waves.
         """
@@ -134,13 +134,13 @@ class Adjustments:
 
     @property
     def exact(self) -> bool:
-        """True if moves are executed without steps and errors."""
+        """True if the compensators move continuously and without errors."""
         return not np.any((self.steps > 0.0) | (self.accuracies > 0.0))
 
     def made(self, slopes: np.ndarray, residuals: np.ndarray, moves: np.ndarray, errors: np.ndarray) -> np.ndarray:
         """Return the moves as executed one after the other, in whole steps and with errors.
 
-        The later ones compensate the errors of the earlier.
+        Each move compensates the errors of those before it.
 
         Array dimensions: S cameras, R residuals, C compensators.
 
@@ -151,7 +151,7 @@ class Adjustments:
         residuals : (S, R) ndarray
             Wavefront residuals at ``moves``, waves.
         moves : (S, C) ndarray
-            Ideal moves, SI.
+            Ideal moves, SI units.
         errors : (S, C) ndarray
             Errors of the executed moves, in standard deviations.
         """
@@ -172,18 +172,17 @@ class Adjustments:
 
 
 SETTLED = 1e-3
-"""Rms wavefront error, waves, that a further step of the adjustments may still change in a camera that counts as
-converged.
+"""Largest change of a camera's rms wavefront error by a further adjustment step, waves, for it to count as converged.
 """
 MOST_STEPS = 12
-"""Largest number of steps of the adjustments, three times as many as any camera of the library has needed."""
+"""Largest number of iterations of a camera's adjustments, three times as many as any library camera has needed."""
 
 FIRST_RULE, LARGEST_RULE = 3, 17
-"""Wavelengths of the first and of the last rule over a spectrum."""
+"""Numbers of wavelengths of the first and of the largest quadrature rule over a spectrum that is tried."""
 EVERY = 4
-"""Spacing, in points of the line, of those at which distortion is evaluated."""
+"""Distortion is evaluated at every ``EVERY``-th of the points along the line."""
 _MOVE = 1e-3
-"""Step of the numerical derivatives with respect to compensators, as a share of their range."""
+"""Step of the numerical derivatives with respect to a compensator, as a fraction of its range."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -196,13 +195,13 @@ class AdjustedCameras:
     Attributes
     ----------
     moves : (S, C) ndarray
-        Compensator moves, SI.
+        Compensator moves, SI units.
     parts : (S, P) ndarray
-        Parts of all merits (smooth quantities); NaN where the light is lost.
+        Parts of all merits; NaN where the light is lost.
     problems : tuple of str
         Reason why the light is lost, (S,); empty where it is not.
     settled : (S,) ndarray
-        Change of the rms wavefront error by a further step of the adjustments, waves.
+        Change of the rms wavefront error by a further step of the adjustments, waves; it shows convergence.
     paths : (S, F, K N) ndarray or None
         Optical paths of the beams' rays minus those of the chief rays, for all traced wavelengths, metres; None if not
         requested.
@@ -216,7 +215,7 @@ class AdjustedCameras:
 
     @classmethod
     def joined(cls, results: Sequence[AdjustedCameras]) -> AdjustedCameras:
-        """Return the results of several groups of cameras concatenated in order."""
+        """Return the results of several groups of perturbed cameras, concatenated in order."""
         paths = [result.paths for result in results if result.paths is not None]
         return cls(
             np.concatenate([result.moves for result in results]),
@@ -228,9 +227,9 @@ class AdjustedCameras:
 
 
 class ToleranceBench:
-    """Camera with its varied parameters, compensators and merits.
+    """Nominal camera of a tolerance budget, with its varied parameters, compensators and merits.
 
-    Array dimensions: F fields, C wavelengths.
+    It traces and adjusts perturbed cameras. Array dimensions: F fields, C wavelengths.
 
     Parameters
     ----------
@@ -294,7 +293,7 @@ class ToleranceBench:
 
     @property
     def figure_faces(self) -> dict[str, Element]:
-        """Surface of each tolerance that is a figure error, by the tolerance's name."""
+        """Name of each tolerance that is a figure error -> its surface."""
         bodies = {number.entry: next(iter(number.moves)) for number in self.numbers if number.kind == SPECTRUM}
         return {name: self.instrument.assembly.face(body) for name, body in bodies.items()}
 
@@ -307,7 +306,7 @@ class ToleranceBench:
         return test.camera or names[0]
 
     def _adjusts_before_stop(self) -> bool:
-        """Return True if adjustments move the light at the stop, so that rays have to be aimed again."""
+        """Return True if adjustments change the light before the stop, so that rays must be aimed at the stop again."""
         path = self.optics.path
         chain = [path.assembly.elements[name] for name in path.assembly.sequences[f"{path.name}/to_stop"]]
         bodies = {body for element in chain for body in (element.body, element.solid) if body is not None}
@@ -341,9 +340,7 @@ class ToleranceBench:
         return np.concatenate([np.sqrt(squares), mtfs])
 
     def _prepare_in(self, colours: np.ndarray, shares: np.ndarray) -> None:
-        """Compute what all cameras share, for given wavelengths.
-
-        Array dimensions: C wavelengths.
+        """Compute the data that all perturbed cameras share, for C wavelengths.
 
         Parameters
         ----------
@@ -374,11 +371,9 @@ class ToleranceBench:
         self._adjust = Adjustments(self.ranges, self.grid_steps, self.accuracies, self._adjustment_slope())
 
     def _adjustment_slope(self) -> np.ndarray:
-        """Return the derivatives (R, C) of the residuals with respect to the compensators, waves per SI unit.
+        """Return the derivatives of R wavefront residuals with respect to C compensators, (R, C), waves per SI unit.
 
-        They are 0 where the range is zero.
-
-        Array dimensions: R residuals, C compensators.
+        They are 0 where a compensator's range is zero.
         """
         used = np.flatnonzero(self.ranges)
         slope = np.zeros((self._residuals(self.beams.designed.paths).shape[1], len(self.ranges)))
@@ -394,11 +389,9 @@ class ToleranceBench:
         return slope
 
     def _residuals(self, paths: np.ndarray) -> np.ndarray:
-        """Return residuals (S, R) whose squares sum to the mean square wavefront errors of all fields.
+        """Return residuals whose squares sum to the mean square wavefront errors of all fields, (S, R), in waves.
 
-        They are in waves of the design wavelength.
-
-        Array dimensions: S cameras, R residuals.
+        The unit is the design wavelength. Array dimensions: S cameras, R residuals.
         """
         terms = paths.reshape(len(paths), len(self.fields), len(self.traced_shares), -1) @ self.beams.solve.T
         return self._roots.residuals(terms / self.wavelength, self.traced_shares)
@@ -408,17 +401,17 @@ class ToleranceBench:
     def adjust_cameras(
         self, amounts: np.ndarray, errors: np.ndarray | None = None, paths: bool = False
     ) -> AdjustedCameras:
-        """Trace perturbed cameras, adjust them, and compute their merits.
+        """Trace perturbed cameras, adjust them with the compensators, and compute their merits.
 
         Array dimensions: S cameras, K varied parameters, C compensators.
 
         Parameters
         ----------
         amounts : (S, K) ndarray
-            Amounts of the varied parameters, SI.
+            Amounts of the varied parameters, SI units.
         errors : (S, C) ndarray, optional
             Errors of the compensator moves in standard deviations. With them each compensator moves by whole steps with
-            its error, in order, and the later ones compensate the earlier. None for the ideal adjustment.
+            its error, in order, and each move compensates the errors of those before it. None for the ideal adjustment.
         paths : bool
             True to return the optical paths of the rays as well.
 
@@ -464,7 +457,10 @@ class ToleranceBench:
         light = self.beams.light(states)
 
         def again(moved: Sequence[State], rows: np.ndarray) -> BeamLight:
-            """Trace adjusted cameras; rays keep their starting points unless an adjustment moves the stop's beam."""
+            """Trace cameras once more after an adjustment.
+
+            Rays keep their starting points unless the adjustment moves the beam at the stop.
+            """
             return self.beams.light(moved, None if self._moves_stop else light.aimed[rows])
 
         if np.any(self.ranges > 0.0):
@@ -538,13 +534,14 @@ class ToleranceBench:
         return np.concatenate(out, axis=1) if out else np.zeros((count, 0))
 
     def pair_curvature(self, slopes: np.ndarray) -> np.ndarray:
-        """Return the second derivatives (P, K, K) of the parts that follow from first derivatives of the wavefronts.
+        """Return the second derivatives of the merits' parts that follow from the wavefronts' first derivatives.
 
-        Mean squares and MTFs are quadratic in a wavefront that itself is nearly linear in the parameters. Parts that
-        are no function of a wavefront get 0.
+        They are a (P, K, K) array.
 
-        Array dimensions: P parts of the merits (smooth quantities, such as the MTF at one field), K varied parameters,
-        F fields, C wavelengths, N rays.
+        Parts are smooth quantities, such as the MTF at one field. Mean squares and MTFs are quadratic in a wavefront
+        that itself is nearly linear in the parameters. Parts that are no function of a wavefront get 0.
+
+        Array dimensions: P parts, K varied parameters, F fields, C wavelengths, N rays.
 
         Parameters
         ----------
@@ -604,7 +601,10 @@ class ToleranceBench:
         return out
 
     def _change(self, merit: Merit, line: dict[str, np.ndarray], light: BeamLight | None) -> np.ndarray:
-        """Return the parts of a merit that is a change from the nominal camera, of the line of sight or chief rays."""
+        """Return the parts of a merit that is a change of the line of sight or of chief rays.
+
+        The change is that from the nominal camera.
+        """
         if merit.spec.kind != "chief_ray":
             return line[merit.spec.kind]
         assert light is not None
@@ -623,7 +623,7 @@ class ToleranceBench:
         )
 
     def _line(self, states: Sequence[State]) -> dict[str, np.ndarray]:
-        """Return the parts of the merits about the image line (boresight, roll, distortion, ...), by kind."""
+        """Return the parts of the merits about the camera's image line (boresight, roll, distortion, ...), by kind."""
         if not self._wanted & {"boresight", "roll", "principal_distance", "distortion"}:
             return {}
         sight, axes = self.experiment.sight, self.experiment.sight.axes[self.camera]
@@ -648,10 +648,7 @@ class ToleranceBench:
         return np.arange(0, LINE_POINTS, EVERY)
 
     def scaled(self, scales: np.ndarray) -> ToleranceBench:
-        """Return the same budget and camera with every limit multiplied by its entry of ``scales`` (E,).
-
-        Array dimensions: E tolerances.
-        """
+        """Return the same budget and camera with the limit of each of E tolerances multiplied by ``scales`` (E,)."""
         other = copy(self)
         by_entry = dict(zip(self.entries, scales.tolist(), strict=True))
         other.numbers = tuple(replace(number, size=number.size * by_entry[number.entry]) for number in self.numbers)
@@ -660,7 +657,7 @@ class ToleranceBench:
 
     @cached_property
     def entries(self) -> dict[str, tuple[int, ...]]:
-        """Indices of the varied parameters of each tolerance, by its name."""
+        """Tolerance -> indices of its varied parameters, of which a figure error has one for each Zernike term."""
         out: dict[str, tuple[int, ...]] = {}
         for k, number in enumerate(self.numbers):
             out[number.entry] = (*out.get(number.entry, ()), k)
@@ -668,9 +665,9 @@ class ToleranceBench:
 
     @cached_property
     def sizes(self) -> np.ndarray:
-        """SI amount of one unit of every varied parameter, (K,).
+        """SI amount of one unit of each of the K varied parameters, (K,).
 
-        Array dimensions: K varied parameters.
+        The unit is the limit of a tolerance, or the standard deviation of a figure term.
         """
         return np.array([number.size for number in self.numbers])
 
@@ -682,11 +679,9 @@ class ToleranceBench:
         return np.stack([merit.values(parts) for merit in self.merits], axis=-1)
 
     def worst_margins(self, values: np.ndarray) -> np.ndarray:
-        """Return the worst margin of each camera, (S,), from merits (S, M); infinite without light.
+        """Return the worst margin of each of S cameras, (S,), from M merits, (S, M); infinite without light.
 
-        A margin is the excess over the requirement in units of it, negative where it is met.
-
-        Array dimensions: S cameras, M merits.
+        A margin is the excess of a merit over its requirement, relative to the requirement; negative where it is met.
         """
         margins = np.stack([merit.margin(values[:, k]) for k, merit in enumerate(self.merits)])
         return np.asarray(np.where(np.isnan(margins), np.inf, margins).max(axis=0))

@@ -1,4 +1,8 @@
-"""Report of a tolerance budget: yield, shares of variance, sensitivities, inverse limits and allocation."""
+"""Report of a tolerance budget: yield, contributions to variances, sensitivities, inverse limits and allocation.
+
+The yield is the fraction of cameras that meet all requirements. The inverse limit of a tolerance is the size at which
+it alone causes a merit's allowed loss.
+"""
 
 from __future__ import annotations
 
@@ -26,15 +30,15 @@ from twin.tolerance.tolerance_run import EXACT, LEVELS, MeritResult, ToleranceRu
 _FEW = 3
 """Number of tolerances that the verdict names."""
 _LITTLE = 0.01
-"""Share of the variance, in every merit, below which the report says that a tolerance may be loosened."""
+"""Fraction of the variance of every merit below which the report says that a tolerance may be loosened."""
 _MOST_CURVES = 6
 """Largest number of merits that are plotted."""
 _ROUNDING = 1e-7
-"""Share of a compensator's range below which a move is reported as zero."""
+"""Fraction of a compensator's range below which a move is reported as zero."""
 
 
 def tolerance_report(run: ToleranceRun) -> Report:
-    """Return the report of a budget: verdict, yield, sensitivities, inverse limits, variance shares and allocation."""
+    """Return the report of a budget: verdict, yield, sensitivities, inverse limits, variances and allocation."""
     test = run.setup.test
     with look("tolerance"):
         curves = to_svg(_yield_figure(run))
@@ -103,7 +107,7 @@ def tolerance_report(run: ToleranceRun) -> Report:
 
 
 def _light(run: ToleranceRun) -> str:
-    """Return the wavelengths of wavefronts and MTFs as text."""
+    """Return a text on the wavelengths at which wavefronts and MTFs are evaluated."""
     colours = 1e9 * run.bench.colours
     if len(colours) == 1:
         return f"{colours[0]:.4g} nm"
@@ -143,7 +147,10 @@ def _dear(run: ToleranceRun) -> str:
 
 
 def _importance(run: ToleranceRun) -> dict[str, float]:
-    """Return each tolerance's largest share of the variance of a merit, over the merits that not every camera meets."""
+    """Return tolerance -> the largest fraction of the variance of any merit that it causes.
+
+    Merits that every camera meets are left out.
+    """
     tight = [result for result in run.merits if result.passing.share < 1.0] or list(run.merits)
     return {name: max(result.shares[name] for result in tight) for name in run.bench.entries}
 
@@ -265,7 +272,7 @@ def _sensitivity_table(run: ToleranceRun) -> Table:
 
 
 def _number(limit: str | float) -> tuple[float, str]:
-    """Return number and unit of a limit in the form of the files; a pure number has an empty unit."""
+    """Return number and unit of a limit in the notation of the files; a pure number has an empty unit."""
     parts = split_quantity(limit)
     return (float(limit), "") if parts is None else (float(parts[0]), parts[1])
 
@@ -287,12 +294,12 @@ def _inverse_table(run: ToleranceRun) -> Table:
 
 
 def _unless_rounding(share: float) -> float:
-    """Return a share of a range, 0 where it is below the rounding of the adjustment."""
+    """Return a move as a fraction of the compensator's range, or 0 if it is below the rounding of the adjustment."""
     return 0.0 if abs(share) < _ROUNDING else share
 
 
 def _scaled_limit(limit: str | float, share: float) -> str:
-    """Return a multiple of a limit as text in the limit's unit."""
+    """Return ``share`` times a tolerance limit as text, in the limit's unit."""
     if isinstance(limit, str):
         number, _, unit = limit.strip().partition(" ")
         return f"{float(number) * share:.3g} {unit}"
@@ -414,7 +421,7 @@ def _monitor_sections(run: ToleranceRun) -> tuple[Section, ...]:
 
 
 def _yield_figure(run: ToleranceRun) -> Figure:
-    """Plot the cumulative share of cameras against the value of each merit."""
+    """Plot the cumulative fraction of cameras against the value of each merit."""
     shown = run.merits[:_MOST_CURVES]
     columns = min(3, len(shown))
     lines = -(-len(shown) // columns)
@@ -448,7 +455,7 @@ def _curve(ax: Axes, run: ToleranceRun, result: MeritResult) -> None:
 
 
 def _share_figure(run: ToleranceRun) -> Figure:
-    """Plot the shares of variance of the most important tolerances."""
+    """Plot the fractions of each merit's variance due to the most important tolerances."""
     worst = _importance(run)
     order = sorted(worst, key=lambda name: -worst[name])[:12][::-1]
     figure = new_figure(0.9 + 0.32 * len(order))

@@ -1,4 +1,8 @@
-"""Computation of a tolerance budget: sensitivities, inverse limits, yield and allocation."""
+"""Computation of a tolerance budget: sensitivities, inverse limits, yield and allocation.
+
+The yield is the fraction of random cameras that meet all requirements; the inverse limit of a tolerance is the size at
+which it alone causes a merit's allowed loss.
+"""
 
 from __future__ import annotations
 
@@ -30,28 +34,30 @@ from twin.tolerance.tolerance_bench import SETTLED, ToleranceBench
 from twin.tolerance.variations import states_of
 
 CONFIDENCE = 0.95
-"""Confidence level of the intervals of yields."""
+"""Confidence level of the intervals in which the true yields lie."""
 WORST = 10
-"""Number of the worst cameras that are written as jobs."""
+"""Number of the worst random cameras that are written as job files."""
 LEVELS = (0.5, 0.9, 0.95)
-"""Shares of cameras at which the quantiles of a merit are reported."""
+"""Fractions of cameras for which the quantiles of a merit are reported."""
 _MORE = 7919
 """Number added to the seed for the independent cameras that validate an allocation."""
 _NOTHING = 1e-15
-"""Size of a motion, in metres or radians, below which it is rounding error."""
+"""Amplitude of a motion, in metres or radians, below which it is rounding error."""
 EXACT = 4
 """Number of cameras in which the monitor's derivatives are traced exactly, to check the interpolated ones."""
 NEAR_MODEL = 0.05
-"""Relative difference between a model's quantile and that of the traced cameras, above which a warning is given."""
+"""Relative difference of a merit's quantile between model and traced cameras above which a warning is given."""
 _PAIR, _DRAWN, _SHOWN, _MODELLED = 6.6e3, 32.0, 120.0, 40.0
-"""Bytes of two numbers that vary together, by which the merits are modelled to the second order; of each camera, of a
-number that varies, of a merit or compensator in the tables, and of a merit of the models.
+"""Estimates of memory, in bytes.
+
+They are for each pair of toleranced numbers in the second-order models; and, for each camera, for each toleranced
+number, for each merit or compensator in the tables, and for each merit of the models.
 """
 
 
 @dataclass(frozen=True)
 class Yield:
-    """Share of cameras that pass, with its confidence interval.
+    """Yield: fraction of cameras that pass, with its confidence interval.
 
     Attributes
     ----------
@@ -60,7 +66,7 @@ class Yield:
     of : int
         Number of all cameras.
     low, high : float
-        Clopper-Pearson limits of the share, at ``CONFIDENCE``.
+        Clopper-Pearson limits of the fraction, at ``CONFIDENCE``.
     """
 
     passed: int
@@ -70,16 +76,13 @@ class Yield:
 
     @classmethod
     def count(cls, passing: np.ndarray) -> Yield:
-        """Return the yield from whether each camera passes, (S,).
-
-        Array dimensions: S cameras.
-        """
+        """Return the yield of S cameras; ``passing`` (S,) is True for each that passes."""
         passed, total = int(np.sum(passing)), len(passing)
         return cls(passed, total, *proportion_interval(passed, total, CONFIDENCE))
 
     @property
     def share(self) -> float:
-        """Share of all cameras that pass."""
+        """Fraction of all cameras that pass."""
         return self.passed / self.of
 
     def judged(self, wanted: float) -> str:
@@ -89,26 +92,26 @@ class Yield:
 
 @dataclass(frozen=True, eq=False)
 class MeritResult:
-    """Distribution of a merit over all cameras.
+    """Distribution of a merit over all Monte Carlo cameras.
 
     Attributes
     ----------
     merit : Merit
         Merit whose distribution it is.
     nominal : float
-        Value of the nominal camera, adjusted, SI.
+        Value of the nominal camera, adjusted, SI units.
     mean, deviation : float
-        Mean and standard deviation over the cameras, SI.
+        Mean and standard deviation over the cameras, SI units.
     levels : tuple of float
-        Values that shares ``LEVELS`` of the cameras do not exceed (for an MTF: exceed), SI.
+        Values that the fractions ``LEVELS`` of the cameras do not exceed (for an MTF: exceed), SI units.
     linear, quadratic : tuple of float
-        Quantiles at ``LEVELS`` by the first-order and by the second-order model, SI.
+        Quantiles at ``LEVELS`` by the first-order and by the second-order model, SI units.
     passing : Yield
-        Share of cameras that meet the requirement.
+        Fraction of cameras that meet the requirement.
     model_passing : tuple of float
-        Share of cameras that meet the requirement, by the first-order and by the second-order model.
+        Fraction of cameras that meet the requirement, by the first-order and by the second-order model.
     shares : dict
-        Tolerance -> share of the merit's variance that vanishes without it, by the second-order model.
+        Tolerance -> fraction of the merit's variance that vanishes without it, by the second-order model.
     """
 
     merit: Merit
@@ -142,11 +145,12 @@ class ToleranceRun:
     merits : tuple of MeritResult
         Distribution of each merit over these cameras.
     passing : Yield
-        Share of cameras that meet all requirements.
+        Fraction of cameras that meet all requirements.
     allocation : Allocation or None
         Allocated limits; None if no allocation is requested.
     judged : Yield or None
-        Share of independent cameras with the allocated limits that meet all requirements; None without an allocation.
+        Fraction of independent cameras with the allocated limits that meet all requirements; None without an
+        allocation.
     jobs : dict
         Worst cameras as files of jobs, by name.
     warnings : tuple of str
@@ -177,7 +181,7 @@ def run_tolerance(
     advance: Advance = silent,
     force: Workforce | None = None,
 ) -> ToleranceRun:
-    """Compute a tolerance budget.
+    """Compute a tolerance budget: sensitivities, inverse limits, Monte Carlo cameras, yield and allocation.
 
     Parameters
     ----------
@@ -186,7 +190,7 @@ def run_tolerance(
     backend : Backend
         Array backend of the ray trace.
     seed : int, optional
-        Seed of the random draws; the budget's by default.
+        Seed of the random numbers; the budget's by default.
     advance : Advance
         Callback that reports progress.
     force : Workforce, optional
@@ -252,15 +256,15 @@ def run_tolerance(
 
 
 def _amounts(bench: ToleranceBench, samples: Samples, rows: np.ndarray) -> np.ndarray:
-    """Return the amounts of the parameters and the compensators of selected cameras, SI, (W, K).
+    """Return the amounts of the K parameters and compensators of W selected cameras, (W, K), SI units.
 
-    Array dimensions: W selected cameras, K varied parameters.
+    ``rows`` selects the cameras.
     """
     return np.concatenate([samples.x[rows] * bench.sizes, np.nan_to_num(samples.moves[rows])], axis=1)
 
 
 def _states(bench: ToleranceBench, samples: Samples, rows: np.ndarray) -> list[State]:
-    """Return the states of selected cameras with their adjustments."""
+    """Return the states of selected cameras, with their tolerances' motions and their adjustments."""
     return states_of((*bench.numbers, *bench.compensators), _amounts(bench, samples, rows))
 
 
@@ -270,7 +274,7 @@ def worst_cameras(bench: ToleranceBench, samples: Samples) -> np.ndarray:
 
 
 def _interpolation_errors(bench: ToleranceBench, samples: Samples) -> dict[str, float]:
-    """Return the relative interpolation error of each monitor merit's sigma in the first cameras."""
+    """Return merit -> largest relative error of its sigma due to interpolated derivatives, in the first cameras."""
     known = np.flatnonzero(np.all(np.isfinite(samples.values), axis=1))[:EXACT]
     if bench.monitor is None or not known.size:
         return {}
@@ -291,7 +295,7 @@ def _require_light(setup: ToleranceSetup, sensitivity: Sensitivities) -> None:
 
 
 def with_limits(setup: ToleranceSetup, limits: Mapping[str, str | float]) -> ToleranceSetup:
-    """Return the budget with the given limits, by tolerance, instead of its own."""
+    """Return a budget with new tolerance limits, given by name, instead of its own."""
     entries = {
         name: tolerance.model_copy(update={"limit": limits.get(name, tolerance.limit)})
         for name, tolerance in setup.test.tolerances.items()
@@ -302,7 +306,7 @@ def with_limits(setup: ToleranceSetup, limits: Mapping[str, str | float]) -> Tol
 def _validated_yield(
     setup: ToleranceSetup, backend: Backend, allocation: Allocation, seed: int, force: Workforce, advance: Advance
 ) -> Yield:
-    """Return the yield of the allocated limits over independent cameras."""
+    """Return the yield of the allocated limits over new random cameras, independent of those of the allocation."""
     other = with_limits(setup, allocation.limits)
     bench = ToleranceBench(other, backend)
     drawn = draw_samples(other, bench, backend, setup.test.samples, seed + _MORE, force, "allocated", advance)
@@ -311,16 +315,16 @@ def _validated_yield(
 
 @dataclass(frozen=True, eq=False)
 class ModelPredictions:
-    """Merits of the Monte Carlo cameras predicted by the models.
+    """Merits of the Monte Carlo cameras predicted by the models of first and second order.
 
     Array dimensions: S cameras, M merits, E tolerances.
 
     Attributes
     ----------
     linear, quadratic : (S, M) ndarray
-        Merits to the first and to the second order, SI.
+        Merits to the first and to the second order, SI units.
     without : (E, S', M) ndarray
-        Merits to the second order with one tolerance at a time excluded, of the first S' cameras.
+        Merits to the second order with one tolerance at a time excluded, for the first S' cameras.
     """
 
     linear: np.ndarray
@@ -458,20 +462,20 @@ def worst_jobs(setup: ToleranceSetup, bench: ToleranceBench, samples: Samples) -
 
 
 def _short(disturbances: dict[str, Any]) -> Any:
-    """Return disturbances in the form of a file: the name alone if nothing of that file is changed."""
+    """Return disturbances in the notation of a file: only the name of a library file if its content is unchanged."""
     changed = {key: value for key, value in disturbances.items() if value}
     return changed["file"] if changed.keys() == {"file"} else changed
 
 
 def _reference(setup: ToleranceSetup) -> str:
-    """Return the instrument as a job in a different folder refers to it: by name or by its absolute path."""
+    """Return the text by which a job in a different folder refers to the instrument: its name or absolute path."""
     named = setup.test.instrument
     path = (Path(setup.test.source.file).parent / named).resolve()
     return str(path) if is_path(named) and path.is_file() else named
 
 
 def _perturb(motion: Any) -> dict[str, Any]:
-    """Return a motion of a body as the mapping that a job's file has under ``perturb``."""
+    """Return a motion of a body as an entry of the section ``perturb`` of a job's file."""
     out: dict[str, Any] = {}
     for kind in ("rotate", "shift"):
         values = [value if abs(value) > _NOTHING else 0.0 for value in getattr(motion, kind)]
@@ -551,9 +555,9 @@ def _tolerance_plain(run: ToleranceRun) -> dict[str, Any]:
 
 
 def _moves_at(run: ToleranceRun, entry: int, end: int) -> dict[str, str | float | None]:
-    """Return each compensator's move, as a quantity with unit, with a tolerance at its lower or upper limit.
+    """Return compensator -> its move (quantity with unit) with a tolerance at its lower or upper limit.
 
-    None for a figure error.
+    The moves are None for a figure error.
     """
     moves = run.sensitivity.moves[entry, end].tolist()
     return {

@@ -1,4 +1,4 @@
-"""Varied parameters of a tolerance budget, each a motion of bodies per unit, and the states that they add up to.
+"""Varied parameters of a tolerance budget, each a motion of bodies per unit, and the states that result from them.
 
 Several parameters may move one body. Their rotation vectors and shifts are added, each rotation about its own point, so
 that the order in a file does not matter.
@@ -49,7 +49,7 @@ class BodyMove:
     figure : FrozenMap
         Noll index -> rms of the sag, metres.
     shape : FrozenMap
-        Kind of shape change in ``SHAPE`` -> change, SI.
+        Kind of shape change in ``SHAPE`` -> change, SI units.
     """
 
     rotate: np.ndarray = field(default_factory=lambda: np.zeros(3))
@@ -72,8 +72,8 @@ class VariedParameter:
     kind : str
         Kind of the motion.
     size : float
-        SI amount of one unit: the limit of a tolerance, 1 for a compensator, the standard deviation for a term of a
-        figure error.
+        Amount of one unit, in SI units: the limit of a tolerance, 1 for a compensator, the standard deviation for a
+        term of a figure error.
     moves : FrozenMap
         Path of a body -> its motion.
     """
@@ -157,7 +157,7 @@ class _Maker:
         return VariedParameter(name, name, spec.parts[1], 1.0, moves)
 
     def _node(self, spec: Varied, name: str, key: KeyPath) -> str:
-        """Return the path of a body that allows the motion; raise InputError if there is none."""
+        """Return the path of a body named in the budget if it allows the motion; else raise InputError."""
         try:
             body = find_node(name, self.instrument.nodes)
         except Problem as problem:
@@ -206,7 +206,10 @@ class _Maker:
         return self.instrument.assembly.tree[path]
 
     def _heat(self, body: str, kind: str, axis: str, key: KeyPath, limit: float) -> FrozenMap[str, BodyMove]:
-        """Return each body's motion due to a change of temperature, per kelvin or K/m, between zero and the limit."""
+        """Return body -> its motion per kelvin or K/m of a temperature change.
+
+        It is the mean slope between zero and ``limit``.
+        """
         try:
             return heat_moves(self.thermal, self.instrument, body, kind, AXES.get(axis, 0), limit)
         except TemperatureError as error:
@@ -222,9 +225,9 @@ def heat_moves(
     amount: float,
     others: Mapping[str, Temperature] = FrozenMap(),
 ) -> FrozenMap[str, BodyMove]:
-    """Return the effect of a change of temperature on every body, per SI unit.
+    """Return body -> the motion and shape change due to a change of temperature, per kelvin or K/m.
 
-    It is the motion at ``amount`` divided by ``amount``.
+    It is the effect of ``amount`` divided by ``amount``.
 
     Parameters
     ----------
@@ -273,7 +276,10 @@ def _per_unit(body: Body, motion: Motion, amount: float) -> BodyMove:
 
 
 def _rigid(pose: Pose, kind: str, direction: np.ndarray, point: np.ndarray) -> BodyMove:
-    """Return a motion along or about a world direction (3,), about a world point (3,), in a body's own frame."""
+    """Return a rotation about, or shift along, a world direction (3,) as a motion in a body's own frame.
+
+    A rotation is about the world point ``point`` (3,).
+    """
     axis = pose.rotation.T @ direction
     if kind == "shift":
         return BodyMove(shift=axis)
@@ -281,11 +287,9 @@ def _rigid(pose: Pose, kind: str, direction: np.ndarray, point: np.ndarray) -> B
 
 
 def spectrum_shares(terms: Sequence[int], power: float) -> np.ndarray:
-    """Return the standard deviation of each term of a figure error whose rms is 1, (T,).
+    """Return the standard deviation of each of T polynomial terms of a figure error whose rms is 1, (T,).
 
     The variance of a term with radial order n is proportional to (n + 1)^-power.
-
-    Array dimensions: T polynomial terms.
 
     Parameters
     ----------
@@ -300,12 +304,10 @@ def spectrum_shares(terms: Sequence[int], power: float) -> np.ndarray:
 
 
 def spectrum_over(element: Element, terms: Sequence[int], power: float) -> np.ndarray:
-    """Return the standard deviation of each term of a figure error whose rms over a clear aperture is 1, (T,).
+    """Return the standard deviation of each of T terms of a figure error whose rms over a clear aperture is 1, (T,).
 
     The mean square is that of an ensemble of surfaces, about each surface's mean over its clear aperture. Terms have
-    unit rms over the smallest circle round that aperture, and another rms over a rectangle or a ring in it.
-
-    Array dimensions: T polynomial terms.
+    unit rms over the smallest circle around that aperture, and another rms over a rectangle or a ring in it.
 
     Parameters
     ----------
@@ -329,18 +331,21 @@ def spectrum_over(element: Element, terms: Sequence[int], power: float) -> np.nd
 
 
 _CELLS = 200
-"""Number of cells along each side of the box round a clear aperture for the rms of terms; accurate to 1e-3."""
+"""Number of cells along each side of the box around a clear aperture, over which the rms of terms is summed.
+
+The rms is accurate to 1e-3.
+"""
 
 
 def states_of(numbers: Sequence[VariedParameter], amounts: np.ndarray) -> list[State]:
-    """Return the states that amounts of varied parameters add up to.
+    """Return the states that result from amounts of the varied parameters.
 
     Parameters
     ----------
     numbers : sequence of VariedParameter
         K parameters.
     amounts : (S, K) ndarray
-        Amounts, SI.
+        Amounts, SI units.
 
     Returns
     -------
@@ -381,7 +386,10 @@ def states_of(numbers: Sequence[VariedParameter], amounts: np.ndarray) -> list[S
 def _motions(
     count: int, rotate: np.ndarray, shift: np.ndarray, figure: dict[int, np.ndarray], shape: dict[str, np.ndarray]
 ) -> list[Motion]:
-    """Return the motions of one body in S states from arrays with one entry per state."""
+    """Return the motions of one body in S states, from arrays with one entry per state.
+
+    The arrays hold rotations, shifts, figure terms and changes of shape.
+    """
     turns, shifts = rotate.tolist(), shift.tolist()
     figures = {j: values.tolist() for j, values in figure.items()}
     shapes = {name: values.tolist() for name, values in shape.items()}

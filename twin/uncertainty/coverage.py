@@ -37,10 +37,16 @@ HALF_WIDTHS = tuple(float(np.sqrt(2.0 * gammaincinv(0.5, level))) for level in L
 FALSE = 1e-2
 """Probability that any count of covered intervals is outside its limits although every sigma is right."""
 CHUNK, _PIXELS = 32, 10_000_000
-"""Numbers of states, and of pixels of their images, that are rendered at once (2 GB); results do not depend on them."""
+"""Largest numbers of states, and of pixels of their images, that are rendered together, to limit memory to 2 GB.
+
+Results do not depend on them.
+"""
 STATES = "random states"
 _DRAWN, _DETECTOR, _BEFORE, _AFTER = 9, 10, 11, 12
-"""Numbers of the random streams of the states, of their detectors and of the noise before and after."""
+"""Numbers of the random streams of a seed.
+
+They are for the random states, their detectors, and the image noise before and after the change.
+"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,19 +63,21 @@ class Coverage:
     truth : (N, Q) ndarray
         True values.
     errors : Mapping[str, (N, Q) ndarray]
-        Estimator -> reading minus truth.
+        Estimator -> estimate minus truth.
     sigmas : Mapping[str, (N, Q) ndarray]
         Estimator -> total standard deviations.
     expected : Mapping[str, (levels, Q) ndarray]
-        Estimator -> expected share of intervals that contain the truth: the levels themselves where all states are
-        measured. Otherwise the measured states move the spots less than the prior says, which reduces errors that are
-        correlated with the spots; errors of the posterior are not.
+        Estimator -> expected fraction of intervals that contain the truth. It is the confidence level itself if all
+        states drawn are measured. Otherwise the states with large spot shifts are missing, so that errors that are
+        correlated with the shifts are smaller than the prior predicts; those of the posterior are not correlated with
+        them.
     chi_square : (N,) ndarray
-        Predictive chi-square of the shifts.
+        Predictive chi-square of the spot shifts.
     alarms : int
         Number of states whose chi-square exceeds its limit.
     doubted : int
-        Number of states in which spots differ from their calibration, or readings are not linear and not relinearised.
+        Number of states in which spots differ from their calibrated shape, or in which the changes are too large for
+        the linear estimate and it was not relinearised.
     """
 
     quantities: tuple[Quantity, ...]
@@ -278,8 +286,9 @@ def _chances(
 ) -> dict[str, np.ndarray]:
     """Return estimator -> probability that an interval contains the truth, given the spot shifts.
 
-    Each is a (levels, N, Q) array for N states and Q quantities. Errors of the posterior are independent of the shifts;
-    relative to the posterior, an estimate is off by (its gain - posterior's gain) times the shifts.
+    Each is a (levels, N, Q) array for the confidence levels, N states and Q quantities. Errors of the posterior are
+    independent of the shifts; the estimate of another estimator differs from the posterior's by the difference of their
+    gains times the shifts.
     """
     prior, noise = experiment.disturbances, recovery.shift_covariance
     assert prior is not None

@@ -39,11 +39,11 @@ from twin.monitor.truth import half_fields
 BEST = "posterior"
 """Name of the estimator of the smallest variance; only a further measurement reduces the error that it leaves."""
 LINES = 10
-"""Number of motions that are listed for each quantity; the others are summed."""
+"""Number of motions of bodies that tables list for each quantity; the contributions of the others are summed."""
 FIELD = 0.1 * ARCSEC
-"""Standard deviation, in radians, of a direction of a camera that is calibrated with a test field.
+"""Standard deviation, in radians, of a camera's viewing direction that a calibration over a test field determines.
 
-It is a quarter of a metre on the ground from 500 km, the result of control points of that accuracy.
+It corresponds to a quarter of a metre on the ground from 500 km, the accuracy of the control points.
 """
 DAY = 86400.0
 _MORE_FRAMES = 4
@@ -55,9 +55,11 @@ Rounding errors of a trace are 1e-10.
 """
 _DRAWS = 100_000
 _STATES = 6
-"""Number of states over which the covariance of a shift is averaged; it varies by some per cent between states."""
+"""Number of random states over which the noise covariance of the spot shifts is averaged; it varies by some per cent
+between states.
+"""
 _PIXELS = 1 << 21
-"""Number of pixels of the images of these states that are processed at once."""
+"""Largest number of pixels of the images of these random states that are processed at once."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,7 +122,10 @@ class MonitorLimits:
 
     @cached_property
     def rows(self) -> np.ndarray:
-        """Derivatives of the Q quantities with respect to the four parameters of each of K cameras, (Q, 4 K)."""
+        """Derivatives of the Q quantities with respect to the changes of the K cameras, (Q, 4 K).
+
+        The four changes of each camera are three rotations, in radians, and that of the principal distance, in metres.
+        """
         return np.stack([quantity.row for quantity in self.quantities])
 
     def lines(self, estimator: str, quantity: int) -> list[tuple[str, float]]:
@@ -167,7 +172,7 @@ class MonitorLimits:
 
     @cached_property
     def from_statement(self) -> np.ndarray:
-        """Shares of the Q posterior variances that would remain without image noise, due to the prior alone, (Q,)."""
+        """Fractions of the Q posterior variances that would remain without image noise, due to the prior, (Q,)."""
         with_noise, noise_free = (
             limits.posterior_sigma(self.rows, self.stated, noise) for noise in (self.noise, 0.0 * self.noise)
         )
@@ -291,7 +296,7 @@ def _left(rows: np.ndarray, prior: Disturbances, noise: np.ndarray) -> np.ndarra
 
 
 def _own(prior: Disturbances) -> list[bool]:
-    """Return, for each motion, True if its body is one that a second monitor has as well: prisms.
+    """Return, for each motion of the prior, True if a second monitor has a body of its own for it, as for prisms.
 
     Cameras and the central prism are shared by both monitors.
     """

@@ -16,12 +16,12 @@ from twin.uncertainty.coverage import FALSE, Coverage, UncertaintyRun
 from twin.uncertainty.monitor_limits import BEST, LINES, MonitorLimits, Remedy
 
 SEEN = 8
-"""Largest number of motions that are listed for a least observable combination."""
+"""Largest number of motions that the file lists for the combination of motions that the spots observe least."""
 
 
 @dataclass(frozen=True, eq=False)
 class _Limited:
-    """Limits of one quantity before the measurement, or after it by an estimator, for the JSON file."""
+    """Standard deviation of one quantity and its causes, before or after the measurement, for the JSON file."""
 
     limits: MonitorLimits
     q: int
@@ -60,7 +60,7 @@ class _Limited:
 
     @property
     def followed(self) -> list[tuple[Elasticity, int]]:
-        """Numbers of the prior with the largest elasticities, each with the quantity's index."""
+        """Numbers of the prior on which the quantity's sigma depends most, each with the index of the quantity."""
         largest = sorted(self.limits.elasticities, key=lambda elasticity: -float(elasticity.elasticity[self.q]))[:LINES]
         return [(elasticity, self.q) for elasticity in largest]
 
@@ -106,7 +106,7 @@ _ELASTICITY: Record[tuple[Elasticity, int]] = Record(
     ),
     Quantity(
         "doubled_in_prior",
-        lambda one: float(one[0].told[one[1]]),
+        lambda one: float(one[0].doubled_in_prior[one[1]]),
         "standard deviation if the number is twice as large, also in the prior",
     ),
 )
@@ -170,7 +170,7 @@ LIMITS: Record[MonitorLimits] = Record(
 
 @dataclass(frozen=True, eq=False)
 class _Counted:
-    """Errors of one quantity by one estimator in random states, for the JSON file."""
+    """Errors and interval coverage of one quantity by one estimator in the random states, for the JSON file."""
 
     coverage: Coverage
     q: int

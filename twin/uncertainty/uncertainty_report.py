@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 FEW = 3
-"""Number of motions listed for each quantity in a report of the main job."""
+"""Number of motions of bodies listed for each quantity in the section of the main job's report."""
 RARE = 1e-3
 """Probability that a spot leaves its CCD below which the report does not mention it."""
 
@@ -244,7 +244,8 @@ def _prior_section(limits: MonitorLimits) -> Section:
         largest = sorted(limits.elasticities, key=lambda elasticity: -float(elasticity.elasticity[q]))[:FEW]
         for elasticity in largest:
             size = f"{significant(elasticity.size, 3)} {unit_for_reports(elasticity.unit)}"
-            numbers_of_row = (float(elasticity.elasticity[q]), float(elasticity.doubled[q]), float(elasticity.told[q]))
+            values = (elasticity.elasticity, elasticity.doubled, elasticity.doubled_in_prior)
+            numbers_of_row = [float(value[q]) for value in values]
             rows.append((quantity_text(quantity), elasticity.number.replace("_", " "), size, *numbers_of_row))
     numbers = Table(
         "limits-elasticities",

@@ -1,1 +1,1 @@
-"""Validation of the source papers: their formulas and numbers, one check each, worked out anew by simulation."""
+"""Validation of the source papers: their formulas and numbers, one check for each, recomputed by simulation."""

@@ -1,4 +1,8 @@
-"""Check of a paper's statement: the statement, the value from the simulation, and the verdict."""
+"""Check of a paper's statement: the statement, the value from the simulation, and the verdict.
+
+A check is a row of the validation's table and of the paper's YAML file. An input that the paper does not print and that
+was therefore chosen here is reported with the range over which the verdict does not change.
+"""
 
 from __future__ import annotations
 
@@ -20,16 +24,23 @@ from scenes.yaml.spec import Number, Spec, Text
 from twin.framework.artefact import plain, significant
 
 FARTHEST = 100.0
-"""Largest factor on an input within which its limit is searched."""
+"""Largest factor on an input, chosen because the paper does not print it, up to which the limit of its range is
+searched.
+"""
 _STEP = 1.1
-"""Factor between two trial values of an input in the search for its limit."""
+"""Ratio of one trial value of a chosen input to the one before, in the search for the limit of its range."""
 _HALVINGS = 20
-"""Number of bisections that locate a limit: 1.1 to 2^-20 of a step, far below the two digits shown."""
+"""Number of bisections that locate the limit of an input's range.
+
+An interval of a factor 1.1 is narrowed to 2^-20 of it, far below the two digits shown.
+"""
 
 
 @dataclass(frozen=True)
 class InputRange:
-    """Chosen input, with the range over which the verdict stays the same while all other inputs are fixed.
+    """Chosen input of a check, with the range over which the verdict stays the same.
+
+    All other inputs are fixed.
 
     Attributes
     ----------
@@ -40,11 +51,11 @@ class InputRange:
     unit : str
         Unit of the numbers; "1" for a factor.
     low, high : float or None
-        Limits of the range; None if there is none within a factor of `FARTHEST`, or if the row does not agree.
+        Limits of the range; None if there is none within a factor of `FARTHEST`, or if the check does not agree.
     agrees : bool
-        True if the row agrees with the claim.
+        True if the simulation agrees with the paper's statement.
     said : str
-        Other choices for which the row agrees, if the input is not a number.
+        Other choices for which they agree, if the input is not a number.
     """
 
     name: str
@@ -57,7 +68,7 @@ class InputRange:
 
     @property
     def text(self) -> str:
-        """Text for the report: the value, and its limits to two digits."""
+        """Text for the report: the chosen value, and the limits of its range to two digits."""
         if self.value is None:
             return f"{self.name}, {self.said}"
         unit = "" if self.unit == "1" else f" {self.unit}"
@@ -73,13 +84,13 @@ class InputRange:
 
 
 def _two(value: float) -> str:
-    """Return a number with two digits and without an exponent."""
+    """Return a number as text with two significant digits and without an exponent."""
     return significant(value, 2, floor=0.0)
 
 
 @dataclass(frozen=True)
 class Chosen:
-    """Input that was chosen, with the response of the measured value to it.
+    """Numerical input of a check that was chosen here, with the dependence of the simulated value on it.
 
     Attributes
     ----------
@@ -90,7 +101,7 @@ class Chosen:
     unit : str
         Unit of the value.
     response : callable
-        Function from a factor on the input to the measured value, in the unit of the row.
+        Function from a factor on the input to the simulated value, in the unit of the check.
     """
 
     name: str
@@ -100,18 +111,18 @@ class Chosen:
 
     @classmethod
     def power(cls, name: str, value: float, unit: str, measured: float, exponent: float = 1.0) -> Chosen:
-        """Return an input to a power of which the measured value is proportional; exponent 1 if simply proportional."""
+        """Return an input on which the simulated value depends as a power; exponent 1 for simple proportionality."""
         return cls(name, value, unit, lambda factor: measured * factor**exponent)
 
     def range(self, holds: Callable[[float], bool], agrees: bool) -> InputRange:
-        """Return the range of the input over which a row agrees.
+        """Return the range of the input over which the simulation agrees with the paper's statement.
 
         Parameters
         ----------
         holds : callable
-            Function that returns True if a measured value agrees.
+            Function that returns True if a simulated value agrees.
         agrees : bool
-            True if the measured value of the row agrees; otherwise no limits are searched.
+            True if the simulated value of the check agrees; otherwise no limits are searched.
         """
         low = high = None
         if agrees:
@@ -120,7 +131,10 @@ class Chosen:
         return InputRange(self.name, self.value, self.unit, low, high, agrees)
 
     def _limit(self, holds: Callable[[float], bool], step: float) -> float | None:
-        """Return the factor at which the row begins to fail, searched with a step; None if it does not fail."""
+        """Return the factor on the input at which the check begins to fail; None if it does not fail.
+
+        ``step`` is the ratio between two trial values.
+        """
         inside, outside = 1.0, step
         while holds(self.response(outside)):
             if not 1.0 / FARTHEST <= outside <= FARTHEST:
@@ -134,21 +148,21 @@ class Chosen:
 
 @dataclass(frozen=True)
 class Supposed:
-    """Chosen input of a check that is not a number.
+    """Input of a check that was chosen here and is not a number.
 
     Attributes
     ----------
     name : str
         Name of the input with the choice, a phrase.
     said : str
-        Other choices for which the row agrees, determined by trying them.
+        Other choices for which the simulation agrees with the statement, determined by trying them.
     """
 
     name: str
     said: str
 
     def range(self, holds: Callable[[float], bool], agrees: bool) -> InputRange:
-        """Return the range of this choice. It has no limits, because the choice is not a number."""
+        """Return this choice as an input without limits of a range, because it is not a number."""
         return InputRange(self.name, None, "1", None, None, agrees, self.said)
 
 
@@ -178,10 +192,14 @@ _STATISTICS: Mapping[str, Callable[[Any], Any]] = {
 
 
 class _Sentences(Formatter):
-    """Formatter that inserts facts into the texts of ``printed.yaml``."""
+    """Formatter that inserts computed values into the texts of ``printed.yaml``."""
 
     def format_field(self, value: Any, format_spec: str) -> str:
-        """Apply statistics and unit that precede the digits in a format, and name each value of a mapping."""
+        """Format a value for a text.
+
+        The format may name statistics and a unit before the digits; they are applied first. The values of a mapping get
+        their names.
+        """
         *words, digits = format_spec.split(" ")
         for word in words:
             if isinstance(value, Mapping) and word in _UNITS:
@@ -197,7 +215,7 @@ class _Sentences(Formatter):
 
 
 def sentence(text: str, facts: Mapping[str, Any]) -> str:
-    """Return a text of ``printed.yaml`` with its facts inserted.
+    """Return a text of ``printed.yaml`` with computed values (facts) inserted.
 
     Parameters
     ----------
@@ -238,7 +256,7 @@ VERDICTS: dict[Verdict, str] = {
     NOT_CHECKABLE: "The paper does not print what a comparison needs; the reason is given.",
     FAILED: "The check could not be computed; this says nothing about the paper.",
 }
-"""Meaning of each verdict."""
+"""Verdict of a check -> its meaning in words."""
 
 SIGMAS = 3.0
 """Noise allowance of a comparison, in standard deviations of the measured value."""
@@ -255,7 +273,7 @@ PAPERS = {
 Comparison = Literal["two-sided", "at most", "at least"]
 Basis = Literal["printed", "chosen", "theory"]
 AGREED: dict[Basis, Verdict] = {"printed": CONFIRMED, "chosen": REPRODUCED, "theory": CONSISTENT}
-"""Verdict for agreement of simulation and claim, by the basis of the row.
+"""Basis of a check -> verdict if simulation and statement agree.
 
 The basis is a printed value that could have failed, a printed value with inputs chosen here, or a theory where the
 paper prints nothing.
@@ -271,7 +289,7 @@ class CheckResult:
     id : str
         Dotted id that begins with the paper's number.
     also : tuple of str
-        Further ids of the same row.
+        Further ids of the same check.
     paper : str
         Number of the paper.
     equation : str
@@ -289,16 +307,16 @@ class CheckResult:
     unit : str
         Unit of all these numbers; "1" for a ratio.
     tolerance : float
-        Largest difference of claim and measurement that agrees, without the noise.
+        Largest difference of printed or implied number and ``measured`` that counts as agreement, without the noise.
     comparison : {"two-sided", "at most", "at least"}
-        Sides that are tested; a one-sided row accepts any value on the other side.
+        Sides that are tested; a one-sided check accepts any value on the other side.
     because : str
         Reason of the tolerance, a phrase.
     power : float or None
-        Tolerance + 3 sigma: the smallest error of the statement that the row would have found. An error of this size is
-        found half the time, one that is 3 sigma larger practically always. None if nothing is compared.
+        Tolerance + 3 sigma: the smallest error of the statement that the check would have detected. An error of this
+        size is detected half the time, one that is 3 sigma larger practically always. None if nothing is compared.
     tells : float or None
-        Distance of the alternative statement from which the row has to distinguish the printed one.
+        Distance from the printed statement to the alternative one, which the check must be able to distinguish.
     against : str
         The alternative statement, a phrase.
     theory : str
@@ -308,7 +326,7 @@ class CheckResult:
     verdict : Verdict
         One of VERDICTS.
     how : str
-        Lines: the method; the reason, unless the row is confirmed; the comparison that gives the verdict.
+        Lines: the method; the reason, unless the statement is confirmed; the comparison that gives the verdict.
     seconds : float
         Computing time since the previous result of the group; the first one includes the work that all share.
     """
@@ -336,7 +354,7 @@ class CheckResult:
     seconds: float
 
     def __post_init__(self) -> None:
-        """Raise an error if a value cannot be shown or written to JSON."""
+        """Raise an error if a value of the result is not finite or does not fit the others."""
         if self.verdict not in VERDICTS:
             raise ValueError(f"{self.id}: no verdict {self.verdict!r}; there are {', '.join(VERDICTS)}")
         for name in ("printed", "implied", "measured", "sigma", "tolerance", "power", "tells", "seconds"):
@@ -356,21 +374,21 @@ class CheckResult:
 
     @property
     def claim(self) -> float | None:
-        """Number that was compared with: the printed or the implied one."""
+        """Number with which the simulated one was compared: the printed or the implied number of the statement."""
         return self.implied if self.printed is None else self.printed
 
     def to_dict(self) -> dict[str, Any]:
-        """Return plain data for JSON."""
+        """Return the result as plain data for JSON."""
         return asdict(self) | {"also": list(self.also), "inputs": [asdict(i) for i in self.inputs]}
 
 
 class Explanation(Spec):
-    """Known reason of a value other than the claimed one.
+    """Known reason why the simulated value differs from the one that the paper prints or implies.
 
     Attributes
     ----------
     verdict : {"confirmed with correction", "refuted"}
-        CORRECTED if the reason is a fault, a gap or an ambiguity of the print, else REFUTED.
+        CORRECTED if the reason is an error, a gap or an ambiguity of the print, else REFUTED.
     text : str
         Reason, with the facts that `Check.evaluate` receives; see `sentence`.
     """
@@ -380,10 +398,10 @@ class Explanation(Spec):
 
 
 class Check(Spec):
-    """Row of the validation: a paper's statement, its tolerance with the reason, and the alternative to be excluded.
+    """Check of the validation: a paper's statement, a tolerance with its reason, and the alternative to be excluded.
 
-    A row stands in the paper's ``printed.yaml`` and is known before anything is computed, so that no tolerance can
-    follow a result. `evaluate` compares the measured value, with the inputs that were chosen for it, and gives the
+    A check is a row of the paper's ``printed.yaml``, fixed before anything is computed, so that no tolerance can be
+    adapted to a result. `evaluate` compares the simulated value, with the inputs that were chosen for it, and gives the
     result.
 
     Attributes
@@ -395,11 +413,11 @@ class Check(Spec):
     statement : str
         Statement of the paper, in one sentence.
     unit : str
-        Unit of printed value, measured value and tolerance; "1" for a ratio.
+        Unit of printed value, simulated value and tolerance; "1" for a ratio.
     printed : float or None
         Number that the paper prints; None if it prints none.
     tolerance : float
-        Largest difference of printed and measured value that agrees, without the noise.
+        Largest difference of printed and simulated value that counts as agreement, without the noise.
     because : str
         Reason of the tolerance.
     comparison : {"two-sided", "at most", "at least"}
@@ -408,24 +426,24 @@ class Check(Spec):
     expected : Verdict
         Verdict known from earlier work; any other one is reported and fails the command. Agreement by default.
     tells : float or None
-        Distance of the nearest alternative statement from this one, in the unit of the row; if tolerance plus noise
-        exceed it, the row confirms nothing. None only if nothing can be compared.
+        Distance of the nearest alternative statement from this one, in the unit of the check; if tolerance plus noise
+        exceed it, the check confirms nothing. None only if nothing can be compared.
     against : str
         The alternative statement, a phrase that completes "distinguished from".
     basis : {"printed", "chosen", "theory"}
         Basis of agreement, see AGREED; for ``chosen`` the inputs are passed to `evaluate`.
     theory : str
-        Theory that agreement rests on, a phrase; the basis is then ``theory``.
+        Theory that agreement is based on, a phrase; the basis is then ``theory``.
     also : tuple of str
-        Further ids of the same row, if one comparison tests two equations.
+        Further ids of the same check, if one comparison tests two equations.
     not_checkable : str
         Reason why nothing can be compared; empty if something can.
     explanations : tuple of Explanation
         Known reasons for other values, the likeliest first; `evaluate` receives the values.
     otherwise : str
-        Conclusion if neither the claim nor an explanation agrees.
+        Conclusion if neither the statement nor an explanation agrees.
     how : str
-        Method of measurement and further findings, with facts like the explanations.
+        Method of the simulation and further findings, with facts like the explanations.
     """
 
     id: Text
@@ -450,7 +468,10 @@ class Check(Spec):
     @model_validator(mode="before")
     @classmethod
     def _follow(cls, row: Any) -> Any:
-        """Fill in keys that follow from others: the basis from a theory, the expected verdict from the basis."""
+        """Fill in keys of a check that follow from others.
+
+        They are the basis, which follows from a theory, and the expected verdict, which follows from the basis.
+        """
         if not isinstance(row, dict):
             return row
         basis = row.get("basis", "theory" if row.get("theory") else "printed")
@@ -459,7 +480,7 @@ class Check(Spec):
 
     @model_validator(mode="after")
     def _can_separate(self) -> Check:
-        """Raise an error for ids that cannot be selected, and for rows that cannot distinguish what they test."""
+        """Raise an error for ids that cannot be selected, and for checks that cannot distinguish what they test."""
         for name in self.names:
             parts = name.split(".")
             if parts[0] not in PAPERS or len(parts) < 2 or not all(p and p.replace("_", "").isalnum() for p in parts):
@@ -485,17 +506,17 @@ class Check(Spec):
 
     @property
     def names(self) -> tuple[str, ...]:
-        """All ids of the row, the main one first."""
+        """All ids of the check, the main one first."""
         return (self.id, *self.also)
 
     @property
     def agreed(self) -> Verdict:
-        """Verdict for agreement of simulation and claim."""
+        """Verdict if the simulation agrees with the paper's statement."""
         return AGREED[self.basis]
 
     @property
     def paper(self) -> str:
-        """Number of the paper."""
+        """Number of the paper, with which the check's id begins."""
         return self.id.partition(".")[0]
 
     def evaluate(
@@ -508,11 +529,12 @@ class Check(Spec):
         inputs: Sequence[Chosen | Supposed] = (),
         facts: Mapping[str, Any] = FrozenMap(),
     ) -> CheckResult:
-        """Return the result of the row, with the verdict that the numbers give.
+        """Return the result of the check, with the verdict that the numbers give.
 
-        The row agrees if ``measured`` is within ``tolerance`` + 3 ``sigma`` of the claimed value. Otherwise the first
-        explanation whose value is within the same limit gives verdict and reason; if there is none, the row is refuted.
-        A limit above ``tells`` turns either agreement into ``undecided``.
+        The check agrees if ``measured`` is within ``tolerance`` + 3 ``sigma`` of the printed or implied value.
+        Otherwise the first explanation whose value is within the same limit gives verdict and reason; if there is none,
+        the statement is refuted. A limit above ``tells`` (the distance of the alternative statement) turns either
+        agreement into ``undecided``.
 
         Parameters
         ----------
@@ -521,15 +543,15 @@ class Check(Spec):
         sigma : float or None
             Its standard deviation; None without noise.
         how : str
-            Text appended to the row's own ``how``.
+            Text appended to the check's own ``how``.
         implied : float or None
             Number that the paper's statement implies, if it prints none.
         explained : sequence of float or None
-            Values that the row's explanations would give, in their order; None for one that does not apply.
+            Values that the check's explanations would give, in their order; None for one that does not apply.
         inputs : sequence of Chosen or Supposed
-            Inputs chosen here; required if the row's basis is ``chosen``.
+            Inputs chosen here; required if the check's basis is ``chosen``.
         facts : mapping of str to object
-            Facts that the row's texts name in braces, in addition to ``measured``.
+            Facts that the check's texts name in braces, in addition to ``measured``.
 
         Returns
         -------
@@ -567,7 +589,7 @@ class Check(Spec):
         return replace(result, implied=None if self.printed is not None else goal, power=allowed, inputs=ranges)
 
     def worse(self, *results: CheckResult) -> CheckResult:
-        """Return one of several results for the same statement: the first unexpected one, otherwise the first."""
+        """Return one of several results for a statement: the first with an unexpected verdict, else the first."""
         return next((r for r in results if r.verdict != self.expected), results[0])
 
     def failed(self, why: str) -> CheckResult:
@@ -575,11 +597,14 @@ class Check(Spec):
         return self._result(None, None, FAILED, f"Could not be computed: {why}")
 
     def without_comparison(self) -> CheckResult:
-        """Return the result of a row whose paper does not print what a comparison needs."""
+        """Return the result of a check for which the paper does not print what a comparison needs."""
         return self._result(None, None, NOT_CHECKABLE, self.not_checkable)
 
     def outside(self, measured: float, goal: float) -> float:
-        """Return the distance of a value from the claim, positive where it disagrees."""
+        """Return the distance of a value from the paper's number, positive where it disagrees.
+
+        ``goal`` is the paper's number.
+        """
         distance = measured - goal
         return {"two-sided": abs(distance), "at most": distance, "at least": -distance}[self.comparison]
 
@@ -620,4 +645,4 @@ _OF_THE_ROW = (
     "id", "also", "paper", "equation", "statement", "printed", "unit", "tolerance", "comparison", "because", "tells",
     "against", "theory",
 )  # fmt: skip
-"""Attributes of a row that its result repeats."""
+"""Attributes of a check that its result repeats."""

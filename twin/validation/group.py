@@ -1,8 +1,8 @@
-"""Groups of rows that share work, their context, and the YAML files with the rows and the printed values.
+"""Groups of checks that share work, their context, and the YAML files with the checks and the printed values.
 
 Keys of numbers end in the unit in which the paper prints them, so that they are read as printed and converted where
-they are used. Below ``groups`` stand the rows by group and id, with the keys of `Check`; a row's ``printed`` is a
-number, or the dotted key of one in the same file.
+they are used. The section ``groups`` of a file holds the checks by group and id, with the keys of `Check`; a check's
+``printed`` is a number, or the dotted key of one in the same file.
 """
 
 from __future__ import annotations
@@ -30,9 +30,9 @@ from twin.validation.row_names import FILE, FOLDER, matches
 
 
 class ArtefactText(Spec):
-    """Title, caption and column heads of a figure or a table of a group.
+    """Title, caption and column heads of a figure or a table of a group of checks.
 
-    Facts in braces are inserted when it is shown; the attributes are those of `Table`.
+    Computed values (facts) named in braces are inserted when it is shown; the attributes are those of `Table`.
     """
 
     title: Text
@@ -43,7 +43,7 @@ class ArtefactText(Spec):
 
 @dataclass(eq=False)
 class Context:
-    """Context in which the function of a group computes.
+    """Context in which the function of a group computes its checks.
 
     Attributes
     ----------
@@ -54,7 +54,7 @@ class Context:
     fast : bool
         True for fewer trials; the verdicts must not depend on it.
     selected : frozenset of str
-        Ids that are requested; others need no work, and their results are not kept.
+        Ids that are requested; others need no work, and their results are discarded.
     checks : mapping of str to Check
         All checks of the group by id.
     report_progress : callable
@@ -66,7 +66,7 @@ class Context:
     texts : mapping of str to ArtefactText
         Texts of the group's figures and tables by name.
     artefacts : list of Artefact
-        Artefacts added so far.
+        Figures, tables and data added so far.
     """
 
     backend: Backend
@@ -81,7 +81,7 @@ class Context:
     artefacts: list[Artefact] = field(default_factory=list)
 
     def wants(self, *prefixes: str) -> bool:
-        """Return True if a selected id begins with one of the prefixes."""
+        """Return True if the id of a selected check begins with one of the prefixes."""
         return any(matches(identifier, prefix) for identifier in self.selected for prefix in prefixes)
 
     def count(self, full: int, fast: int) -> int:
@@ -109,7 +109,7 @@ class Context:
         return self.experiments[instrument]
 
     def add(self, artefact: Artefact) -> None:
-        """Show a figure, table or data in the report and keep it in the run folder.
+        """Add a figure, table or data to the report and the run folder.
 
         Raises
         ------
@@ -121,17 +121,17 @@ class Context:
         self.artefacts.append(artefact)
 
     def figure(self, name: str, drawing: str | bytes, **facts: object) -> None:
-        """Add a drawing, SVG or PNG, with the title and caption from the group's file."""
+        """Add a drawing (SVG or PNG) to the report, with the title and caption from the group's file."""
         texts = self._said(name, facts)
         self.add(SvgFigure(name, *texts, drawing) if isinstance(drawing, str) else PngFigure(name, *texts, drawing))
 
     def table(self, name: str, rows: Sequence[Sequence[Cell]], **facts: object) -> None:
-        """Add a table with the title, caption and heads from the group's file."""
+        """Add a table to the report, with the title, caption and column names from the group's file."""
         text = self.texts[name]
         self.add(Table(name, *self._said(name, facts), text.heads, rows, text.decimals))
 
     def data(self, name: str, content: dict[str, Any]) -> None:
-        """Add data with the title and caption from the group's file."""
+        """Add data to the report's downloads, with the title and caption from the group's file."""
         self.add(Data(name, *self._said(name, {}), content))
 
     def _said(self, name: str, facts: Mapping[str, Any]) -> tuple[str, str]:
@@ -148,9 +148,9 @@ class Context:
         inputs: Sequence[Chosen | Supposed] = (),
         **facts: object,
     ) -> CheckResult:
-        """Return the result of one of the group's checks for a measured value.
+        """Return the result of one of the group's checks for a simulated value.
 
-        The arguments are those of `Check.evaluate`; facts for the texts are passed by name.
+        The arguments are those of `Check.evaluate`; values for the texts are passed by name.
         """
         return self.checks[identifier].evaluate(measured, sigma, "", implied, explained, inputs, facts)
 
@@ -189,7 +189,7 @@ class CheckGroup:
     artefacts: Mapping[str, ArtefactText] = FrozenMap()
 
     def __post_init__(self) -> None:
-        """Raise an error for groups that cannot be distinguished or shown."""
+        """Raise an error for groups with ids that cannot be distinguished, or with texts that cannot be shown."""
         if not self.checks or self.seconds <= 0 or (self.fast_seconds is not None and self.fast_seconds <= 0):
             raise ValueError(f"group {self.prefix!r} needs checks and a rough time > 0")
         if not self.prefix.replace(".", "").replace("_", "").isalnum():
@@ -203,7 +203,7 @@ class CheckGroup:
 
     @property
     def ids(self) -> tuple[str, ...]:
-        """Ids of the group's checks."""
+        """Main ids of the group's checks."""
         return tuple(check.id for check in self.checks)
 
 
@@ -211,10 +211,10 @@ _Seconds = Annotated[Number, Field(gt=0.0)]
 
 
 class GroupRows(Spec):
-    """Rows of one group as they are in the paper's file.
+    """Checks of one group as they are in the paper's file.
 
     The attributes are those of `CheckGroup`, and ``sentences``: texts by name, which may be named in braces in the
-    ``how`` of several rows, or in a later one of these texts.
+    ``how`` of several checks, or in a later one of these texts.
     """
 
     title: Text
@@ -226,7 +226,7 @@ class GroupRows(Spec):
 
 
 class PaperRows(Spec):
-    """Rows of the checks in a paper's file, whose other keys are the printed values."""
+    """Checks in a paper's file, whose other keys are the printed values."""
 
     model_config = ConfigDict(frozen=True, extra="ignore")
 
@@ -235,43 +235,44 @@ class PaperRows(Spec):
 
 @dataclass(frozen=True, eq=False)
 class Printed:
-    """Printed values of a paper. Keys are dotted, as in ``table1.mtf_nyquist``.
+    """Printed values of a paper, by dotted keys such as ``table1.mtf_nyquist``.
 
-    Every reader raises InputError, with file, line and key, for a name that does not exist or is of another kind.
+    Every reader raises InputError, with file, line and key, for a name that does not exist or whose value is of another
+    kind.
     """
 
     content: YamlFile
 
     def number(self, key: str) -> float:
-        """Return the printed number of a key, in the unit that the key names."""
+        """Return the printed number at a key, in the unit with which the key ends."""
         return self._number(_path(key), self._at(key))
 
     def whole(self, key: str) -> int:
-        """Return the printed whole number of a key."""
+        """Return the printed integer at a key."""
         value = self._at(key)
         if not isinstance(value, int) or isinstance(value, bool):
             raise self._error(_path(key), "no whole number", value)
         return value
 
     def column(self, key: str) -> tuple[float, ...]:
-        """Return the printed list of numbers of a key."""
+        """Return the printed list of numbers at a key, in the unit with which the key ends."""
         return self._column(_path(key), self._at(key))
 
     def numbers(self, key: str) -> Mapping[str, float]:
-        """Return the printed numbers below a key, by name, in the order of the file."""
+        """Return name -> printed number for all entries below a key, in the order of the file."""
         return FrozenMap({k: self._number((*_path(key), k), v) for k, v in self._mapping(key).items()})
 
     def columns(self, key: str) -> Mapping[str, tuple[float, ...]]:
-        """Return the printed lists of numbers below a key, by name, in the order of the file."""
+        """Return name -> printed list of numbers for all entries below a key, in the order of the file."""
         return FrozenMap({k: self._column((*_path(key), k), v) for k, v in self._mapping(key).items()})
 
     @cached_property
     def groups(self) -> Mapping[str, GroupRows]:
-        """Prefix of each group -> its rows, in the order of the file, validated."""
+        """Prefix of each group -> its checks, in the order of the file, validated."""
         return FrozenMap(validate(PaperRows, replace(self.content, data=self._named(self.content.data))).groups)
 
     def group(self, prefix: str, run: Run) -> CheckGroup:
-        """Return the group of a prefix, whose rows a function computes.
+        """Return the group with a prefix, whose checks the function ``run`` computes.
 
         Raises
         ------
@@ -288,7 +289,7 @@ class Printed:
         )
 
     def _named(self, data: Any) -> Any:
-        """Return the data with the id and the shared sentences inserted into each row.
+        """Return the data of a group with the id and the shared sentences inserted into each check.
 
         The key of a printed value is replaced by its number.
         """
@@ -371,7 +372,7 @@ def load_printed(paper: str) -> Printed:
 
 
 def group_of(prefix: str, run: Run = lambda context: ()) -> CheckGroup:
-    """Return a group by its prefix, with the rows of its paper's file and the function that computes them.
+    """Return a group by its prefix, with the checks in its paper's file and the function that computes them.
 
     Raises
     ------
@@ -387,7 +388,7 @@ Draw = Callable[..., None]
 def drawing(
     name: str | Callable[..., str], height: float | Callable[..., float]
 ) -> Callable[[Draw], Callable[..., str]]:
-    """Return a decorator that turns a drawing function into one that returns the SVG.
+    """Return a decorator for a function that draws into a Matplotlib figure: the decorated one returns the SVG.
 
     Parameters
     ----------

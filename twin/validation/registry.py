@@ -38,7 +38,7 @@ _GROUPS = (
 """Module and name of each group of checks; a new group is added here."""
 
 GROUPS: tuple[CheckGroup, ...]
-"""All groups in the order in which they run; they are imported at the first access."""
+"""All groups of checks in the order in which they run; they are imported at the first access."""
 
 
 def __getattr__(name: str) -> Any:
@@ -52,12 +52,12 @@ def __getattr__(name: str) -> Any:
 
 
 class UnknownCheck(Exception):
-    """Error raised for a prefix that no check's id begins with; the message names the nearest one."""
+    """Error that no check's id begins with a given prefix; the message names the nearest one."""
 
 
 @dataclass(frozen=True)
 class Selection:
-    """Group with the ids of the checks that are requested."""
+    """Group of checks, with the ids of those that are requested."""
 
     group: CheckGroup
     ids: frozenset[str]
@@ -92,7 +92,7 @@ def select(groups: Sequence[CheckGroup], only: str | None) -> tuple[Selection, .
     groups : sequence of CheckGroup
         All groups.
     only : str or None
-        Prefixes separated by commas, each ending where a part of an id ends; further ids of a row count as well. None
+        Prefixes separated by commas, each ending where a part of an id ends; further ids of a check count as well. None
         selects everything.
 
     Raises
@@ -126,7 +126,7 @@ def require_known(only: str | None) -> None:
 
 
 def _known(only: str, ids: Sequence[str]) -> list[str]:
-    """Return the prefixes after checking that each has ids under it.
+    """Return the prefixes in ``only`` after checking that each has ids under it.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""Ids of the validation's rows, read from the papers' files."""
+"""Ids of the validation's checks, read from the papers' files."""
 
 from __future__ import annotations
 
@@ -6,15 +6,15 @@ import re
 from pathlib import Path
 
 FILE = "printed.yaml"
-"""Name of the file with the rows in each paper's folder."""
+"""Name of the file with the checks in each paper's folder."""
 FOLDER = Path(__file__).parent
 """Folder that contains the papers' folders."""
 _ROW = re.compile(r"^      (\d{3}(?:\.\w+)+):$|^        also: \[(.*)\]$", re.M)
-"""Pattern of a row's key below ``groups``, or of its further ids."""
+"""Regular expression for a line with a check's key below ``groups``, or with its further ids."""
 
 
 def names_in_files() -> list[str]:
-    """Return the ids of all rows of all papers, and further ids of the same rows, paper by paper.
+    """Return the ids of all checks of all papers, paper by paper, including the additional ids of checks with several.
 
     The files are read as text. An unknown id is therefore reported before anything that computes is imported, and
     before the YAML is parsed, which takes a second.
@@ -27,7 +27,7 @@ def names_in_files() -> list[str]:
 
 
 def matches(identifier: str, prefix: str) -> bool:
-    """Return True if an id lies under a prefix.
+    """Return True if an id equals a prefix or continues it after a dot.
 
     ``001.table3`` matches itself and ``001.table3.x``, but not ``001.table33``.
     """

@@ -23,10 +23,10 @@ SCHEMA_VERSION = 2
 """Version of validation.json; it rises when a key changes its meaning or is removed."""
 
 FILES = "artefacts"
-"""Folder of the groups' artefacts in the run folder; each group has a folder named by its prefix there."""
+"""Folder of the groups' figures, tables and data in the run folder; each group has a subfolder named by its prefix."""
 
 Progress = Callable[[float, str], None]
-"""Callable with the estimated seconds of work done, out of ``rough_seconds``, and the name of the present work."""
+"""Function that is called with the finished work, in estimated seconds out of ``rough_seconds``, and its name."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,7 +54,7 @@ class GroupRun:
     files: tuple[str, ...] = ()
 
     def place(self, artefact: Artefact) -> str:
-        """Return the path of an artefact in the run folder."""
+        """Return the path, in the run folder, of a figure, table or data file of the group."""
         return f"{FILES}/{self.group.prefix}/{artefact.name}.{artefact.kind}"
 
 
@@ -195,7 +195,7 @@ def run_checks(
 
 
 def _advance(progress: Progress, start: float, group: CheckGroup, seconds: float, fraction: float, text: str) -> None:
-    """Report how much of a group is done, as a share of the whole progress."""
+    """Report how much of a group is done, as part of the progress of all groups."""
     progress(start + fraction * seconds, f"{group.prefix}: {text}")
 
 
@@ -240,7 +240,7 @@ def _run_group(
 
 
 def _keep(result: CheckResult, results: dict[str, CheckResult], group: CheckGroup, wanted: frozenset[str]) -> None:
-    """Add a result to the results of its group.
+    """Add the result of a check to the results of its group.
 
     Raises
     ------
@@ -256,7 +256,7 @@ def _keep(result: CheckResult, results: dict[str, CheckResult], group: CheckGrou
 
 
 def _sentence(error: Exception) -> str:
-    """Return the message of an error with the place where it was raised, for the report."""
+    """Return the message of an error, with the line of code that raised it, for the report."""
     text = " ".join(str(error).split()) or "no message"
     place = traceback.extract_tb(error.__traceback__)[-1]
     return f"{type(error).__name__}: {text} (in {place.name}, {Path(place.filename).name}:{place.lineno})"

@@ -18,13 +18,13 @@ from twin.validation.runner import GroupRun, Validation
 
 PROGRAM = "twin.validate"
 SUMMARY = "summary"
-"""Folder of the summary in the run folder."""
+"""Name of the folder in the run folder that contains the summary page and its figures."""
 PAGE = "README.md"
 """Name of the summary page; code hosts show a README.md when its folder is opened."""
 
 
 def summary_files(validation: Validation) -> dict[str, bytes]:
-    """Return the files of the summary by name: the page and the figures that it shows."""
+    """Return name -> contents of the files of the summary: the page and the figures that it shows."""
     figures = {
         f"{run.group.prefix}-{a.name}.{a.kind}": a
         for run in validation.runs
@@ -81,14 +81,14 @@ def _tables(validation: Validation) -> Iterator[str]:
 
 
 def _measured(result: CheckResult) -> str:
-    """Return the measured value with its sigma and unit as text."""
+    """Return the simulated value with its sigma and unit as text."""
     text, sigma = measured_text(result), sigma_text(result)
     parts = [text, f"± {sigma}" if sigma else "", "" if result.unit == "1" or result.measured is None else result.unit]
     return " ".join(part for part in parts if part)
 
 
 def _limits(result: CheckResult) -> tuple[str, str, str]:
-    """Return tolerance with reason, the smallest error that would be found, and the alternative, as text."""
+    """Return tolerance with reason, smallest detectable error, and alternative statement, as text."""
     if result.power is None or result.tells is None:
         return ("", "", "")
     unit = "" if result.unit == "1" else f" {result.unit}"
@@ -97,7 +97,7 @@ def _limits(result: CheckResult) -> tuple[str, str, str]:
 
 
 def _chosen(validation: Validation) -> Iterator[str]:
-    """Yield the lines that list the chosen inputs and their admissible ranges."""
+    """Yield the lines that list the inputs chosen here, since no paper prints them, with their ranges."""
     results = [result for result in validation.results if result.inputs]
     if not results:
         return
@@ -111,7 +111,7 @@ def _chosen(validation: Validation) -> Iterator[str]:
 
 
 def _corrections(validation: Validation) -> Iterator[str]:
-    """Yield the lines that list all rows without agreement, with the reason."""
+    """Yield the lines that list all checks without agreement, with the reason."""
     results = [result for result in validation.results if result.verdict not in AGREED.values()]
     if not results:
         return
@@ -132,7 +132,7 @@ def _cell(text: str) -> str:
 
 _LOOKS = "confirmed", "reproduced", "consistent", "corrected", "refuted", "undecided", "silent", "failed"
 MARKS: dict[Verdict, tuple[str, str]] = dict(zip(VERDICTS, zip("=⊜∼≈≠±?✕", _LOOKS, strict=True), strict=True))
-"""Character and CSS class of each verdict; the character makes the meaning independent of the colour."""
+"""Verdict -> its character and CSS class in the report; the character shows the meaning without colour."""
 
 
 def render_report(validation: Validation) -> str:
@@ -184,7 +184,7 @@ def verdict(validation: Validation) -> str:
 
 
 def _papers(validation: Validation) -> Iterator[Section]:
-    """Yield a section with all rows of each paper."""
+    """Yield a report section for each paper, with all its checks."""
     for number, title in PAPERS.items():
         results = [result for result in validation.results if result.paper == number]
         if results:
@@ -192,7 +192,7 @@ def _papers(validation: Validation) -> Iterator[Section]:
 
 
 def _paper_table(paper: str, results: Sequence[CheckResult]) -> Table:
-    """Return the table of a paper's rows; its downloadable form has all digits."""
+    """Return the table of a paper's checks; its downloadable form has all digits."""
     heads = ("id", "equation", "statement", "printed", "sides", "measured", "sigma", "unit", "verdict", "finds", "how")
     full = [
         (
@@ -234,7 +234,7 @@ def _words(validation: Validation) -> list[str]:
 
 
 def measured_text(result: CheckResult) -> str:
-    """Return the measured value with the digits that its sigma justifies."""
+    """Return the simulated value as text, with the digits that its sigma justifies."""
     if result.measured is None:
         return "\N{EM DASH}"
     if result.sigma:
@@ -255,12 +255,12 @@ def claim_text(result: CheckResult) -> str:
 
 
 def comparison_text(result: CheckResult) -> str:
-    """Return the sides on which a measurement can disagree with the claim; empty if nothing is compared."""
+    """Return on which sides of the paper's number a value disagrees, as text; empty if nothing is compared."""
     return result.comparison if result.power is not None else ""
 
 
 def power_text(result: CheckResult) -> str:
-    """Return the smallest error that the row would have found, in its unit and as a share of the claim."""
+    """Return the smallest error that the check would have detected, in its unit and relative to the paper's number."""
     if result.power is None:
         return "\N{EM DASH}"
     text = significant(result.power, 2, floor=0.0)
@@ -294,7 +294,7 @@ def _typeset(text: str) -> str:
 
 
 def _angles(page: str) -> str:
-    """Return a page with angles in the units of all reports.
+    """Return a report page with angles written in the unit symbols of all reports.
 
     The papers, and with them the checks, print 0.1 arcsec as 0.1″.
     """

@@ -130,14 +130,14 @@ class ReadingLawsSpec(Spec):
 
 
 class TrackerAngleSpec(Spec):
-    """Measured angle between two star trackers: the difference of their constant errors.
+    """Measured relative orientation of two star trackers, which determines the difference of their constant errors.
 
     Attributes
     ----------
     between : tuple[str, str]
         Names of the two star trackers.
     sigma : tuple[float, float, float]
-        Standard deviation about body X, Y and Z, in radians.
+        Standard deviation of the measured rotation about body X, Y and Z, in radians.
     """
 
     between: tuple[Name, Name]
@@ -150,9 +150,12 @@ class BlockPassSpec(Spec):
     Attributes
     ----------
     epoch : str
-        UTC at which the satellite is vertically above the place below.
-    longitude, latitude : float | None
-        Geodetic coordinate of this place, in radians; by default that of the area's centre.
+        UTC at which the satellite is vertically above the place that `longitude` and `latitude` give.
+    longitude : float | None
+        Longitude of the place over which the satellite is at the epoch, in radians; east is positive. By default that
+        of the area's centre.
+    latitude : float | None
+        Geodetic latitude of that place, in radians; north is positive. By default that of the area's centre.
     direction : {'descending', 'ascending'}
         Direction of flight: descending to the south, ascending to the north.
     roll : float
@@ -174,14 +177,18 @@ class AreaSpec(Spec):
 
     Attributes
     ----------
-    longitude, latitude : float
-        Geodetic coordinate of the area's centre, in radians.
+    longitude : float
+        Longitude of the area's centre, in radians; east is positive.
+    latitude : float
+        Geodetic latitude of the area's centre, in radians; north is positive.
     height : float
         Mean height of the ground above the ellipsoid, in metres.
     relief : float
         Half range of the heights, which are uniformly distributed about the mean, in metres.
-    east, north : float
-        Size in this direction, in metres.
+    east : float
+        Size of the area from west to east, in metres.
+    north : float
+        Size of the area from south to north, in metres.
     """
 
     longitude: Longitude
@@ -442,7 +449,7 @@ class CameraReadingSpec(Spec):
 
     Attributes
     ----------
-    angles : dict[str, dict[str, tuple[float, float]]]
+    angles : tuple[float, float, float]
         Rotations d_alpha (about the camera's Y), d_beta (about X) and d_gamma (about the line of sight), in radians.
     principal_distance : float
         Change d_f of the principal distance, in metres.

@@ -1,4 +1,4 @@
-"""Measurement of intersection angles in orbit from ground points (paper 000), as in a file of scenes/orbit."""
+"""Intersection angles in orbit from ground points (paper 000, Liu and Huang 2014), as in a file of scenes/orbit."""
 
 from collections.abc import Mapping, Sequence
 from typing import Annotated
@@ -95,7 +95,7 @@ class TerrainSpec(Spec):
     Attributes
     ----------
     height : float
-        Mean height, in metres.
+        Mean height above the ellipsoid, in metres.
     relief : float
         Standard deviation of the heights about the mean, in metres.
     length : float

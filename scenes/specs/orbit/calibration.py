@@ -98,8 +98,11 @@ class FieldSpec(Spec):
 
     Attributes
     ----------
-    latitude, longitude : float
-        Geodetic coordinate of the field's centre, over which the satellite passes at the epoch, in radians.
+    latitude : float
+        Geodetic latitude of the field's centre, over which the satellite passes at the epoch, in radians; north is
+        positive.
+    longitude : float
+        Longitude of the field's centre, in radians; east is positive.
     epoch : str
         UTC of the pass.
     height : float
@@ -126,8 +129,10 @@ class PointsSpec(Spec):
         Number of control points, which are used for the calibration.
     check : int
         Number of check points, which only test the calibration.
-    first, last : float
-        First or last pixel of the part of the nadir line on which the points lie, counted from 0.
+    first : float
+        First pixel of the part of the nadir line on which the points lie, counted from 0.
+    last : float
+        Last pixel of this part of the nadir line, counted from 0.
     length : float
         Length of the field along the track, in metres.
     """
@@ -169,8 +174,10 @@ class CalibrationImagesSpec(Spec):
     ----------
     patches : tuple[PatchPlaceSpec, ...]
         Positions of the patches of every field.
-    lines, pixels : int
-        Size of every image in this direction, in pixels.
+    lines : int
+        Number of lines of every image.
+    pixels : int
+        Number of pixels in a line of every image.
     ground : GroundSpec
         True ground. Its mean height is that of the field; a real terrain is another part of the model in each patch.
     control : ControlSpec
@@ -313,7 +320,7 @@ class OrbitCalibrationSpec(TitledSpec):
     effects : EffectsSpec
         Effects on the light path.
     errors : CalibrationErrorsSpec
-        Measurement errors.
+        Errors of orbit, attitude, image points and control points.
     drift : Mapping[str, CameraDriftSpec]
         Line -> change of its camera from field to field.
     monitor : MonitorReadingSpec | None

@@ -46,8 +46,10 @@ class JitterBandSpec(Spec):
 
     Attributes
     ----------
-    first, last : float
-        Lower (first) or upper (last) end of the band, in hertz.
+    first : float
+        Lower end of the band, in hertz.
+    last : float
+        Upper end of the band, in hertz.
     level : tuple[float, float, float]
         One-sided spectral density about body X, Y and Z, in rad^2/Hz; level x (last - first) is the variance.
     """
@@ -70,9 +72,9 @@ class JitterSpec(Spec):
     Attributes
     ----------
     lines : tuple[JitterLineSpec, ...]
-        Oscillations; none by default.
+        Oscillations of single frequencies (lines of the spectrum); none by default.
     bands : tuple[JitterBandSpec, ...]
-        Bands of noise; none by default.
+        Bands of frequencies with random motion; none by default.
     """
 
     lines: tuple[JitterLineSpec, ...] = Field(default=(), max_length=100)
@@ -85,7 +87,7 @@ class JitterSpec(Spec):
 
 
 FIRST_YEAR, LAST_YEAR = 1972, 2099
-"""UTC has whole leap seconds since 1972."""
+"""First and last year of the times that files may have: since 1972 UTC differs from TAI by whole leap seconds."""
 ALLOWED = f"date and time in UTC, ISO 8601 and ending in Z, {FIRST_YEAR} to {LAST_YEAR}, e.g. '2011-03-05T03:05:00Z'"
 PATTERN = r"^[0-9]{4}-[0-9]{2}-[0-9]{2}T[0-9]{2}:[0-9]{2}(:[0-9]{2}(\.[0-9]{1,6})?)?Z$"
 
@@ -159,8 +161,10 @@ class PassingSpec(Spec):
 
     Attributes
     ----------
-    longitude, latitude : float
-        Geodetic coordinate of the place vertically below the satellite, in radians.
+    longitude : float
+        Longitude of the place vertically below the satellite, in radians; east is positive.
+    latitude : float
+        Geodetic latitude of the place vertically below the satellite, in radians; north is positive.
     altitude : float
         Altitude of the satellite above the ellipsoid there, in metres.
     direction : {'descending', 'ascending'}
@@ -237,14 +241,16 @@ class OrbitSpec(Spec):
     ----------
     epoch : str
         UTC epoch, from which all times of the orbit are counted.
-    before, after : float
-        Duration of the orbit data before or after the epoch, in seconds.
+    before : float
+        Duration of the orbit data before the epoch, in seconds.
+    after : float
+        Duration of the orbit data after the epoch, in seconds.
     passing : PassingSpec | None
         Place over which the orbit passes at the epoch.
     elements : ElementsSpec | None
-        Osculating elements.
+        Osculating elements at the epoch.
     state : StateSpec | None
-        State vector.
+        Position and velocity at the epoch.
     """
 
     epoch: UtcTime
@@ -360,9 +366,9 @@ class StarTrackerErrorsSpec(Spec):
     noise : tuple[float, float, float]
         Standard deviation of a reading, independent from reading to reading, in radians.
     bias : tuple[float, float, float]
-        Constant error, in radians.
+        Constant error about body X, Y and Z, in radians.
     thermal : ThermalDriftSpec
-        Error that depends on the latitude.
+        Error that changes with the satellite's temperature, and so with the latitude.
     slow : SlowErrorsSpec
         Error that changes within a pass.
     drift : tuple[float, float, float]
@@ -386,9 +392,9 @@ class ErrorsSpec(Spec):
     Attributes
     ----------
     gps : GpsErrorsSpec
-        Errors of the orbit.
+        Errors of the measured orbit.
     star_tracker : StarTrackerErrorsSpec
-        Errors of the attitude.
+        Errors of the measured attitude.
     """
 
     gps: GpsErrorsSpec = GpsErrorsSpec.model_construct()

@@ -57,8 +57,10 @@ class JitterSearchSpec(Spec):
 
     Attributes
     ----------
-    lowest, highest : float
-        Lowest or highest frequency of the search, in hertz.
+    lowest : float
+        Lowest frequency of the search, in hertz.
+    highest : float
+        Highest frequency of the search, in hertz.
     axes : tuple[{'roll', 'pitch', 'yaw'}, ...]
         Body axes about which jitter is searched.
     false_alarm : float
@@ -154,11 +156,11 @@ class OrbitJitterSpec(PayloadTestSpec):
     time : float
         Time of the strip's middle from the orbit's epoch, in seconds.
     points : BandPointsSpec
-        Points that are measured.
+        Ground points that all lines observe, and their noise.
     errors : ErrorsSpec
         Errors of the satellite's orbit and attitude measurements.
     search : JitterSearchSpec
-        Settings of the search.
+        Settings of the search: frequencies, axes, false-alarm probability and models.
     seed : int
         Seed of all random numbers.
     """

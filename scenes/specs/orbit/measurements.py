@@ -78,13 +78,13 @@ class OrbitFileSpec(Spec):
     frame : {'ITRS', 'GCRS', 'EME2000', 'TEME'} | None
         Reference frame of positions and velocities; inertial ones need Earth orientation.
     time_scale : {'UTC', 'GPS', 'TAI', 'TT', 'GAL', 'QZS', 'BDT'} | None
-        Time scale of the clock.
+        Time scale of the times in the file.
     epoch : str | None
-        Reading of that clock at 0 s, for tables with `time [s]`.
+        Date and time, in that time scale, at which `time [s]` of a table is 0.
     leap_seconds : {'counted', 'skipped'} | None
         Treatment of leap seconds since the epoch in `time [s]` of a UTC clock; required if there are any.
     offset : float
-        Time to be added to the times, in seconds.
+        Time that is added to all times of the file, in seconds.
     """
 
     file: Reference
@@ -108,13 +108,13 @@ class AttitudeFileSpec(Spec):
     frame : {'ITRS', 'GCRS', 'EME2000', 'TEME', 'orbital'} | None
         Reference frame of the attitude; `orbital` has X forward, Z down, Y = Z x X.
     time_scale : {'UTC', 'GPS', 'TAI', 'TT', 'GAL', 'QZS', 'BDT'} | None
-        Time scale of the clock.
+        Time scale of the times in the file.
     epoch : str | None
-        Reading of that clock at 0 s, for tables with `time [s]`.
+        Date and time, in that time scale, at which `time [s]` of a table is 0.
     leap_seconds : {'counted', 'skipped'} | None
         Treatment of leap seconds since the epoch in `time [s]` of a UTC clock; required if there are any.
     offset : float
-        Time to be added to the times, in seconds.
+        Time that is added to all times of the file, in seconds.
     scalar : {'last', 'first'} | None
         Position of a quaternion's scalar part, the cosine of half the rotation angle.
     turns : {'body_to_frame', 'frame_to_body'} | None
@@ -124,8 +124,12 @@ class AttitudeFileSpec(Spec):
         Directions of the file's body x, y and z in flight, as [forward, right, down].
     sequence : {'xyz', 'xzy', 'yxz', 'yzx', 'zxy', 'zyx'} | None
         Sequence of roll about x, pitch about y, yaw about z: `xyz` means v_frame = Rx(roll) Ry(pitch) Rz(yaw) v_body.
-    nadir, steering : {'geodetic', 'geocentric'} | None
-        Definition of the orbital frame, as in `attitude` of a simulated pass.
+    nadir : {'geodetic', 'geocentric'} | None
+        For the frame `orbital`, the direction of its Z: along the ellipsoid's normal (geodetic) or to the Earth's
+        centre (geocentric).
+    steering : {'none', 'yaw'} | None
+        For the frame `orbital`, the direction of its X: along the inertial velocity (none), or along the track on the
+        rotating Earth (yaw).
     """
 
     file: Reference
@@ -330,7 +334,7 @@ class PassFilesSpec(Spec):
     Attributes
     ----------
     epoch : str
-        Epoch of the times in all tables.
+        UTC at which the times of all tables of the pass are 0 s.
     platform : str | PlatformFilesSpec | None
         Orbit and attitude in one table, or files of other formats (SP3, OEM, AEM ...) with the conventions that they do
         not contain; alternatively `orbit` and `attitude`.
@@ -382,7 +386,7 @@ class OrbitDataSpec(Spec):
     Attributes
     ----------
     conventions : ConventionsSpec
-        Conventions of all tables.
+        Conventions of all tables: frames, quaternions, times and image coordinates.
     passes : Mapping[str, PassFilesSpec]
         Name of the pass, or of the field over which it leads -> its tables.
     """
@@ -440,9 +444,9 @@ class ReadingErrorsSpec(Spec):
     Attributes
     ----------
     gps : OrbitReadingsSpec
-        Accuracy of the orbit.
+        Accuracy of the measured orbit.
     star_tracker : AttitudeReadingsSpec
-        Accuracy of the attitude.
+        Accuracy of the measured attitude.
     season : tuple[float, float, float]
         Standard deviation of the change of biases from pass to pass about body X, Y, Z, in radians; used for warnings
         only.
@@ -483,7 +487,7 @@ class MeasuredTestSpec(FixedTestSpec):
         Folder with a ``data.yaml``, or the path of such a file; alternatively `conventions` and `passes` are given
         here.
     conventions : ConventionsSpec | None
-        Conventions of all tables.
+        Conventions of all tables: frames, quaternions, times and image coordinates.
     passes : Mapping[str, PassFilesSpec] | None
         Name -> tables of a pass.
     effects : EffectsSpec
@@ -574,7 +578,7 @@ class MeasuredJitterSpec(MeasuredTestSpec):
     lines : tuple[str, ...] | None
         Names of the lines that are used; by default all that have points.
     search : JitterSearchSpec
-        Settings of the search.
+        Settings of the search: frequencies, axes, false-alarm probability and models.
     """
 
     lines: SomeLines = None
@@ -590,9 +594,9 @@ class LineTimesFileSpec(Spec):
         Path of a CSV file with columns `camera`, `line` and `time [s]` or `date_time`; or of the DIMAP file of a scene,
         for a camera of one line.
     time_scale : {'UTC', 'GPS', 'TAI', 'TT', 'GAL', 'QZS', 'BDT'}
-        Time scale of the clock.
+        Time scale of the times in the file.
     epoch : str | None
-        Reading of that clock at 0 s, for tables with `time [s]`.
+        Date and time, in that time scale, at which `time [s]` of a table is 0.
     moment : {'start', 'middle', 'end'}
         Moment of a line's exposure to which its time refers.
     """
@@ -690,10 +694,14 @@ class ImageWindowSpec(Spec):
 
     Attributes
     ----------
-    row, column : int
-        Row or column in the file of the window's first pixel, counted from 0.
-    rows, columns : int
-        Size of the window in this direction, in pixels.
+    row : int
+        Row, in the file, of the window's first pixel, counted from 0.
+    column : int
+        Column, in the file, of the window's first pixel, counted from 0.
+    rows : int
+        Number of rows of the window.
+    columns : int
+        Number of columns of the window.
     """
 
     row: Annotated[Whole, Field(ge=0)]

@@ -62,7 +62,7 @@ class MotionSpec(Spec):
     pivot : str
         Name of the body's point that the rotation leaves in place.
     begin : float
-        Start time, in seconds.
+        Time from the orbit's epoch at which the motion starts, in seconds.
     duration : float
         Duration of the linear growth to `rotate` and `shift`, in seconds; 0 for a step.
     period : float | None
@@ -103,14 +103,16 @@ class MotionSpec(Spec):
 class GroundSpec(Spec):
     """Check points at every time of the course, at random positions that both lines image.
 
-    They are centred where the two views are at equal times before and after.
+    The area is centred where one camera of the pair images the ground as long before that time as the other after it.
 
     Attributes
     ----------
     points : int
         Number of points at every time.
-    first, last : float
-        First or last pixel of the part of the second camera's line on which the points lie, counted from 0.
+    first : float
+        First pixel of the part of the second camera's line on which the points lie, counted from 0.
+    last : float
+        Last pixel of this part of the line, counted from 0.
     length : float
         Length of the area along the track, in metres.
     height : float
@@ -359,7 +361,8 @@ class OrbitMonitorSpec(TitledSpec):
     intervals : tuple[float, ...] | None
         Intervals that are compared, in seconds; by default all that divide the course.
     apply : tuple[{'d_alpha', 'd_beta', 'd_gamma', 'd_f'}, ...]
-        Monitor values that correct the cameras.
+        Changes measured by the monitor by which the cameras are corrected: rotations about the camera's Y, its X and
+        the line of sight, and the principal distance.
     mechanisms : MechanismsSpec | None
         Closed loop that acts on every reading, instead of `reference` and `interval`.
     frames : int | None
@@ -377,9 +380,9 @@ class OrbitMonitorSpec(TitledSpec):
     line_time : float
         Time from one image line to the next, in seconds.
     ground : GroundSpec
-        Check points.
+        Check points on the ground, whose errors are computed.
     errors : MonitorErrorsSpec
-        Measurement errors.
+        Errors of image points, orbit, attitude and the monitor's frames.
     seed : int
         Seed of all random numbers.
     """

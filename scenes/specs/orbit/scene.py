@@ -120,14 +120,14 @@ class TerrainSpec(Spec):
         Source of the heights: `real`, the elevation model that comes with matplotlib (Jacksboro fault, Tennessee, 3 arc
         seconds), mirrored beyond its edges of 30 km x 32 km; `fractal`, random.
     height : float
-        Mean height, in metres.
+        Mean height above the ellipsoid, in metres.
     relief : float | None
         Rms of the heights about their mean, in metres; required for `fractal`, for `real` by default that of the model,
         121 m.
     exponent : float
         Exponent of a fractal's amplitude spectrum against spatial frequency; a larger one is smoother.
     post : float
-        Spacing of a fractal's posts, in metres; between them the terrain is a cubic spline.
+        Spacing of a fractal's grid points (posts), in metres; between them the terrain is a cubic spline.
     longest : float
         Longest wavelength of a fractal's relief, in metres.
     offset : tuple[float, float]
@@ -209,9 +209,9 @@ class GroundSpec(Spec):
     Attributes
     ----------
     terrain : TerrainSpec
-        Heights.
+        Heights of the ground.
     texture : TextureSpec
-        Reflectance.
+        Reflectance of the ground.
     light : LightSpec
         Illumination and atmosphere.
     """
@@ -227,7 +227,7 @@ class DemSpec(Spec):
     Attributes
     ----------
     post : float
-        Spacing of the posts, in metres.
+        Spacing of the model's grid points (posts), in metres.
     sigma : float
         Standard deviation of a height, in metres.
     correlation : float
@@ -261,7 +261,7 @@ class ControlSpec(Spec):
     correlation : float
         Correlation length of the smooth error, in metres.
     dem : DemSpec
-        Elevation model.
+        Reference elevation model.
     """
 
     spacing: Spacing = 2.0
@@ -307,8 +307,8 @@ class ImagePointsSpec(Spec):
     height_sigma : float
         Standard deviation of the reference heights, as their producer states it, in metres.
     roughness : float
-        Rms of the displacement over a patch by attitude noise, in pixels; smaller differences between neighbours are
-        consistent.
+        Standard deviation, in x and in y, of the displacement of points within a patch by attitude noise, in pixels;
+        the consensus test, which compares a match with its neighbours, allows for it.
     false_alarm : float
         Fraction of correct matches that the consensus test may reject.
     """
@@ -362,13 +362,15 @@ class PatchSpec(Spec):
     Attributes
     ----------
     line : str
-        Name of this line.
+        Name of the line at whose footprint the patch is centred.
     pixel : float
         Pixel of this line that images the patch's centre.
     time : float
         Time at which this pixel images the patch's centre, from the orbit's epoch, in seconds.
-    lines, pixels : int
-        Size of every image in this direction, in pixels.
+    lines : int
+        Number of lines of every image.
+    pixels : int
+        Number of pixels in a line of every image.
     """
 
     line: Name = "nadir"

@@ -109,7 +109,7 @@ class AngleSetup(ExperimentSetup[OrbitAngleSpec]):
 
     @property
     def usual_pixels(self) -> int:
-        """Number of pixels of the standard line, on which the positions in the file are counted."""
+        """Number of pixels of the standard line, to which the pixel positions of the strips in the file refer."""
         return self.camera.pixels if self.camera is not None else next(iter(self.pixels.values()))
 
     @property
@@ -186,7 +186,7 @@ class CalibrationSetup(PayloadSetup[OrbitCalibrationSpec]):
 
     @classmethod
     def parts(cls, test: OrbitCalibrationSpec) -> dict[str, Any]:
-        """Read the payload, and the data sheets of its line CCDs if images are rendered, by field."""
+        """Read the payload, and data sheets if images are rendered; return field of the set-up -> content."""
         parts = super().parts(test)
         return parts if test.images is None else {**parts, "detectors": _line_detectors(parts["camera"])}
 

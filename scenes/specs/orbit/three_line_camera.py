@@ -35,8 +35,10 @@ class CcdSpec(Spec):
 
     Attributes
     ----------
-    first, last : int
-        First or last pixel of the CCD, both inclusive.
+    first : int
+        First pixel of the CCD, counted from 0 on the whole line.
+    last : int
+        Last pixel of the CCD, which still belongs to it.
     shift : tuple[float, float]
         Shift x (flight) and y (along the line) in the focal plane, in metres.
     rotate : float

@@ -1,8 +1,8 @@
 """State of an estimator after some entries of a record, and its serialisation.
 
 An `EstimatorState` holds the filter's state, the scores of its predictions and the condition of the temperature
-sensors. `EntryFilter` updates it with the entries of a record, one moment after the other. `packed` and `unpacked`
-write it as bytes and read it back to the bit: equal numbers give equal bytes.
+sensors. `EntryFilter` updates it with the entries of a record (readings and events) in the order of time. `packed` and
+`unpacked` serialise it as bytes without any loss: equal numbers give equal bytes.
 """
 
 from __future__ import annotations
@@ -88,24 +88,27 @@ def unpacked(content: bytes, *classes: type) -> Any:
 
 
 SPANS = (1, 3, 10)
-"""Numbers of consecutive readings whose summed chi-square is tested against the predictions."""
+"""Numbers of consecutive readings for each of which the summed chi-square of the innovations is tested."""
 HISTORY_LENGTH = 200
-"""Number of the latest innovations (readings minus predictions), and excluded entries, that the state keeps."""
+"""Number of the latest innovations (readings minus predictions), and of the latest excluded entries, that the state
+stores.
+"""
 OUTLIER_SIGMAS = 6.0
 """Residual of a sensor's reading, in standard deviations, beyond which the reading is not used."""
 SENSOR_WINDOW = 10
-"""Number of a sensor's latest readings from which its condition is judged."""
+"""Number of a sensor's latest readings from which its condition (ok, stuck, doubtful) is determined."""
 INFLATION_SIGMAS = 3.0
-"""Residual of a reading, in standard deviations, beyond which it inflates the prior of the temperatures.
+"""Residual of a temperature reading, in standard deviations, above which the prior sigmas of temperatures are enlarged.
 
-It does so where several sensors disagree with the prior.
+This is done only where several sensors disagree with the prior.
 """
 DOUBTFUL_OUTLIERS = 3
 """Number of outliers within `SENSOR_WINDOW` readings that makes a sensor doubtful."""
 SILENT_INTERVALS = 10.0
 """Time without a reading, in mean intervals of the sensor, after which the sensor is considered dead."""
 STUCK_PROBABILITY = 1e-4
-"""Probability, for a working sensor, of as many equal readings, below which the sensor is considered stuck."""
+"""Probability that a working sensor repeats a value as often as observed, below which the sensor is considered stuck.
+"""
 
 
 @dataclass(frozen=True)
@@ -127,13 +130,14 @@ class Sensor:
     since_us : int
         Time of the first of these equal readings, in microseconds of TAI since 2000.
     step : float
-        Smallest difference of two consecutive readings, in kelvin; infinite before there is one.
+        Smallest nonzero difference of two consecutive readings (resolution), in kelvin; infinite as long as there is
+        none.
     sigma : float
         Standard deviation of a reading, in kelvin.
     recent : tuple[float, ...]
-        Residuals of the latest readings against their predictions, in standard deviations.
+        Residuals of the latest readings (reading minus prediction), in standard deviations.
     stuck : bool
-        Whether the sensor repeats its value more often than chance explains.
+        True if the sensor repeats its value more often than chance explains.
     """
 
     body: str
@@ -169,7 +173,7 @@ class Sensor:
         )
 
     def with_residual(self, white: float) -> Sensor:
-        """Return the sensor with the residual ``white`` of its newest reading, in standard deviations, added."""
+        """Return the sensor with the residual of its newest reading, in standard deviations, added to `recent`."""
         return replace(self, recent=(*self.recent, white)[-SENSOR_WINDOW:])
 
     @property
@@ -179,12 +183,12 @@ class Sensor:
 
     @property
     def disagrees(self) -> bool:
-        """True if the chi-square of the latest residuals exceeds its limit."""
+        """True if the chi-square of the latest residuals exceeds its critical value."""
         square = sum(white**2 for white in self.recent)
         return bool(self.recent) and square > float(limit_of(FALSE_ALARM, len(self.recent)))
 
     def state(self, now: int, alone: bool) -> tuple[str, int, str]:
-        """Return the sensor's condition, the time since when, and the reason.
+        """Return the sensor's condition, the time since which it has it, and the reason.
 
         The condition is ``ok``, ``dead``, ``stuck`` or ``doubtful``; the time is in microseconds of TAI since 2000.
 
@@ -193,8 +197,8 @@ class Sensor:
         now : int
             Time of the newest entry of the record, in microseconds of TAI since 2000.
         alone : bool
-            Whether no other sensor disagrees with the prior at the same time. If several do, the prior is wrong and the
-            sensor is not doubtful.
+            True if no other sensor disagrees with the prior at the same time. If several do, the prior is considered
+            wrong, and the sensor is not doubtful.
         """
         if self.stuck:
             return "stuck", self.since_us, f"{self.repeats + 1} consecutive readings of {self.value:.6g} K"
@@ -214,14 +218,14 @@ class Sensor:
 
 @dataclass(frozen=True)
 class Scores:
-    """Quality of the predictions that were made before each reading of the monitor came.
+    """Quality of the predictions of the monitor's readings, each made before the reading was used.
 
     Attributes
     ----------
     readings : int
         Number of readings of the monitor.
     components : int
-        Number of statistically independent (decorrelated) components of these readings, summed over the readings.
+        Number of decorrelated components (such as spot coordinates) of these readings, summed over the readings.
     within_one, within_two : int
         Number of components within one and within two standard deviations of the prediction.
     log_score : float
@@ -261,7 +265,7 @@ class Scores:
 
 @dataclass(frozen=True)
 class JumpDetection:
-    """A jump, and the time of the reading at which it was detected, in microseconds of TAI since 2000."""
+    """Jump of a body, and the time of the reading at which it was detected, in microseconds of TAI since 2000."""
 
     time: int
     jump: Jump
@@ -269,7 +273,7 @@ class JumpDetection:
 
 @dataclass(frozen=True, eq=False)
 class EstimatorState:
-    """State of the estimator after the entries up to a time.
+    """State of the estimator after the record's entries up to a time.
 
     Array dimensions: Q quantities, D spot coordinates, P camera parameters, n filter states, U used entries, m motions
     that may jump.
@@ -291,23 +295,24 @@ class EstimatorState:
     excluded : tuple[tuple[int, str, str, str], ...]
         (time_us, kind, subject, reason) of the latest entries that were not used.
     scatter_sums : (4, Q) ndarray
-        Four sums over the readings, for every quantity: of the quantity, of its square, of the quantity without the
-        part that temperatures explain, and of the square of that. `explained` is computed from them.
+        Four sums over the readings, for every quantity: of the quantity, of its square, of the quantity minus the part
+        that temperatures explain, and of the square of this difference. `explained` is computed from them.
     basis : (D + P, n) ndarray
-        Spot coordinates and camera parameters due to one unit of each filter state. They identify the basis of the
-        state space, which depends on this computer's linear algebra.
+        Spot coordinates (px) and camera parameters (rad, m) due to one unit of each filter state. They identify the
+        basis of the state space, which depends on the linear algebra library of the computer.
     used : (U,) ndarray of int64
         Ids of the entries used since the last permanent checkpoint, in their order.
     undetected_shares : (U, m) ndarray
-        Share of the mean square of each motion's jumps that could not be detected, before each of these entries.
+        Before each of these entries and for each motion, the share of the mean square of its possible jumps that
+        readings could not have detected, 0 to 1.
     new_innovations : tuple[tuple[int, float, int], ...]
         Innovations since the last permanent checkpoint, in the form of `innovations`.
     stuck_sensors : tuple[tuple[str, int], ...]
-        (body, time_us) of sensors that repeat their value, with the time of the first equal reading; none of their
-        readings from that time on is used.
+        (body, time_us) of sensors that repeat their value, with the time of the first equal reading; their readings
+        from that time on are not used.
     pending : tuple[int, int] | None
-        (id, time_us) of a reading of the monitor that was set aside until the next one decides about it; it is part of
-        `used`.
+        (id, time_us) of a possible outlier among the monitor's readings, about which the next reading decides; it is
+        part of `used`.
     bad_readings : tuple[tuple[int, str], ...]
         (time_us, reason) of the latest readings of the monitor that were rejected as outliers, and of a pending one.
     first_innovations : tuple[tuple[int, float, int], ...]
@@ -336,9 +341,9 @@ class EstimatorState:
 
     @property
     def explained(self) -> Array:
-        """Share of the variance of every quantity over the readings that the measured temperatures explain, (Q,).
+        """Share of each quantity's variance over the readings that measured temperatures explain, (Q,), 0 to 1.
 
-        NaN before there are two readings.
+        It is NaN as long as there are fewer than two readings.
 
         Array dimensions: Q quantities.
         """
@@ -351,13 +356,23 @@ class EstimatorState:
         return np.where(whole > 0.0, 1.0 - rest / np.where(whole > 0.0, whole, 1.0), np.nan)
 
     def excluding(self, time: int, kind: str, subject: str, reason: str) -> EstimatorState:
-        """Return the state with one more entry, described by its arguments, in the list of those not used."""
+        """Return the state with one more entry in the list of excluded ones.
+
+        Parameters
+        ----------
+        time : int
+            Time of the entry, in microseconds of TAI since 2000.
+        kind, subject : str
+            Kind of the entry, and its body or camera.
+        reason : str
+            Reason for the exclusion.
+        """
         return replace(
             self, time=max(self.time, time), excluded=(*self.excluded, (time, kind, subject, reason))[-HISTORY_LENGTH:]
         )
 
     def with_decision(self, excluded: str) -> EstimatorState:
-        """Return the state after the decision about the reading that was set aside.
+        """Return the state after the decision about the reading that was a possible outlier.
 
         Parameters
         ----------
@@ -383,7 +398,7 @@ class EstimatorState:
 
     @property
     def newly_stuck(self) -> tuple[tuple[str, int], ...]:
-        """Sensors recognised as repeating their value, some of whose repeated readings have been used already.
+        """Sensors newly recognised as stuck (repeating a value) after some repeated readings were used.
 
         Each is (body, time_us of the first equal reading).
         """
@@ -415,7 +430,7 @@ class EstimatorState:
         )
 
     def with_counters_reset(self) -> EstimatorState:
-        """Return the state with empty lists of the entries and innovations since the last permanent checkpoint."""
+        """Return the state with its lists of entries and innovations since the last permanent checkpoint emptied."""
         return replace(self, used=self.used[:0], undetected_shares=self.undetected_shares[:0], new_innovations=())
 
     @classmethod
@@ -433,7 +448,7 @@ class EntryFilter:
     Attributes
     ----------
     model : OperationModel
-        Traced model of the instrument and its disturbances.
+        Model of the instrument and its disturbances (unintended motions and temperature changes), from ray traces.
     series_filter : SeriesFilter
         Kalman filter of this model, in which the record's events are steps of the motions.
     epoch : int
@@ -455,7 +470,7 @@ class EntryFilter:
         return (time - self.epoch) / MICRO
 
     def start(self, time: int, stuck_sensors: tuple[tuple[str, int], ...] = ()) -> EstimatorState:
-        """Return the state before any entry.
+        """Return the initial state of the estimator, before any entry of the record.
 
         Parameters
         ----------
@@ -474,10 +489,10 @@ class EntryFilter:
         Parameters
         ----------
         state : EstimatorState
-            State before them.
+            State before these entries.
         entries : Sequence[Mapping[str, Any]]
-            Entries of one time, each with its content as plain data and, as ``decided``, the decision of a person
-            (whether it is included, and why); None where there is no decision.
+            Entries of one time, each with its content as plain data and, under the key ``decided``, the decision of a
+            person about it (whether it is used, and why), or None.
         """
         state = replace(state, time=max(state.time, int(entries[0]["time_us"])))
         for entry in entries:
@@ -496,7 +511,7 @@ class EntryFilter:
         return state
 
     def observed(self, entry: Mapping[str, Any]) -> Observed:
-        """Return an entry as an observation of the filter.
+        """Convert an entry of the record to an observation for the Kalman filter.
 
         Parameters
         ----------
@@ -583,7 +598,7 @@ class EntryFilter:
         )
 
     def _outlier_text(self, number: int, innovation: Innovation) -> str:
-        """Return in words why a reading is rejected as an outlier."""
+        """Return a text with the reason why a reading is rejected as an outlier."""
         assert innovation.bad is not None
         camera, channel = self.model.spots[innovation.bad.coordinate // 2]
         axis = ("row", "column")[innovation.bad.coordinate % 2]

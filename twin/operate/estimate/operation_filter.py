@@ -1,8 +1,8 @@
 """Estimate of an instrument's state from its record: now, at any past time and ahead, with standard deviations.
 
-A reading updates the estimate with the same work whatever the length of the record: the estimator's state is kept in
-the record beside the readings, and later readings continue from there. After a reading that came late the estimate
-continues from the newest checkpoint before it. The result is the same to the bit whenever it is asked for.
+The work for a new reading does not depend on the length of the record: the estimator's state is stored in the record
+beside the readings, and filtering continues from there. After a reading that arrived late, it continues from the newest
+checkpoint (stored state) before it. The result is identical to the bit, however often and whenever it is computed.
 """
 
 from __future__ import annotations
@@ -57,14 +57,14 @@ CHECKPOINT_READINGS = 1000
 HEAD_READINGS = 16
 """Number of new readings after which the newest state is saved.
 
-Filtering as many again is as fast as writing it.
+Filtering so many readings again takes as long as saving the state.
 """
 _MODEL, _HEAD = -1, 0
-"""Numbers of the checkpoints that hold the traced model, and the newest state of the estimator."""
+"""Numbers of two checkpoints in the record: the traced model, and the newest state of the estimator."""
 
 
 class Operation:
-    """Estimate of a record under a plan of operation.
+    """Estimate of an instrument's state from its record, under a plan of operation.
 
     Parameters
     ----------
@@ -73,17 +73,17 @@ class Operation:
     plan
         Plan of operation of the record's instrument.
     advance
-        Called with the number of readings that were filtered, and their total.
+        Callback that receives the number of readings filtered so far, and their total.
     previous
-        Estimate of the same record before the newest readings came, from which this one continues; None if there is
-        none.
+        Estimate of the same record before the newest readings, from which this one continues; None if there is none.
 
     Attributes
     ----------
     epoch
         Time of the first reading of the monitor, in microseconds of TAI since 2000; the filter's seconds count from it.
     key
-        SHA-256 of everything besides the readings that the estimate depends on; it identifies the checkpoints.
+        SHA-256 of all inputs other than the readings on which the estimate depends (such as plan and program); it
+        identifies the checkpoints.
 
     Raises
     ------
@@ -129,7 +129,7 @@ class Operation:
                 self._previous, self._saved = (known.get("estimator_state"), previous._newest), previous._saved
 
     def updated(self) -> Operation:
-        """Return the same estimate with the newest readings of the record; faster than a new one."""
+        """Continue the estimate with the newest readings of the record, which is faster than a new estimate."""
         return Operation(self.history, self.plan, self._advance, self)
 
     @cached_property
@@ -155,14 +155,14 @@ class Operation:
 
     @cached_property
     def events(self) -> tuple[tuple[int, str, tuple[str, ...]], ...]:
-        """Events of the record that step motions under the plan, each as (time_us, name, causes)."""
+        """Events of the record at which motions step according to the plan, each as (time_us, name, causes)."""
         events = ((int(entry["time_us"]), str(entry["subject"])) for entry in self.history.entries("event"))
         known = self.plan.operation.events
         return tuple((time, name, tuple(known[name])) for time, name in events if known.get(name))
 
     @cached_property
     def _entry_filter(self) -> EntryFilter:
-        """Kalman filter in which the record's events are steps of the motions."""
+        """Kalman filter that allows for steps of the motions at the record's events."""
         causes = self.model.series_filter.stated.causes
         steps = []
         for time, _, stepping in self.events:
@@ -183,7 +183,7 @@ class Operation:
 
     @cached_property
     def _decisions(self) -> dict[int, tuple[bool, str]]:
-        """Decision of a person about an entry, by the entry's id: whether it is included, and why."""
+        """Decisions of persons about entries, by the entry's id: whether it is used, and why."""
         decisions = (content_of(entry) for entry in self.history.entries(DECISION))
         return {int(decision["entry"]): (bool(decision["included"]), str(decision["why"])) for decision in decisions}
 
@@ -224,7 +224,10 @@ class Operation:
         return state
 
     def _rewind(self, state: EstimatorState) -> EstimatorState | None:
-        """Return the newest checkpoint before a sensor got stuck, or None; its later readings are not used."""
+        """Return the newest checkpoint before a sensor got stuck; None if there is none.
+
+        Filtering continues from there without the readings of this sensor since it got stuck.
+        """
         self._stuck_sensors = (*state.stuck_sensors, *state.newly_stuck)
         since = min(time for _, time in state.newly_stuck)
         self.history.drop_checkpoints(self.key, since)
@@ -256,7 +259,7 @@ class Operation:
         return state.with_counters_reset() if checkpoint.number > _HEAD else state
 
     def _has_same_basis(self, state: EstimatorState) -> bool:
-        """Return whether a saved state uses the state basis that this computer's linear algebra gives."""
+        """Return whether a saved state has the basis of the state space that this computer's linear algebra gives."""
         basis = self._entry_filter.series_filter.space.basis
         if state.basis.shape != basis.shape:
             return False
@@ -267,7 +270,7 @@ class Operation:
         self.history.save_checkpoint(self.key, number, state.time, newest, packed(state))
 
     def filter_readings(self) -> FilterResult:
-        """Filter all new readings and return the present estimate, with jumps, sensors and requirements."""
+        """Filter all new readings; return the present estimate with jumps, sensors and requirements."""
         state = self.estimator_state
         now = self.forecast([state.time])
         jumps = tuple(self._detected_jump(jump.time, jump.jump) for jump in state.jumps)
@@ -297,7 +300,7 @@ class Operation:
     def power(self) -> tuple[DetectionPower, ...]:
         """Return the smallest detectable jump of each body at the mean interval of the readings so far.
 
-        Empty if there is only one reading.
+        The result is empty for a single reading.
         """
         count, noise = self.estimator_state.scores.readings, self.model.series_filter.reference_noise
         if count < 2 or noise is None:
@@ -307,7 +310,7 @@ class Operation:
             return detection_power(self.model.series_filter, interval, noise)
 
     def _understated_causes(self) -> tuple[str, ...]:
-        """Return the causes of the temperatures of bodies whose sensors jointly disagree with the prior."""
+        """Return the causes, in the prior, of temperatures with which the sensors of several bodies disagree."""
         stated, heat, disagreeing = (
             self.model.series_filter.stated,
             self.model.series_filter.heat,
@@ -333,7 +336,7 @@ class Operation:
         )
 
     def _requirement_status(self) -> tuple[RequirementStatus, ...]:
-        """Return the status of every requirement of the plan, now and within the horizon."""
+        """Return the status of every requirement of the plan, now and within the horizon of the forecast."""
         operation, start = self.plan.operation, self.estimator_state.time
         if not operation.requirements:
             return ()
@@ -386,7 +389,7 @@ class Operation:
 
     @cached_property
     def _now(self) -> FilterState:
-        """Filter state after all readings, with possible undetected jumps weighted by their probabilities."""
+        """Filter state after all readings, as the mixture over possible undetected jumps and their probabilities."""
         return self._entry_filter.series_filter.mixture(self.estimator_state.filter_state)
 
     @cached_property
@@ -397,10 +400,10 @@ class Operation:
         return float(inflation_factors(squares, [len(squares)], False, self._lasting(times))[0])
 
     def _lasting(self, times: Sequence[int]) -> list[tuple[int, Array]]:
-        """Return contradictions between readings and prior that inflate sigma permanently.
+        """Return contradictions between readings and prior that enlarge the sigmas of all later estimates.
 
-        Each is (number of readings before it, array of chi-square and degrees of freedom). They are those of the first
-        readings, and the residuals that a detected jump leaves unexplained.
+        Each is (number of readings before it, array of chi-square and degrees of freedom). They come from the first
+        readings, and from residuals that a detected jump does not explain.
         """
         out = [(0, self._unexplained(self.estimator_state.first_innovations))]
         jumps = [] if self.too_many_jumps else self.estimator_state.jumps
@@ -408,9 +411,9 @@ class Operation:
 
     @cached_property
     def too_many_jumps(self) -> bool:
-        """True if more jumps were detected than the plan specifies, at a false-alarm rate of one in a thousand.
+        """True if significantly more jumps were detected than the plan's rates predict (p-value below 0.001).
 
-        A body without a specified rate counts as one expected jump.
+        For a body without a specified rate, one jump is expected.
         """
         stated, lasted = self.model.series_filter.stated, (self.estimator_state.time - self.epoch) / MICRO
         mean_intervals = {body: law.every_s for body, law in zip(stated.bodies, stated.laws, strict=True) if law.jump}
@@ -419,9 +422,9 @@ class Operation:
         return bool(count > 1 and pdtrc(count - 1, mean) < FALSE_ALARM)
 
     def _unexplained(self, innovations: Sequence[tuple[int, float, int]]) -> Array:
-        """Return chi-square and degrees of freedom (N, 2) of readings; zero where a detected jump explains the reading.
+        """Return chi-square and degrees of freedom (N, 2) of readings; zero where a detected jump explains them.
 
-        If more jumps were detected than the plan specifies, none is taken as an explanation.
+        If too many jumps were detected (`too_many_jumps`), none counts as an explanation.
 
         Array dimensions: N readings.
         """
@@ -439,7 +442,7 @@ class Operation:
     def _course(
         self, times: NDArray[np.int64], estimates: Sequence[tuple[Array, Array]], sigma_inflation: Array
     ) -> Course:
-        """Return the estimate of all quantities at the times, from camera parameters and their covariances."""
+        """Convert estimated camera parameters and covariances at given times to all quantities with their sigmas."""
         rows = self.model.rows
         changes = np.array([one for one, _ in estimates]).reshape(len(times), rows.shape[1])
         covariance = np.array([one for _, one in estimates]).reshape(len(times), rows.shape[1], rows.shape[1])
@@ -480,15 +483,15 @@ class Operation:
         return out
 
     def motions(self, time_us: int, acting: bool = False) -> Motions:
-        """Return every specified motion at one time, given all readings.
+        """Return the estimates of all specified motions at one time, from all readings.
 
         Parameters
         ----------
         time_us : int
             Microseconds of TAI since 2000, from the first reading on.
         acting : bool
-            Multiply the temperatures of bodies with sensors by the estimated factor between their true and their
-            computed effect on light, so that the traced effect of the motions agrees with `smoothed`.
+            True to multiply the temperatures of bodies with sensors by the estimated ratio of their true to their
+            computed optical effect, so that the traced effect of the motions agrees with `smoothed`.
 
         Raises
         ------
@@ -509,14 +512,14 @@ class Operation:
         return Motions(int(time_us), stated.labels, stated.units, size * mean, size[:, None] * spread * size)
 
     def _steps(self, told_after: int | None = None) -> tuple[Step, ...]:
-        """Return the detected jumps as steps of the filter; only those detected after a time, if one is given."""
+        """Return the detected jumps as steps for the filter, optionally only those detected after a time."""
         own = (jump for jump in self.estimator_state.jumps if told_after is None or jump.time > told_after)
         return tuple(Step.of(one.jump) for one in own)
 
     def _states_at(
         self, times: NDArray[np.int64], each: Callable[[Array, Array, float], tuple[Array, Array]]
     ) -> list[tuple[Array, Array]]:
-        """Evaluate a function of the filter's state at given times, from all readings; later times are forecast."""
+        """Evaluate a function of the smoothed (or, after the newest reading, forecast) state at given times."""
         entry_filter, last = self._entry_filter, self.estimator_state
         if len(times) and times.max() >= last.time:
             with one_blas_thread():
@@ -535,21 +538,22 @@ class Operation:
             return smoothed(series_filter, start, observed, seconds, left, each)
 
     def smooth_jointly(self, times_us: Sequence[int] | NDArray[np.int64]) -> tuple[Array, Array]:
-        """Return the smoothed estimate at several times with the covariance between times.
+        """Return the smoothed estimate at several times with the joint covariance of all times.
 
         Array dimensions: T times, K cameras with 4 parameters each.
 
         Parameters
         ----------
         times_us : (T,) sequence of int
-            Microseconds of TAI since 2000, ascending, from the first reading on. If one is before the newest reading,
-            jumps that the latest readings only hint at are ignored for the later ones.
+            Microseconds of TAI since 2000, ascending, from the first reading on. If one of them is before the newest
+            reading, possible jumps that are not yet significant are ignored at the later times.
 
         Returns
         -------
         tuple of ndarray
-            (T, 4 K) d_alpha, d_beta, d_gamma (rad) and d_f (m) of one camera after the other, and (T, 4 K, T, 4 K)
-            covariance of their errors. At a single time they equal `smoothed`.
+            (T, 4 K) rotations d_alpha, d_beta, d_gamma (rad) and changes d_f of the principal distance (m) of one
+            camera after the other, and (T, 4 K, T, 4 K) covariance of their errors. At a single time they equal
+            `smoothed`.
 
         Raises
         ------
@@ -575,10 +579,11 @@ class Operation:
             raise Problem("the time is before the first reading", utc_text(time), allowed)
 
     def _smoothing_inputs(self, time: int) -> tuple[SeriesFilter, FilterState, list[Observed], list[Array]]:
-        """Return the inputs of a smoother that estimates states from a given time on.
+        """Return the inputs of a smoother for the states from a given time on.
 
-        They are the filter with all detected jumps as steps, the state at which it begins, the observations from there
-        on, and, before each, the share of the mean square of each motion's jumps that could not be detected.
+        They are the filter with all detected jumps as steps, its initial state, the observations from there on, and,
+        before each observation, the share of the mean square of each motion's possible jumps that readings could not
+        have detected.
         """
         entry_filter, start = self._entry_filter, self._checkpoint_before(time)
         told = None if start is None else start.time
@@ -597,9 +602,10 @@ class Operation:
         return knowing, filter_state, observed, with_hints
 
     def _used_entries(self, after_us: int | None) -> tuple[NDArray[np.int64], Array]:
-        """Return the ids of the entries used after a checkpoint, and the undetected shares of jumps before each.
+        """Return the ids of the entries used after a checkpoint, and the undetectable shares of jumps before each.
 
-        An undetected share is the share of the mean square of a motion's jumps that could not have been detected.
+        An undetectable share is the share of the mean square of a motion's possible jumps that readings could not have
+        detected.
         """
         spans = self._segments(after_us)
         width = len(self._entry_filter.series_filter.walking)
@@ -609,9 +615,9 @@ class Operation:
         return used[good], left[good]
 
     def _segments(self, after_us: int | None) -> list[EstimatorState]:
-        """Return the permanent checkpoints after a time and the newest state.
+        """Return the estimator's states at the permanent checkpoints after a time, and the newest state.
 
-        Each lists the entries used since the one before.
+        Each state lists the entries used since the one before it.
         """
         return [segment for segment in self._all_segments if after_us is None or segment.time > after_us]
 
@@ -631,7 +637,7 @@ class Operation:
         return min(int(one["time_us"]) for kind in USED if (one := self.history.first(kind)) is not None)
 
     def _checkpoint_before(self, time: int) -> EstimatorState | None:
-        """Return the newest permanent checkpoint before a time and before all jumps detected since; or None."""
+        """Return the newest permanent checkpoint before a time and all jumps detected since; None if there is none."""
         last = self.estimator_state
         while True:
             checkpoint = self.history.checkpoint(self.key, before_us=time, valid=True)

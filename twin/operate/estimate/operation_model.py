@@ -1,8 +1,8 @@
 """Model on which the estimate of an instrument in operation depends, and its plans of operation.
 
-`traced_model` traces what each specified motion does to the spots and to the cameras' parameters, and what the
-temperature sensors read of it. Plans of operation are read from a file, checked against the record's instrument and
-stored in the record.
+`traced_model` traces the effect of each specified motion on the monitor's spots and on the cameras' parameters, and
+relates temperatures to the readings of the sensors. Plans of operation are read from a file, checked against the
+record's instrument and stored in the record.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from twin.operate.record.entries import digest_of_data, digest_of_job
 from twin.operate.record.history import History
 
 BEFORE = 0.01
-"""Time between the calibration and the first reading, as a share of the mission.
+"""Assumed time between the calibration and the first reading, as a share of the mission's duration.
 
 The probability of a jump in that time, and its part of the false-alarm probability, are proportional to it.
 """
@@ -41,21 +41,21 @@ The probability of a jump in that time, and its part of the false-alarm probabil
 
 @dataclass(frozen=True, eq=False)
 class OperationModel:
-    """Traced model of the instrument under a plan of operation.
+    """Linear model of the instrument under a plan of operation, from ray traces.
 
     Array dimensions: K cameras with 4 parameters each, D spot coordinates.
 
     Attributes
     ----------
     series_filter : SeriesFilter
-        Kalman filter of the model, without the record's events.
+        Kalman filter of the model, without the steps at the record's events.
     spots : tuple[tuple[str, str], ...]
         (camera, channel) of each spot, in the order of the spot shifts.
     quantities : tuple[Quantity, ...]
         The Q estimated quantities.
     reading : (4 K, D) ndarray
-        Camera parameters per pixel of spot shift (rad/px and m/px) by the estimator `model`, which assumes that every
-        camera moves as a whole.
+        Derivatives of the camera parameters with respect to spot shifts (rad/px and m/px) according to the estimator
+        `model`, which assumes that every camera moves as a whole.
     """
 
     series_filter: SeriesFilter
@@ -84,7 +84,7 @@ def traced_model(
     Parameters
     ----------
     setup : OperationSetup
-        The plan with its instrument.
+        Plan of operation with its instrument.
     reference_sigma : (C, 2) ndarray
         Standard deviations of the spots in the reference images, row and column in pixels.
     sensors : Sequence[str]
@@ -95,7 +95,7 @@ def traced_model(
     Returns
     -------
     OperationModel
-        The filter, its spots, its quantities and the readings per pixel.
+        Filter, spots, quantities, and camera parameters per pixel of spot shift.
 
     Raises
     ------
@@ -126,7 +126,7 @@ def traced_model(
 def heat_inputs(
     stated: DisturbancePrior, thermal: ThermalModel, sensors: Sequence[str], sigma: float
 ) -> HeatInputs | None:
-    """Return the model of the temperature sensors' readings as functions of the prior's temperatures.
+    """Return the model of the sensors' readings as a linear function of the prior's temperatures.
 
     None is returned if no sensor reads a temperature of the prior. A sensor is located at its body's origin. A body
     without a specified temperature has that of the body that carries it.
@@ -140,7 +140,8 @@ def heat_inputs(
     sensors : Sequence[str]
         Bodies that have a sensor.
     sigma : float
-        Standard deviation of the factor between the true and the computed effect of each body's heat on light.
+        Relative standard deviation, over the bodies, of the ratio of the true to the computed optical effect of a
+        body's temperature.
     """
     heat = [k for k, component in enumerate(stated.components) if component.kind in HEAT]
     still = {stated.components[k].body: Temperature() for k in heat}
@@ -173,7 +174,7 @@ def read_plan(path: Path, history: History) -> OperationSetup:
     path : Path
         The file.
     history : History
-        Record, for whose instrument the plan has to be.
+        Record; the plan must be for its instrument.
 
     Raises
     ------
@@ -196,7 +197,7 @@ def read_plan(path: Path, history: History) -> OperationSetup:
 
 
 def quantity_names(instrument: InstrumentSpec) -> tuple[str, ...]:
-    """Return group and key of all quantities of an instrument, such as ``forward`` and ``d_alpha_arcsec``.
+    """Return group and key of all quantities of an instrument, such as ``forward d_alpha_arcsec``.
 
     Their order is that of `analysis.monitor.limits.quantities`.
     """
@@ -228,7 +229,7 @@ def stored_plan(history: History) -> OperationSetup | None:
 def plan_digest(setup: OperationSetup) -> str:
     """Return the SHA-256 of the parts of a plan that the estimate depends on.
 
-    The requirements, and the locations of its files, do not count.
+    Requirements and the locations of files do not affect it.
     """
     plain = setup.plain()
     operation = {key: value for key, value in plain["operation"].items() if key not in _NO_PART}
@@ -236,4 +237,4 @@ def plan_digest(setup: OperationSetup) -> str:
 
 
 _NO_PART = ("instrument", "disturbances", "horizon", "requirements")
-"""Keys of a plan that do not change the estimate of the present and past, and so not its digest."""
+"""Keys of a plan that do not affect the estimate of the present and past, and are therefore not part of its digest."""

@@ -1,7 +1,7 @@
 """Reported estimate of an instrument in operation: values with sigmas over time, jumps, sensors and alarms.
 
-An alarm tells a person that a requirement is violated or will be, that a body jumped, that a sensor fails, or that
-readings contradict the prior. Each alarm is raised once, and stays open in the record until somebody acknowledges it. A
+An alarm reports that a requirement is violated or will be, that a body jumped, that a sensor fails, or that readings
+contradict the prior. Each alarm is raised once, and stays open in the record until somebody acknowledges it. A
 continuing condition, such as a requirement that stays violated, is not raised again while its alarm is open, nor within
 a month of an acknowledged alarm.
 """
@@ -28,9 +28,9 @@ from twin.operate.record.entries import MICRO, Alarm, utc_text
 from twin.operate.record.history import History
 
 MOST_BAD = 2
-"""Number of outlier readings among the latest 200 above which a warning is given.
+"""Largest number of outliers among the latest 200 readings without a warning.
 
-Three of 200 are rejected by chance once in a thousand times.
+By chance, three of 200 are rejected with a probability of 0.001.
 """
 
 
@@ -49,8 +49,8 @@ class Course:
     sigmas : (T, Q) ndarray
         Total standard deviations of the values.
     changes : (T, 4 K) ndarray
-        Rotations d_alpha, d_beta, d_gamma (rad) and change of principal distance d_f (m) of one of K cameras after the
-        other.
+        Rotations d_alpha, d_beta, d_gamma (rad) and changes d_f of the principal distance (m) of K cameras, one camera
+        after the other.
     covariance : (T, 4 K, 4 K) ndarray
         Covariance of the errors of `changes`.
     """
@@ -64,7 +64,7 @@ class Course:
 
     @property
     def utc(self) -> tuple[str, ...]:
-        """The times in UTC, ISO 8601."""
+        """Times of the estimate in UTC, ISO 8601 texts."""
         return tuple(utc_text(int(time)) for time in self.times)
 
     def to_dict(self) -> dict[str, Any]:
@@ -77,7 +77,7 @@ class Course:
 
 
 class _Dated:
-    """Base of data classes whose fields ``..._us`` become ``..._utc`` in plain data."""
+    """Base of data classes whose times (fields ``..._us``, microseconds) become UTC texts in plain data."""
 
     def to_dict(self) -> dict[str, Any]:
         """Return the fields as plain data, times as UTC."""
@@ -90,7 +90,7 @@ class _Dated:
 
 @dataclass(frozen=True)
 class DetectedJump(_Dated):
-    """A jump of one body that the readings showed.
+    """Jump (sudden motion) of one body that was detected in the readings.
 
     Attributes
     ----------
@@ -107,11 +107,11 @@ class DetectedJump(_Dated):
     false_alarm : float
         Upper bound of the probability that so large a ratio occurs at any time in a mission without jumps.
     rivals : Mapping[str, float]
-        Other bodies that could have jumped -> their log likelihood ratio.
+        Other bodies that could have jumped -> log likelihood ratio of a jump of that body.
     line_changes : Mapping[str, tuple[float, float, float]]
-        Quantity -> (read, changed, sigma): the change that the spots indicate if every camera moves as a whole; the
-        estimated change of the line of sight, averaged over the bodies that can have jumped; and its standard
-        deviation. The first two differ because a part that moves the spots need not move the line of sight as much.
+        Quantity -> (read, changed, sigma) in the quantity's unit: the change that the spots indicate if every camera
+        moves as a whole; the estimated change of the line of sight, averaged over the bodies that can have jumped; and
+        its standard deviation. The first two differ because a part can affect the spots more than the line of sight.
     """
 
     body: str
@@ -158,7 +158,7 @@ class SensorState(_Dated):
     Attributes
     ----------
     body : str
-        Path of the body that carries it.
+        Path of the body that carries the sensor.
     state : str
         ``ok``, ``dead``, ``stuck`` or ``doubtful``.
     since_us : int
@@ -166,7 +166,7 @@ class SensorState(_Dated):
     last_us : int
         Time of its newest reading.
     reason : str
-        Reason in words; empty if it is ok.
+        Reason as text; empty if the state is ``ok``.
     """
 
     body: str
@@ -178,7 +178,7 @@ class SensorState(_Dated):
 
 @dataclass(frozen=True)
 class RequirementStatus(_Dated):
-    """Status of a requirement of the plan.
+    """Status of a requirement of the plan: limit of a quantity's change, and probability of exceeding it.
 
     Attributes
     ----------
@@ -189,14 +189,14 @@ class RequirementStatus(_Dated):
     limit : float
         Limit of the absolute change.
     probability : float
-        Required probability that the limit is kept.
+        Required probability that the change is within the limit.
     chance_now : float
         Probability that the limit is exceeded now.
     holds_now : bool
-        Whether the requirement holds now.
+        True if the requirement is met now.
     breaks_us : int | None
-        First time within the horizon at which it does not hold, in microseconds of TAI since 2000; None if it always
-        holds.
+        First time within the horizon of the forecast at which it is violated, in microseconds of TAI since 2000; None
+        if it is always met.
     """
 
     quantity: str
@@ -210,7 +210,7 @@ class RequirementStatus(_Dated):
 
 @dataclass(frozen=True, eq=False)
 class Motions:
-    """Estimate of all M specified motions at one time.
+    """Estimate of all M motions specified in the disturbances, at one time.
 
     Attributes
     ----------
@@ -246,13 +246,13 @@ class FilterResult:
     now : Course
         Estimate at that time.
     scores : Scores
-        Quality of the predictions made before each reading came.
+        Quality of the predictions of the readings.
     innovations : tuple[tuple[int, float, int], ...]
         (time_us, chi-square, degrees of freedom) of the latest readings' innovations (reading minus prediction).
     jumps : tuple[DetectedJump, ...]
         Detected jumps.
     events : tuple[tuple[int, str, tuple[str, ...]], ...]
-        (time_us, name, causes that stepped) of the events.
+        (time_us, name, causes whose motions stepped) of the events.
     sensors : tuple[SensorState, ...]
         Condition of the temperature sensors.
     excluded : tuple[tuple[int, str, str, str], ...]
@@ -262,13 +262,13 @@ class FilterResult:
     sigma_inflation : float
         Factor by which present sigmas are inflated because the latest readings contradict the prior; 1 if they do not.
     too_many_jumps : bool
-        Whether more jumps were detected than the plan specifies.
+        True if significantly more jumps were detected than the plan specifies.
     requirements : tuple[RequirementStatus, ...]
         Status of the plan's requirements.
     bad_readings : tuple[tuple[int, str], ...]
         (time_us, reason) of the latest readings of the monitor that were rejected as outliers.
     undecided : bool
-        Whether the newest rejected reading may be the first one after a jump; the sigmas then allow for both cases.
+        True if the newest rejected reading may be the first one after a jump; the sigmas then include both cases.
     understated_causes : tuple[str, ...]
         Causes of the prior with which the sensors of several bodies jointly disagree.
     """
@@ -292,7 +292,7 @@ class FilterResult:
 
     @property
     def warnings(self) -> list[str]:
-        """Warnings to be read before the numbers are used, one sentence each."""
+        """Warnings about the reliability of the estimate, one sentence each."""
         out = []
         if self.sigma_inflation > 1.0:
             text = f"all sigmas are inflated by a factor of {self.sigma_inflation:.3g}"
@@ -346,9 +346,9 @@ def beyond(value: Array, sigma: Array, limit: float) -> Array:
     Parameters
     ----------
     value : ndarray
-        Mean.
+        Mean of the quantity.
     sigma : ndarray
-        Standard deviation, of the same shape.
+        Standard deviation of the quantity, of the same shape.
     limit : float
         Limit in the same unit.
     """
@@ -359,13 +359,13 @@ def beyond(value: Array, sigma: Array, limit: float) -> Array:
 def inflation_factors(
     squares: Array, now: Sequence[int] | NDArray[np.intp], centred: bool, lasting: Sequence[tuple[int, Array]] = ()
 ) -> Array:
-    """Return the factors (T,) by which the sigmas are inflated because readings contradict the prior.
+    """Return the factors (T,) by which sigmas at T times are enlarged because readings contradict the prior.
 
-    The factor is the root of chi-square over its degrees of freedom, of the last reading or of several consecutive
-    ones, whichever is larger; it is 1 if chance explains them. A contradiction of the first readings, or of a jump,
-    lasts: the unobservable part of the state depends on it for as long as nothing explains it.
+    The factor is the root of the innovations' chi-square divided by its degrees of freedom, of the last reading or of
+    several consecutive ones, whichever is larger; it is 1 if chance explains them. A contradiction of the first
+    readings, or one after a jump, affects all later factors, because the unobservable part of the state depends on it.
 
-    Array dimensions: T times, N readings, n readings from that one on.
+    Array dimensions: T times, N readings, n readings after the beginning of a permanent contradiction.
 
     Parameters
     ----------
@@ -375,10 +375,10 @@ def inflation_factors(
     now : (T,) sequence of int
         Number of readings up to each time.
     centred : bool
-        Whether readings after the time count as well as those before it.
+        True if readings after the time are used as well as those before it.
     lasting : Sequence[tuple[int, ndarray]]
-        Lasting contradictions: number of readings from which on each counts, and an (n, 2) array in the form of
-        `squares`.
+        Permanent contradictions: number of readings after which each applies, and an (n, 2) array of n readings in the
+        form of `squares`.
     """
     sums = np.concatenate([np.zeros((1, 2)), np.cumsum(squares, axis=0)])
     out, number = np.ones(len(now)), np.asarray(now, int)
@@ -397,11 +397,13 @@ def inflation_factors(
 
 
 AGAIN = 30 * 86_400 * MICRO
-"""Time after which a continuing condition raises its alarm again, once acknowledged, in microseconds."""
+"""Time after an acknowledged alarm from which a continuing condition raises it again, in microseconds."""
 LEAST = 1e-6
-"""Probability below which reports print "less than" this bound instead of a number."""
+"""Probability below which reports print "less than" and this bound instead of a number."""
 _CLOSE = 3.0
-"""Difference of log likelihood ratios (a factor of 20) below which another body explains a jump nearly as well."""
+"""Difference of log likelihood ratios below which another body explains a jump nearly as well: a likelihood ratio of
+20.
+"""
 BROKEN, BREAKS, JUMP, SENSOR, CONTRADICTION = "broken", "breaks", "jump", "sensor", "contradiction"
 Row = Mapping[str, Any]
 
@@ -421,14 +423,14 @@ def raise_alarms(history: History, plan: OperationSpec, result: FilterResult) ->
     Returns
     -------
     list[Alarm]
-        The new alarms.
+        Alarms that were added.
     """
     before = history.alarms()
     return [one for one in alarms_of(plan, result) if not _is_repeated(one, before) and history.raise_alarm(one)]
 
 
 def alarms_of(plan: OperationSpec, result: FilterResult) -> Iterator[Alarm]:
-    """Yield all alarms that the estimate gives rise to, whether they have been raised before or not."""
+    """Yield all alarms that follow from the estimate, including those that have been raised before."""
     for requirement in result.requirements:
         if not requirement.holds_now or requirement.breaks_us is not None:
             yield _of_requirement(requirement, result.time, result.now.quantities)
@@ -446,7 +448,11 @@ def alarms_of(plan: OperationSpec, result: FilterResult) -> Iterator[Alarm]:
 
 
 def _is_repeated(alarm: Alarm, before: Sequence[Row]) -> bool:
-    """Return whether an alarm repeats an earlier one."""
+    """Return whether an alarm repeats an earlier one of the same kind and subject.
+
+    An earlier alarm counts while it is open and, in general, within the time `AGAIN` of it. A jump is repeated if the
+    times in which it may have occurred overlap; a contradiction is not, since each reading can raise one.
+    """
     same = [one for one in before if (one["kind"], one["subject"]) == (alarm.kind, alarm.subject)]
     if alarm.kind == JUMP:  # later readings determine the time of a jump better
         began, ended = alarm.content["after_us"], alarm.content["until_us"]
@@ -457,12 +463,12 @@ def _is_repeated(alarm: Alarm, before: Sequence[Row]) -> bool:
 
 
 def name_of(quantity: str, quantities: Sequence[Quantity]) -> str:
-    """Return a quantity in words, such as ``Δf of forward``.
+    """Return the display name of a quantity, such as ``Δf of forward``.
 
     Parameters
     ----------
     quantity : str
-        Group and key.
+        Group and key of the quantity, such as ``forward d_f_um``.
     quantities : Sequence[Quantity]
         All estimated quantities.
     """
@@ -482,7 +488,7 @@ def percent(chance: float) -> str:
 
 
 def _of_requirement(requirement: RequirementStatus, time: int, quantities: Sequence[Quantity]) -> Alarm:
-    """Return the alarm of a requirement that is violated or will be."""
+    """Return the alarm of a requirement that is violated or is expected to be."""
     name, allowed = name_of(requirement.quantity, quantities), percent(1.0 - requirement.probability)
     limit = f"{plain(requirement.limit)} {requirement.unit}"
     if not requirement.holds_now:
@@ -509,17 +515,17 @@ def with_sigma(value: float, sigma: float, unit: str, sign: bool = False) -> str
 
 
 def _of_bad(bad: tuple[int, str]) -> Alarm:
-    """Return the alarm of a monitor reading that was rejected as an outlier; ``bad`` is its time and reason."""
+    """Return the alarm of a monitor reading that was rejected as an outlier, given its time and the reason."""
     time, reason = bad
     text = f"the reading of {utc_text(time)} was rejected as an outlier: {reason}; exclude --include uses it anyway"
     return Alarm(CONTRADICTION, "monitor", time, text, {"time_utc": utc_text(time), "reason": reason})
 
 
 def _contradictions(plan: OperationSpec, result: FilterResult) -> Iterator[Alarm]:
-    """Yield alarms of readings too far from their predictions and not explained by a detected jump.
+    """Yield alarms of readings that differ too much from their predictions without a detected jump.
 
-    The false-alarm probability of the whole life is shared out by time: each reading has the share of the interval
-    before it.
+    The false-alarm probability of the whole mission is distributed in proportion to time: each reading has the share of
+    the interval before it.
     """
     spans = [(jump.after_us, jump.detected_us) for jump in result.jumps]
     innovations = result.innovations

@@ -13,11 +13,11 @@ FILE = "record.sqlite"
 
 
 class NotARecord(Exception):
-    """A database that holds no record, or one of a different version; the message says what to do."""
+    """Error of a database that holds no record, or one of a different version; the message gives a remedy."""
 
 
 class RecordFailed(Exception):
-    """A database operation that failed, such as on a full disk or a lost server; nothing is half done."""
+    """Error of a database operation that failed, for example due to a full disk; its transaction was undone."""
 
 
 def require_file(file: Path) -> None:
@@ -33,5 +33,5 @@ def require_file(file: Path) -> None:
 
 
 def file_of(place: str) -> Path | None:
-    """Return the file of a record in a folder; None for the address of a database."""
+    """Return the path of a record's file in a folder; None if the location is the address of a database."""
     return None if "://" in place else Path(place).absolute() / FILE

@@ -24,7 +24,7 @@ MICRO = 1_000_000
 DECISION = "decision"
 """Kind of an entry by which a person excludes another entry from the estimate, or includes it."""
 _NOT_THE_INSTRUMENT = ("description", "disturbances")
-"""Keys of an instrument's file that do not count for its identity (its SHA-256)."""
+"""Keys of an instrument's file that are not included in the SHA-256 that identifies the instrument."""
 
 
 def canonical(data: Any) -> str:
@@ -45,7 +45,7 @@ def digest_of_data(data: Any) -> str:
 
 @dataclass(frozen=True)
 class Entry:
-    """One reading or one event.
+    """Entry of a record: one reading of the monitor or of a sensor, or one event.
 
     Attributes
     ----------
@@ -79,12 +79,12 @@ class Entry:
 
 @dataclass(frozen=True)
 class Refusal:
-    """A row or a file that was refused.
+    """Row of a table, or file, that was refused by a record, with the reason.
 
     Attributes
     ----------
     reason : str
-        Error, and its remedy.
+        Text of the error, and its remedy.
     line : int | None
         Line of the file; None for the whole file.
     entry : Entry | None
@@ -98,7 +98,7 @@ class Refusal:
 
 @dataclass(frozen=True)
 class Alarm:
-    """A condition that a person has to know of.
+    """Alarm of an operation: a condition that a person has to know of.
 
     Attributes
     ----------
@@ -122,7 +122,7 @@ class Alarm:
 
     @property
     def digest(self) -> str:
-        """SHA-256 that identifies the alarm by its kind, subject and time, whatever its numbers."""
+        """SHA-256 that identifies the alarm by its kind, subject and time, independent of its numbers."""
         return digest_of_data([self.kind, self.subject, self.time])
 
 
@@ -137,7 +137,7 @@ class FileContent:
     sha256 : str
         SHA-256 of the file.
     meaning : str
-        SHA-256 of the description by which the file was read: its columns, or the time of a run.
+        SHA-256 of the description with which the file was read: columns of a table, or time of a run.
     items : Sequence[Entry | Refusal]
         Entries and refusals in the order of the file.
     frames : Mapping[str, str]
@@ -158,7 +158,7 @@ def _leap(day: int) -> float:
 
 
 def micros(text: str, scale: str = "UTC", seconds: float = 0.0) -> int:
-    """Return the time of a clock's reading in microseconds of TAI since 2000.
+    """Convert the reading of a clock to microseconds of TAI since 2000.
 
     Parameters
     ----------
@@ -183,9 +183,9 @@ def micros(text: str, scale: str = "UTC", seconds: float = 0.0) -> int:
 
 
 def micros_after(epoch: str, scale: str, seconds: float) -> int:
-    """Return the time of a clock that counts seconds from an epoch, in microseconds of TAI since 2000.
+    """Convert seconds that a clock counts from an epoch to microseconds of TAI since 2000.
 
-    The clock's days have 86400 s.
+    All days of the clock have 86400 s.
 
     Parameters
     ----------
@@ -206,7 +206,7 @@ def micros_after(epoch: str, scale: str, seconds: float) -> int:
 
 
 def _count(day: int, second: float) -> int:
-    """Return microseconds since 2000 from a Modified Julian day and a second of TAI."""
+    """Convert a Modified Julian day and second of the day, both TAI, to microseconds since 2000."""
     return (day - EPOCH_DAY) * int(DAY) * MICRO + round(second * MICRO)
 
 
@@ -234,8 +234,8 @@ def now() -> int:
 def instrument_digest(instrument: Mapping[str, Any], cameras: Mapping[str, Any]) -> str:
     """Return the SHA-256 that identifies an instrument: its geometry and its cameras' prescriptions.
 
-    Descriptions, disturbances, and the data sheet and exposure of its CCDs do not count: a measurement may state
-    others.
+    Descriptions, disturbances, and the data sheet and exposure of its CCDs are not included, because they may differ
+    between measurements.
 
     Parameters
     ----------

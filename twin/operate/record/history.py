@@ -1,6 +1,6 @@
-"""Record of one instrument in a database: ingest, decisions and queries, also as of an earlier time.
+"""Record of one instrument in a database: ingest of readings, exclusions, and queries, also for an earlier time.
 
-Entries never change.
+Entries are never altered.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ from twin.operate.record.schema import (
 from twin.operate.record.taking import Ingest, IngestResult
 
 USED = ("monitor", "temperature")
-"""Kinds of entries that are observations of the estimate; events act on it as steps of the motions."""
+"""Kinds of entries that the estimate uses as observations; events are used as times at which motions may step."""
 
 
 class History:
@@ -65,7 +65,7 @@ class History:
         Folder or address of the record.
     until
         Time of an earlier state of the record, in microseconds of TAI since 2000: readings after it are hidden, and
-        nothing but the traced model is added. None for the whole record.
+        only the traced model can be added. None for the whole record.
 
     Attributes
     ----------
@@ -147,16 +147,16 @@ class History:
         raise AssertionError
 
     def decide(self, number: int, included: bool, why: str) -> dict[str, Any]:
-        """Exclude an entry from the estimate, or include it; the newest decision on an entry counts.
+        """Exclude an entry from the estimate or include it again; the newest decision on an entry is valid.
 
-        The decision is an entry itself.
+        The decision is stored as an entry itself.
 
         Parameters
         ----------
         number : int
             Id of the entry, a reading of the monitor or a temperature.
         included : bool
-            Whether it counts from now on.
+            True to use the entry from now on, False to exclude it.
         why : str
             Reason of the decision.
 
@@ -199,7 +199,7 @@ class History:
     def entries(self, kind: str = "", after_us: int | None = None) -> Iterator[dict[str, Any]]:
         """Yield readings and events in the order of time; those of one time in the order in which they were ingested.
 
-        SQLite has no writer while they are read: collect what is needed before writing.
+        SQLite cannot be written while they are read: collect the required entries before writing.
 
         Parameters
         ----------
@@ -227,7 +227,10 @@ class History:
             yield from map(dict, connection.execute(query.order_by(c.time_us, c.id)).mappings())
 
     def refusals(self) -> list[dict[str, Any]]:
-        """Return the refusals in their order; ``taken_since`` says whether the reading has been ingested since."""
+        """Return the refusals in the order in which they were recorded.
+
+        The value of ``taken_since`` is True if the refused reading has been ingested since.
+        """
         there = select(ENTRY.c.id).where(ENTRY.c.sha256 == REFUSED.c.entry).exists()
         query = select(*REFUSED.c, SOURCE.c.file, there.label("taken_since")).join(
             SOURCE, REFUSED.c.source_id == SOURCE.c.id
@@ -236,12 +239,12 @@ class History:
             return [dict(row) for row in connection.execute(query.order_by(REFUSED.c.id)).mappings()]
 
     def status(self, check_all_entries: bool = False) -> dict[str, Any]:
-        """Return the contents of the record in numbers, as plain data.
+        """Return a summary of the record as plain data: instrument, entries by kind and subject, checks, refusals.
 
         Parameters
         ----------
         check_all_entries : bool
-            Check the digests of all entries, instead of the newest ones only.
+            True to check the digests of all entries, instead of the newest ones only.
         """
         with self.reading() as connection:
             streams = [
@@ -274,7 +277,7 @@ class History:
         }
 
     def store_plan(self, file: str, content: Mapping[str, Any]) -> bool:
-        """Store a plan of operation, which counts from now on.
+        """Store a plan of operation, which is in force from now on.
 
         Parameters
         ----------
@@ -286,7 +289,7 @@ class History:
         Returns
         -------
         bool
-            Whether it differs from the newest stored plan.
+            True if it differs from the newest stored plan.
         """
         digest = digest_of_data(content)
         with writing(self._engine) as connection:
@@ -306,7 +309,7 @@ class History:
         return None if row is None else {**row, "content": content_of(dict(row))}
 
     def first(self, kind: str) -> dict[str, Any] | None:
-        """Return the earliest entry of a kind, with the keys that `entries` yields; None if there is none."""
+        """Return the earliest entry of a kind, as a mapping like those of `entries`; None if there is none."""
         c = ENTRY.c
         with self.reading() as connection:
             # query each subject by the index, which orders by subject before time
@@ -321,7 +324,7 @@ class History:
         return dict(min(rows, key=lambda row: (row["time_us"], row["id"]))) if rows else None
 
     def subjects(self, kind: str) -> list[str]:
-        """Return the subjects of a kind of reading, in alphabetical order."""
+        """Return the subjects (such as bodies or cameras) of a kind of reading, in alphabetical order."""
         with self.reading() as connection:
             return _subjects(connection, kind)
 
@@ -331,7 +334,7 @@ class History:
             return int(connection.execute(select(func.max(ENTRY.c.id))).scalar_one() or 0)
 
     def came_late(self, after_id: int, until_us: int) -> bool:
-        """Return whether an entry up to a time was ingested after another one.
+        """Return whether an entry dated up to a time was ingested after a given other entry.
 
         Parameters
         ----------
@@ -351,14 +354,14 @@ class History:
         Parameters
         ----------
         plan : str
-            Digest of everything that the estimate depends on besides the readings.
+            Digest of all inputs of the estimate other than the readings.
         number : int | None
-            Return the checkpoint of this number only. Without it checkpoints of negative numbers are ignored, and where
-            a time is given also number 0, which is not permanent.
+            Number of the checkpoint to be returned. None for any; then checkpoints with negative numbers are ignored
+            and, if a time is given, also number 0, which is not permanent.
         before_us : int | None
-            Return the newest before this time, in microseconds of TAI since 2000.
+            Time before which the checkpoint must be, in microseconds of TAI since 2000; None for any.
         valid : bool
-            Ignore a checkpoint if a reading up to its time has come since it was saved.
+            True to ignore a checkpoint if a reading dated up to its time was ingested after it was saved.
         """
         c, e = CHECKPOINT.c, ENTRY.c
         if self._until is not None:
@@ -376,7 +379,7 @@ class History:
         Parameters
         ----------
         plan : str
-            Digest of everything that the estimate depends on besides the readings.
+            Digest of all inputs of the estimate other than the readings.
         """
         c = CHECKPOINT.c
         query = select(CHECKPOINT).where(c.plan == plan, *_not_after(c.time_us, self._until))
@@ -384,16 +387,16 @@ class History:
             return list(connection.execute(query.order_by(c.time_us, c.number)))
 
     def save_checkpoint(self, plan: str, number: int, time_us: int, entry_id: int, content: bytes) -> bool:
-        """Save the state of an estimate; it replaces an earlier one of the same number.
+        """Save the state of an estimate, replacing an earlier one of the same number.
 
         Parameters
         ----------
         plan : str
-            Digest of everything that the estimate depends on besides the readings.
+            Digest of all inputs of the estimate other than the readings.
         number : int
             Number of the checkpoint.
         time_us : int
-            Time of the newest reading in it, in microseconds of TAI since 2000.
+            Time of the newest reading used in it, in microseconds of TAI since 2000.
         entry_id : int
             Largest id in the record when the readings were queried.
         content : bytes
@@ -402,7 +405,7 @@ class History:
         Returns
         -------
         bool
-            Whether it was saved; it is not if a reading up to that time has come since.
+            True if it was saved; False if a reading dated up to that time was ingested in the meantime.
         """
         if self._until is not None and number >= 0:  # the newest estimate is not replaced
             return False
@@ -429,7 +432,7 @@ class History:
         Returns
         -------
         bool
-            Whether it is new.
+            True if the alarm is new.
         """
         if self._until is not None:  # alarms of an earlier time were raised at that time
             return False
@@ -493,7 +496,7 @@ class History:
 
 
 def _late(after_id: Any, until_us: Any) -> tuple[Any, Any]:
-    """Return the conditions of entries up to a time that were ingested after another one."""
+    """Return the SQL conditions for entries dated up to a time that were ingested after a given other entry."""
     # few ids are newer, but all times are earlier: the sum prevents a scan of the index of times
     return ENTRY.c.id > after_id, ENTRY.c.time_us + 0 <= until_us
 
@@ -514,7 +517,7 @@ def _numbered(number: int | None, before_us: int | None) -> Any:
 
 
 def _streams(connection: Connection) -> Iterator[tuple[str, str]]:
-    """Yield kind and subject of all readings in order, by index look-ups instead of a scan of the table."""
+    """Yield the pairs of kind and subject that occur in the record, sorted, by look-ups in the index."""
     c = ENTRY.c
     in_order = select(c.kind, c.subject).order_by(c.kind, c.subject).limit(1)
     stream = connection.execute(in_order).first()
@@ -531,7 +534,7 @@ def _subjects(connection: Connection, kind: str) -> list[str]:
 def _stream_extent(connection: Connection, kind: str, subject: str) -> tuple[int, int, int]:
     """Return the number of readings of one kind and subject, and the first and last of their times.
 
-    Each is one query that the index answers.
+    Each value is one query that the index of the table answers.
     """
     c = ENTRY.c
     aggregates = (func.count(), func.min(c.time_us), func.max(c.time_us))
@@ -553,7 +556,7 @@ def bodies_of(job: ResolvedJob) -> dict[str, list[str]]:
 
 
 def initialise_record(place: str, job: ResolvedJob, simulated: bool = False) -> tuple[int, ...]:
-    """Create a record if there is none.
+    """Create the record of an instrument if there is none.
 
     Parameters
     ----------
@@ -567,7 +570,7 @@ def initialise_record(place: str, job: ResolvedJob, simulated: bool = False) -> 
     Returns
     -------
     tuple[int, ...]
-        Version of the new record; empty if there was one.
+        Version of the new record; empty if a record existed.
 
     Raises
     ------

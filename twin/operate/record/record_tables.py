@@ -122,7 +122,7 @@ TABLES: Mapping[str, Record[Row]] = {
         _key("taken_since", "whether the reading has been ingested since"),
     ),
 }
-"""Name of a table -> its columns."""
+"""Columns of each output table, by name of the table."""
 
 
 def tables(history: History) -> list[DataTable]:

@@ -1,7 +1,7 @@
-"""Tables of a record in a database, and the access to it.
+"""Database tables of a record, and the access to the database.
 
-The tables have a version and triggers that refuse every change of a row. A database is found by its address, written by
-one writer at a time, and its failures are raised as `RecordFailed`.
+The tables have a version, and triggers that prevent every change of a row. Only one process at a time writes to a
+database, and its failures are raised as `RecordFailed`.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ LAST_CHECKED = 500
 """Number of the newest entries whose digests are checked at every status; checking all of them takes too long."""
 _METADATA = MetaData()
 _NUMBER = BigInteger().with_variant(Integer(), "sqlite")
-"""Column type of ids; SQLite numbers rows automatically only if their type is INTEGER."""
+"""Column type of row ids; SQLite numbers rows automatically only if their type is INTEGER."""
 
 
 def _table(name: str, *columns: Any) -> Table:
@@ -64,7 +64,7 @@ SCHEMA = _table(
     Column("made_utc", String(32), nullable=False),
     Column("program", Text, nullable=False),
 )
-"""One row for each version that the record has had."""
+"""Table of the versions of the database tables, one row for each version that the record has had."""
 INSTRUMENT = _table(
     "instrument",
     Column("name", Text, nullable=False),
@@ -83,14 +83,16 @@ SOURCE = _table(
     Column("taken_utc", String(32), nullable=False),
     Column("rows_read", Integer, nullable=False),
 )
-"""One row for each ingested file; ``taking`` is the digest of the file and of the description it was read by."""
+"""Table of ingested files, one row each; ``taking`` is the digest of the file and of the description with which it was
+read.
+"""
 FRAME = _table(
     "frame",
     Column("source_id", _NUMBER, ForeignKey("source.id"), nullable=False, index=True),
     Column("file", Text, nullable=False),
     _digest("sha256", nullable=False),
 )
-"""Images that a source was measured in: recorded frames of a monitor."""
+"""Table of the images (recorded frames of a monitor) in which the readings of a source file were measured."""
 ENTRY = _table(
     "entry",
     _digest("sha256", nullable=False, unique=True),
@@ -106,7 +108,7 @@ ENTRY = _table(
     Index("entry_origin", "origin"),
     Index("entry_time", "time_us", "id"),
 )
-"""One row for each reading or event, with the fields of `twin.operate.record.entries.Entry`."""
+"""Table of readings and events, one row each, with the fields of `twin.operate.record.entries.Entry`."""
 REFUSED = _table(
     "refused",
     _digest("sha256", nullable=False, unique=True),
@@ -117,7 +119,7 @@ REFUSED = _table(
     Column("refused_utc", String(32), nullable=False),
     Index("refused_entry", "entry"),
 )
-"""One row for each refused reading or table row; ``entry`` is the digest of the reading, if it could be read."""
+"""Table of refused readings and table rows; ``entry`` is the digest of the reading, if it could be read."""
 PLAN = _table(
     "plan",
     _digest("sha256", nullable=False),
@@ -125,7 +127,7 @@ PLAN = _table(
     Column("content", Text, nullable=False),
     Column("kept_utc", String(32), nullable=False),
 )
-"""One row for each plan of operation under which the record was filtered; the newest counts."""
+"""Table of the plans of operation under which the record was filtered; the newest is in force."""
 ALARM = _table(
     "alarm",
     _digest("sha256", nullable=False, unique=True),
@@ -137,7 +139,7 @@ ALARM = _table(
     Column("content", Text, nullable=False),
     Index("alarm_stream", "kind", "subject", "time_us"),
 )
-"""One row for each alarm, with the fields of `twin.operate.record.entries.Alarm`."""
+"""Table of alarms, one row each, with the fields of `twin.operate.record.entries.Alarm`."""
 ACKNOWLEDGEMENT = _table(
     "acknowledgement",
     Column("alarm_id", _NUMBER, ForeignKey("alarm.id"), nullable=False, unique=True),
@@ -145,7 +147,7 @@ ACKNOWLEDGEMENT = _table(
     Column("note", Text, nullable=False),
     Column("acknowledged_utc", String(32), nullable=False),
 )
-"""One row for each acknowledged alarm."""
+"""Table of the acknowledgements of alarms, one row each."""
 CHECKPOINT = _table(
     "checkpoint",
     _digest("plan", nullable=False),
@@ -156,15 +158,15 @@ CHECKPOINT = _table(
     UniqueConstraint("plan", "number"),
     Index("checkpoint_time", "time_us"),
 )
-"""States of an estimate at some times. They are derived from the entries: the only rows that may change."""
+"""Table of saved states of estimates. They are derived from the entries, and are the only rows that may change."""
 _DERIVED = (CHECKPOINT.name,)
 
 
 def _triggers(table: Table) -> dict[str, str]:
-    """Return name and SQL of the triggers by which SQLite refuses to alter, remove and replace rows of a table.
+    """Return name and SQL of the triggers that prevent altering, removing and replacing rows in SQLite.
 
-    INSERT OR REPLACE removes rows without firing a trigger on DELETE, so that the rows it would remove are looked for
-    before the insert.
+    INSERT OR REPLACE removes rows without firing a trigger on DELETE. A trigger before INSERT therefore checks whether
+    rows would be removed.
     """
     out, name = {}, table.name
     for what in ("UPDATE", "DELETE"):
@@ -178,7 +180,10 @@ def _triggers(table: Table) -> dict[str, str]:
 
 
 def _guard(connection: Connection, table: Table) -> None:
-    """Make SQLite or PostgreSQL refuse changes of a table's rows; in other databases only the program does."""
+    """Create the triggers that prevent changes of a table's rows, in SQLite or PostgreSQL.
+
+    In other databases only the program prevents changes.
+    """
     if connection.dialect.name == "sqlite":
         for sql in _triggers(table).values():
             connection.execute(text(sql))
@@ -193,7 +198,7 @@ def _guard(connection: Connection, table: Table) -> None:
 
 
 def guarded(connection: Connection) -> bool:
-    """Return whether the database itself refuses to alter rows of the record."""
+    """Return whether the database itself prevents changes of the record's rows."""
     if connection.dialect.name == "sqlite":
         rows = connection.execute(text("SELECT name, sql FROM sqlite_master WHERE type = 'trigger'"))
         there = {name: " ".join(sql.split()) for name, sql in rows}
@@ -209,7 +214,7 @@ def guarded(connection: Connection) -> bool:
 
 
 def altered(connection: Connection, newest: int | None) -> tuple[int, list[str]]:
-    """Return the number of entries (the newest, or all) compared with their digests, and the errors found."""
+    """Compare entries (the newest ones, or all) with their digests; return their number and the errors found."""
     c = ENTRY.c
     rows = connection.execute(select(*c).order_by(c.id.desc()).limit(newest)).mappings().all()
     wrong = [
@@ -264,7 +269,7 @@ def require_version(found: int) -> None:
 WAIT = 60.0
 """Time that a writer waits for a second writer to finish, in seconds."""
 _LOCK = 7_236_001
-"""Number of the advisory lock by which writers on a PostgreSQL server take turns."""
+"""Number of the advisory lock that PostgreSQL grants to one writer at a time."""
 
 
 def url_of(place: str) -> URL:
@@ -310,7 +315,7 @@ def engine_of(url: URL) -> Engine:
 def _on_connect(connection: Any, record: object) -> None:
     """Configure a connection so that SQLAlchemy begins the transactions.
 
-    Each is on the disk, with its folder, when it ends.
+    Each transaction is written to the disk, with its folder, before it ends.
     """
     connection.isolation_level = None
     for pragma in ("journal_mode = DELETE", "synchronous = EXTRA", "foreign_keys = ON", "trusted_schema = OFF"):
@@ -318,7 +323,7 @@ def _on_connect(connection: Any, record: object) -> None:
 
 
 def _on_begin(connection: Connection) -> None:
-    """Begin a transaction; a writer locks the database before it reads what it compares with."""
+    """Begin a transaction; a writer locks the database first, so that the rows that it reads stay current."""
     writing = connection.get_execution_options().get("writing", False)
     connection.exec_driver_sql("BEGIN IMMEDIATE" if writing else "BEGIN")
 

@@ -1,4 +1,4 @@
-"""Ingest of one file into a record: new entries, known entries, and refusals of those that cannot be true."""
+"""Ingest of one file into a record: new entries, known entries, and refusals of implausible ones."""
 
 from __future__ import annotations
 
@@ -14,15 +14,16 @@ from twin.operate.record.entries import MICRO, Entry, FileContent, Refusal, cano
 from twin.operate.record.schema import CHECKPOINT, ENTRY, FRAME, REFUSED, SOURCE
 
 SAME_IMAGES = 0.2
-"""Root mean square difference of spots, in sigmas, up to which two readings come from the same images.
+"""RMS difference of spot positions, in sigmas, up to which two readings count as measured in the same images.
 
-Spots in different images of the same state differ by 1.4 sigmas, and with eight coordinates by less than this once in a
-million; spots in the same images differ only where different pixels are excluded.
+Spots in different images of the same state differ by 1.4 sigmas on average, and with eight coordinates by less than
+this limit with a probability of 1e-6; spots measured in the same images differ only where different pixels are
+excluded.
 """
 _BATCH = 500
-"""Number of rows in one query or insert."""
+"""Number of rows in one query or insert of the database."""
 AHEAD = 24 * 3600 * MICRO
-"""Time by which a reading may be later than the computer's clock, in microseconds; beyond it its clock is wrong."""
+"""Largest time by which a reading may be later than the computer's clock, in microseconds; later ones are refused."""
 
 
 Before = Mapping[tuple[str, str, str], tuple[float, float]]
@@ -44,7 +45,7 @@ class IngestResult:
     refused : tuple[tuple[int | None, str], ...]
         Line and reason of every refusal.
     before : bool
-        Whether the same file was ingested before.
+        True if the same file was ingested before.
     refused_before : int
         Number of the refusals that were recorded before and are not counted again.
     """
@@ -71,9 +72,9 @@ class Ingest:
     connection
         Connection in the transaction of the record's only writer.
     simulated
-        Whether the readings are simulated, so that their times are not compared with the computer's clock.
+        True if the readings are simulated, so that their times are not compared with the computer's clock.
     late
-        Accept readings older than the newest of their kind and subject in the record.
+        True to accept readings older than the newest of their kind and subject in the record.
     """
 
     def __init__(self, connection: Connection, simulated: bool, late: bool) -> None:
@@ -117,9 +118,9 @@ class Ingest:
     def _new_refusals(
         self, content: FileContent, refused: list[tuple[Refusal, str | None]], before: bool
     ) -> dict[str, tuple[Refusal, str | None]]:
-        """Return the refusals that are new, by digest.
+        """Return the refusals that the record does not have yet, by digest.
 
-        A reading counts once whatever file it comes in, and an unreadable row once in each file, however the file
+        A refused reading counts once, in whatever file it is, and an unreadable row once in each file, also if the file
         grows.
         """
         out = {
@@ -132,7 +133,7 @@ class Ingest:
         return {key: own for key, own in out.items() if key not in known and own[1] not in readings}
 
     def _present(self, column: Any, digests: list[str]) -> set[str]:
-        """Return those of the digests that a column of the record contains."""
+        """Return those of the given digests that a column of the database contains."""
         present: set[str] = set()
         for k in range(0, len(digests), _BATCH):
             query = select(column).where(column.in_(digests[k : k + _BATCH]))
@@ -140,7 +141,7 @@ class Ingest:
         return present
 
     def _refusal_reason(self, entry: Entry) -> str:
-        """Return why a new reading cannot be true of this record; empty if it can."""
+        """Return the reason why a new reading is implausible for this record; empty if it is plausible."""
         c, stream = ENTRY.c, (entry.kind, entry.subject)
         if not self.simulated and entry.time > now() + AHEAD:
             return (
@@ -174,7 +175,7 @@ class Ingest:
         return ""
 
     def _reference_conflict(self, entry: Entry) -> str:
-        """Return why a reading of the monitor cannot be compared with those of the record; empty if it can."""
+        """Return the reason why a monitor reading cannot be compared with those of the record; empty if it can."""
         spots = _before(entry.content)
         if self.first is None:
             c = ENTRY.c
@@ -215,9 +216,9 @@ class Ingest:
         Parameters
         ----------
         content : FileContent
-            File that they come from.
+            File from which the rows come.
         source_digest : str
-            Digest of the file and of the description by which it was read.
+            Digest of the file and of the description with which it was read.
         source : int | None
             Id of the file's row; None if the record does not have it yet.
         new_entries : list[tuple[Entry, str]]
@@ -269,7 +270,7 @@ class Ingest:
 
 
 def _before(content: Mapping[str, Any]) -> Before:
-    """Return the spots in the reference images of a reading of the monitor, those that have a sigma."""
+    """Return positions and sigmas of a monitor reading's spots in its reference images, where they have a sigma."""
     out = {}
     for camera, channels in (content["numbers"].get("spots") or {}).items():
         for channel, spot in channels.items():

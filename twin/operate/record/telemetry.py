@@ -1,6 +1,6 @@
 """Readings and events from tables, row by row, and from run folders.
 
-Readings that cannot be true are refused with a reason.
+Implausible readings are refused with a reason.
 """
 
 from __future__ import annotations
@@ -86,7 +86,7 @@ def run_entries(place: Path, kind: str, moment: int, history: History, assume_in
     history : History
         Record of the instrument in operation.
     assume_instrument : bool
-        Assume that a run which does not name its instrument is of the record's instrument.
+        True to assume that a run which does not name its instrument is of the record's instrument.
     """
     folder = place.parent if place.name in RESULTS.values() else place
     kind = kind or kind_of_run(folder)
@@ -117,7 +117,7 @@ def _image_digests(manifest: Manifest) -> dict[str, str]:
 
 
 def _require_unchanged(folder: Path, file: Path, digest: str, manifest: Manifest) -> None:
-    """Raise Problem if the results are not those that the run wrote."""
+    """Raise Problem if the results of a run have been altered since it wrote them."""
     known = {file.name: digest}
     known |= {CONFIG: digest_of(folder / CONFIG)} if is_file(folder / CONFIG) else {}
     changed = [name for name, own in known.items() if manifest.sha256.get(name) != own]
@@ -166,7 +166,7 @@ def _run_readings(kind: str, data: Any, start: int, digest: str, frames: Mapping
 
 
 def _entry(kind: str, moment: int, content: Mapping[str, Any], origin: str) -> Entry:
-    """Return a reading whose size and numbers a record can hold. Raise Problem otherwise."""
+    """Return a reading as an entry; raise Problem if it is too large or has numbers that a record cannot store."""
     try:
         text = canonical(content)
     except ValueError:
@@ -181,7 +181,7 @@ LARGEST = 1 << 28
 MOST_DEPARTURE = 100.0
 """Largest plausible difference of a body's temperature from the instrument's, in kelvin.
 
-A job's changes of temperature have the same limit.
+It is also the limit for temperature changes in a job.
 """
 QUATERNION_TOLERANCE = 1e-3
 """Largest difference between a quaternion's length and 1 with which it is accepted."""
@@ -195,7 +195,7 @@ def read_telemetry(path: Path, history: History) -> TelemetrySpec:
     path : Path
         The YAML file.
     history : History
-        Record, for whose instrument the tables have to be.
+        Record; the tables must be for its instrument.
 
     Raises
     ------
@@ -321,7 +321,7 @@ def _keyword_items(
 
 
 def _entry_or_refusal(make: Callable[..., Entry], *of: Any) -> Entry | Refusal:
-    """Return the entry that a function makes, or its Problem as a refusal; the last argument is the line."""
+    """Return the entry that a function makes, or a refusal if it raises Problem; the last argument is the line."""
     try:
         return make(*of)
     except Problem as problem:
@@ -434,13 +434,13 @@ class Sources:
     Attributes
     ----------
     places : Sequence[Path]
-        YAML files, run folders, and folders with some of these.
+        Paths of YAML files, run folders, and folders that contain such files and folders.
     moment : int | None
         Time of the run folders named directly, in microseconds of TAI since 2000; None if their names contain it.
     assume_instrument : bool
-        Assume that run folders which do not name their instrument are of the record's instrument.
+        True to assume that run folders which do not name their instrument are of the record's instrument.
     watching : bool
-        Whether the sources are polled repeatedly, reading only what has changed.
+        True if the sources are checked repeatedly and only changed ones are read.
     seen : dict[str, State]
         Path -> modification time and size when it was read.
     """
@@ -515,7 +515,7 @@ class Sources:
 
 
 def _runs_named(table: ReadingTableSpec, path: Path) -> list[Path]:
-    """Return the manifests of the finished run folders that a table names."""
+    """Return the paths of the manifests of the finished run folders that a table names."""
     try:
         heads, *rows = [cells for _, cells in rows_apart(path, LARGEST) if not isinstance(cells, str)]
         column = [head.strip() for head in heads].index(str(table.name))

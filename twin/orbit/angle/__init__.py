@@ -1,1 +1,1 @@
-"""Intersection angles of lines from planes through the station and ground points, or from resection (paper 000)."""
+"""Intersection angles of lines (paper 000, Liu and Huang 2014) from planes through ground points, or resection."""

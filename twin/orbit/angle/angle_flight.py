@@ -1,8 +1,8 @@
-"""Truth and measurement of one moment of a pass, for tests of the angles between lines.
+"""Simulated truth and measurement at one moment of a pass, for tests of the angles between line cameras.
 
 The measurement has errors of the orbit at the station, and errors of the ground points from matching and aerial
-triangulation. Beside the coordinates, the analysis has the laboratory's measurement of each line before launch, and
-nothing else.
+triangulation. Besides these coordinates, the analysis uses only the laboratory's measurement of each line camera before
+launch.
 """
 
 from __future__ import annotations
@@ -45,17 +45,17 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class AngleCamera:
-    """Lines on their common base, before launch and in orbit.
+    """Line cameras on their common base, before launch and in orbit.
 
     Attributes
     ----------
     laboratory : Mapping[str, LineCamera]
-        Line -> camera as the laboratory measured it before launch, which the analysis knows.
+        Name of the line -> camera as the laboratory measured it before launch, which the analysis knows.
     cameras : Mapping[str, LineCamera]
         Line -> camera as it is in orbit.
     trace : Mapping[str, float]
-        Angle -> its change by exact ray trace (`twin.monitor.truth.trace_truth`), in radians; only for the two cameras
-        of a pair.
+        Name of the angle -> change of the angle since the laboratory by exact ray trace
+        (`twin.monitor.truth.trace_truth`), in radians; only for the two cameras of a pair.
     """
 
     laboratory: Mapping[str, LineCamera]
@@ -127,18 +127,18 @@ def _changed_state(spec: OrbitAngleSpec, instrument: Instrument) -> State:
 
 
 _LINE_TIME = 1e-3
-"""Time per image line, in seconds; only the middle of a single line is used."""
+"""Time per image line, in seconds; points are seen in the middle of a single line, so that its value hardly matters."""
 LEAST_SIGMA = 1e-3
 """Sigma assumed for points that are simulated without errors, in metres, because an adjustment needs weights."""
 _LEAST_CONVERGENCE = np.radians(1.0)
-"""Smallest angle between lines, in radians, at which heights are intersected: below it one arcsecond is half a
-kilometre and more.
+"""Smallest angle between lines, in radians, at which heights are intersected: below it, an error of one arcsecond in
+the angle changes the height by half a kilometre or more.
 """
 
 
 @dataclass(frozen=True, eq=False)
 class Measurement:
-    """Measured station and ground points, with the laboratory's interior of each line; one Cartesian frame, metres.
+    """Measured station and ground points in one Cartesian frame, with each line's interior orientation.
 
     Attributes
     ----------
@@ -149,10 +149,11 @@ class Measurement:
     strips : Mapping[str, Strip]
         Line -> measured ground points, with their covariances.
     tangent : Mapping[str, (n, 2) ndarray for n points]
-        Line -> laboratory's tangents of the points' directions from the line's centre, across the line and along it; X
-        forward, Y to the right.
+        Line -> tangents of the angles between the points' directions and that of the line's centre, across the line (X,
+        forward) and along it (Y, to the right), as the laboratory measured them.
     along : Mapping[str, (n,) ndarray]
-        Line -> tangent of the angle of each point from the line's centre along the line.
+        Line -> tangent of the angle between each point's direction and that of the line's centre, positive to the
+        right.
     look : Mapping[str, float]
         Line -> laboratory's angle of the line's centre from the body's Z about its Y, in radians.
     offset : Mapping[str, (n, 3) ndarray]
@@ -173,7 +174,7 @@ class Measurement:
 
     @classmethod
     def of(cls, laboratory: LineAngles, station: Station, strips: Mapping[str, Strip]) -> Measurement:
-        """Return the measurement of a station and points, with the laboratory's interior orientation of the lines.
+        """Combine a measured station and ground points with the laboratory's interior orientation of the lines.
 
         Parameters
         ----------
@@ -216,9 +217,9 @@ class Measurement:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class AnglePass(LineAngles):
-    """Truth at the moment of exposure, made by `fly`; all coordinates in the ITRS, in metres.
+    """Simulated truth at the moment of exposure, from `fly`; all coordinates in the ITRS, in metres.
 
-    The cameras are those in orbit, so that the angles are the true ones.
+    The cameras are those in orbit, after the changes since launch, so that the angles are the true ones.
 
     Attributes
     ----------
@@ -231,8 +232,8 @@ class AnglePass(LineAngles):
     laboratory : Mapping[str, LineCamera]
         Line -> camera as it was measured before launch.
     trace : Mapping[str, float]
-        Angle -> its change by exact ray trace (`twin.monitor.truth.trace_truth`), in radians; empty for lines that are
-        not the two cameras of a traced pair.
+        Name of the angle -> change of the angle since the laboratory by exact ray trace
+        (`twin.monitor.truth.trace_truth`), in radians; empty for lines that are not the two cameras of a traced pair.
     height : Mapping[str, (n,) ndarray for n points]
         Line -> heights of its points above the ellipsoid, in metres.
     """
@@ -251,7 +252,7 @@ class AnglePass(LineAngles):
 
     @property
     def reference(self) -> str:
-        """Line whose look angle is zero in a resection: the second of the first angle."""
+        """Name of the line camera with zero look angle in a resection: the second line of the file's first angle."""
         return next(iter(self.pairs.values()))[1]
 
     @property
@@ -266,12 +267,12 @@ class AnglePass(LineAngles):
 
     @property
     def effects(self) -> LightEffects:
-        """Effects on the light that the file switches on."""
+        """Effects on the light (light time, aberration, refraction) that the test's file switches on."""
         return LightEffects.of(self.spec.effects)
 
     @property
     def before_launch(self) -> LineAngles:
-        """Angles as the laboratory measured them."""
+        """Angles between the line cameras as the laboratory measured them before launch."""
         return LineAngles(self.laboratory, self.pairs, self.pixel)
 
     @property
@@ -305,7 +306,17 @@ class AnglePass(LineAngles):
         return np.stack([x, np.cross(z, x), z]) @ self.trajectory.body_to_itrs(self.spec.time).T
 
     def ground(self, effects: LightEffects) -> dict[str, np.ndarray]:
-        """Return the true ground points of each line for these effects on the light, ITRS, in metres.
+        """Return the true ground points that each line sees under given effects on the light, ITRS, in metres.
+
+        Parameters
+        ----------
+        effects : LightEffects
+            Effects on the light (light time, aberration, refraction) that are switched on.
+
+        Returns
+        -------
+        dict of str to (n, 3) ndarray for n points
+            Line -> ground points.
 
         Raises
         ------
@@ -336,11 +347,11 @@ class AnglePass(LineAngles):
         points : Mapping[str, (n, 3) ndarray for n points]
             Line -> true points, ITRS, in metres.
         seed : np.random.SeedSequence or None
-            Seed of the errors; None for no errors but the datum's.
+            Seed of the random errors; None for points without errors other than the shift of the datum.
         corrected : LightEffects
-            Effects that the analysis takes out of the points.
+            Effects on the light for which the analysis corrects the points.
         datum : tuple of float, optional
-            Shift of all points east, north and up, in metres; None for that of the file.
+            Shift of all points east, north and up, in metres; None for the shift in the test's file.
         """
         errors, lines = self.spec.errors, self.lines
         noise = np.zeros((1 + sum(len(points[name]) for name in lines), 3))
@@ -358,10 +369,11 @@ class AnglePass(LineAngles):
     def height_per_arcsec(self) -> dict[str, float | None]:
         """Return, by angle, the error of intersected heights for an error of 1 arcsec in that angle, in metres.
 
-        The point that the reference line's centre sees (or the second line's centre, where the reference is not one of
-        the two) is located in the other line's image, that line is then rotated by 1 arcsec about the body's Y, and the
-        two rays are intersected. There are no effects on the light. The value is None where the orbit is too short for
-        the other line to see the point, and for lines so nearly parallel that they give no heights.
+        The point that the centre of the reference line sees (or the centre of the second line, where the reference is
+        not one of the angle's two lines) is located in the other line's image. That line is then rotated by 1 arcsec
+        about the body's Y axis, and the two rays are intersected, without effects on the light. The value is None where
+        the orbit is too short for the other line to see the point, and for lines so nearly parallel that they give no
+        heights.
         """
         heights_by_angle: dict[str, float | None] = {}
         look = self.look
@@ -381,9 +393,9 @@ class AnglePass(LineAngles):
         return heights_by_angle
 
     def _ray(self, name: str, point: np.ndarray, rotation: float) -> tuple[np.ndarray, np.ndarray] | None:
-        """Return the ray of the pixel that sees a point, after a rotation of the line; None if none sees it.
+        """Return the ray of the pixel that sees a point, after a rotation of the line; None if no pixel sees it.
 
-        The ray is the projection centre and the direction.
+        The ray is a pair of (3,) arrays, projection centre in metres and direction; the rotation is in radians.
         """
         first, last = self.trajectory.first, self.trajectory.last
         lines = int((last - first) / _LINE_TIME) - 1
@@ -450,10 +462,10 @@ def fly(setup: AngleSetup, camera: AngleCamera, seed: np.random.SeedSequence) ->
 
 
 def _interior(camera: LineCamera, pixel: np.ndarray) -> dict[str, Any]:
-    """Return the laboratory's geometry of a line's N pixels (N,) as fields of a `Measurement`.
+    """Return the interior orientation of N pixels (N,) of a line, as the fields of a `Measurement`.
 
-    Tangents count across the line (forward) and along it (to the right) in the body's axes pitched to the line's
-    centre; the angle within the line is positive to the right.
+    Tangents are counted across the line (forward) and along it (to the right), in the body's axes rotated about Y to
+    the line's centre; the angle within the line is positive to the right.
     """
     centre = camera.look(np.array([0.5 * (camera.pixels - 1)]))[0]
     looks = camera.look(pixel)
@@ -476,7 +488,7 @@ def _interior(camera: LineCamera, pixel: np.ndarray) -> dict[str, Any]:
 def without_effects(
     points: np.ndarray, station: np.ndarray, velocity: np.ndarray, earth: Earth, effects: LightEffects
 ) -> np.ndarray:
-    """Return N ground points moved to the lines of sight that would see them without effects on the light.
+    """Correct N ground points for effects on the light, as if their lines of sight were straight.
 
     Parameters
     ----------
@@ -489,12 +501,12 @@ def without_effects(
     earth : Earth
         Ellipsoid.
     effects : LightEffects
-        Effects to take out.
+        Effects on the light to correct.
 
     Returns
     -------
     (N, 3) ndarray
-        Moved points, at the distances of the given ones.
+        Corrected points, ITRS, in metres, at unchanged distances from the satellite.
     """
     source = points
     delay = np.linalg.norm(source - station, axis=-1) / light_effects.SPEED_OF_LIGHT * effects.light_time
@@ -509,13 +521,13 @@ def without_effects(
 
 
 def _spread(camera: LineCamera, pixel: np.ndarray) -> np.ndarray:
-    """Return the positions on flat ground that N pixels see, along the line, in units of the flying height, (N,)."""
+    """Return the across-track positions on flat ground that N pixels see, divided by the flying height, (N,)."""
     look = camera.look(pixel)
     return np.asarray(look[:, 1] / look[:, 2])
 
 
 def _terrain(spec: OrbitAngleSpec, position: np.ndarray, random: np.random.Generator) -> np.ndarray:
-    """Draw heights at N positions along a strip, (N,), in metres: a normal process with a Gaussian correlation."""
+    """Draw heights at N positions along a strip, (N,), in metres: a Gaussian process with a Gaussian correlation."""
     distance = (position[:, None] - position) / spec.terrain.length
     unit = covariance_root(np.exp(-0.5 * distance**2)) @ random.standard_normal(len(position))
     return np.asarray(spec.terrain.height + spec.terrain.relief * unit)

@@ -29,11 +29,11 @@ METHOD_NAMES = {
     "corrected": "planes, eq. 5 with the right sign",
     "tls": "planes, total least squares",
 }
-"""Name in reports of each method of fitting planes."""
+"""Names in reports of the methods of fitting planes to station and ground points, by key."""
 EFFECT_NAMES = {"light_time": "light time", "all": "all three", "datum": "shift of all points"}
-"""Name in reports of effects whose key is not their name."""
+"""Names in reports of the effects on the light (light time, aberration, refraction) whose key is not their name."""
 _FALSE_ALARM = 1e-4
-"""Probability that a plane whose points are correct raises a warning."""
+"""Probability of a false alarm: a plane whose points are correct raises a warning."""
 _GREEK = {"alpha": "α", "beta": "β", "gamma": "γ", "delta": "δ"}
 COLOURS = (svg.BLUE, svg.GREEN, svg.VERMILION, svg.ORANGE, svg.PURPLE, svg.SKY)
 """Colours of the camera's lines in figures, in the order of the lines."""
@@ -82,7 +82,7 @@ def angle_report(run: AngleRun) -> Report:
 
 
 def _simulated_verdict(run: SimulatedAngleRun) -> tuple[list[str], tuple[str, ...]]:
-    """Return the sentences of a simulated test: angles against their truth, and planes against resection."""
+    """Return the verdict of a simulated test: angles compared with the truth, and planes with the resection."""
     names, flight, narrow = greek_names(run.names), run.flight, run.narrow
     tls, along = run.estimate.angles["tls"], run.estimate.along
     truth = np.where(narrow, values_of(flight.along_track), values_of(flight.dihedral))
@@ -389,7 +389,10 @@ def _moved(what: str) -> str:
 
 
 def _panels(run: SimulatedAngleRun) -> dict[str, list[tuple[str, str]]]:
-    """Return the panels of each figure, as (quantity with an error, angle), in the paper's order: Figs. 3 to 5."""
+    """Return the panels of each sensitivity figure: (quantity with an error, angle).
+
+    The figures correspond to Figs. 3 to 5 of paper 000 (Liu and Huang 2014).
+    """
     pairs = run.flight.pairs
     out = {"station": [("station", name) for name in pairs]}
     return out | {f"{name}-points": [(line, name) for line in pair] for name, pair in pairs.items()}
@@ -470,7 +473,10 @@ def _scatter_figure(run: SimulatedAngleRun) -> Figure:
 
 
 def _ellipse_of_passes(axes: Axes, scatter: Scatter) -> None:
-    """Draw two angles and the ellipse that should hold 95% of the passes."""
+    """Plot two angles estimated from each pass against each other, with the ellipse that contains 95 % of the passes.
+
+    The ellipse is computed by error propagation, about the true angles.
+    """
     error, phase = (scatter.values - scatter.truth) / ARCSEC, np.linspace(0.0, 2.0 * np.pi, 181)
     root = np.linalg.cholesky(scatter.covariance[:2, :2]) / ARCSEC
     ellipse = np.sqrt(5.991) * root @ np.stack([np.cos(phase), np.sin(phase)])
@@ -491,7 +497,7 @@ def _histogram_of_passes(axes: Axes, scatter: Scatter) -> None:
 
 
 def _far_points(result: PassAngles) -> list[tuple[str, int, float]]:
-    """Return points that lie improbably far from their plane: line, index in it, distance in sigmas."""
+    """Return outliers, points improbably far from their fitted plane: line, index in the line, distance in sigmas."""
     points = []
     for line, fit in zip(result.measurement.strips, result.estimate.planes["tls"], strict=True):
         sigma = np.sqrt(np.einsum("i,nij,j->n", fit.normal, fit.strip.covariance, fit.normal))

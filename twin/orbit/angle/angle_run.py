@@ -1,12 +1,13 @@
 """Test of intersection angles by planes and by resection, in several frames and over many passes.
 
-The truth enters only where an estimate is compared with it. Planes pass through one station, but the lines of a
-satellite have projection centres metres apart, and a mirror camera's line is bent. The resection uses both as the
-laboratory measured them; its attitude, accurate to an arcsecond, then moves the points to where they would lie for
-one common centre (nanoradians of the angles) and, for the angles between lines of sight, onto straight lines.
+The simulated truth is used only to compare estimates with it. The method of planes assumes one common projection
+centre, but the line cameras of a satellite are metres apart, and the image of a mirror camera's line is curved. The
+resection uses both as the laboratory measured them; its attitude, accurate to an arcsecond, then moves the points to
+where they would lie for one common centre (nanoradians of the angles) and, for the angles between lines of sight, onto
+straight lines.
 
-The records below define the keys of angle.json; keys within a result begin with the name of an angle, such as
-alpha_deg and alpha_arcsec_sigma.
+The records below define the keys of angle.json; keys within a result begin with the name of an angle, such as alpha_deg
+and alpha_arcsec_sigma.
 """
 
 from __future__ import annotations
@@ -48,11 +49,11 @@ if TYPE_CHECKING:
     from scenes.specs.orbit.setup import AngleSetup, AnyAngle
 
 EFFECTS = ("light_time", "aberration", "refraction")
-"""Names of the effects on the light, as attributes of `LightEffects`."""
+"""Names of the effects on the light, which are attributes of `LightEffects`."""
 BEND = 0.01 * ARCSEC
-"""Standard deviation of the bending of a line's ends since the laboratory, in radians. A micrometre's shift of a mirror
-bends the line of `gf7` by 1e-5 arcsec, and a rotation of its focal plane by 2 arcsec about the rear node by 1e-3
-arcsec.
+"""Standard deviation of the angle by which a line's ends have bent since the laboratory, in radians. A micrometre's
+shift of a mirror bends the line of `gf7` by 1e-5 arcsec, and a rotation of its focal plane by 2 arcsec about the
+rear node by 1e-3 arcsec.
 """
 
 
@@ -67,13 +68,14 @@ class Estimate:
     angles : Mapping[Method, PlaneAngles]
         Method -> dihedral angles between these planes.
     look : (m,) ndarray for m angles
-        Angles between the lines of sight of the lines' centres, from tls planes and positions on the line, in radians.
+        Angles between the lines of sight of the lines' centres, in radians, from planes fitted by total least squares
+        and the points' positions on the line.
     along : AlongTrackAngles
-        Signed parts of these angles along the track.
+        Signed along-track components of these angles.
     resection : Resection
         Space resection, the second method.
     resection_angles : AlongTrackAngles
-        Angles of the resection, signed like those along the track.
+        Angles of the resection, with the signs of the along-track angles.
     """
 
     planes: Mapping[Method, tuple[PlaneFit, ...]]
@@ -121,11 +123,11 @@ class EffectRow:
     names : tuple of str
         Names of the angles.
     what : str
-        Name of the effect.
+        Name of the effect on the light, or of the shift.
     bias : (m,) ndarray for m angles
-        Angles minus truth without correction.
+        Estimated minus true angles without correction of the effect.
     remaining : (m,) ndarray
-        Angles minus truth after the correction; NaN where there is none.
+        Estimated minus true angles after correction; NaN where no correction exists.
     """
 
     names: tuple[str, ...]
@@ -145,7 +147,7 @@ class Scatter:
     values : (passes, m) ndarray
         Estimated angles, in radians.
     covariance : (m, m) ndarray
-        Predicted covariance, mean over the passes, in rad^2.
+        Mean over the passes of the covariance that the method predicts, in rad^2.
     truth : (m,) ndarray
         True angles, in radians.
     """
@@ -193,15 +195,15 @@ class PassAngles:
     name : str
         Name of the pass.
     time : float
-        Moment of the angles, in seconds from the epoch.
+        Moment to which the angles refer, in seconds from the epoch.
     laboratory : LineAngles
         Angles between the lines as the laboratory measured them.
     ids : Mapping[str, (n,) ndarray for n points]
         Line -> names of its points.
     span : Mapping[str, tuple[float, float]]
-        Line -> first and last time of its points from the moment, in seconds.
+        Line -> times at which it saw its first and its last point, relative to that moment, in seconds.
     measurement : Measurement
-        Points as the lines would see them at the moment.
+        Ground points as the lines would see them at that moment.
     estimate : Estimate
         Angles by all methods.
     """
@@ -216,7 +218,7 @@ class PassAngles:
 
     @property
     def change(self) -> np.ndarray:
-        """Changes of the m angles along the track since the laboratory, (m,), in radians."""
+        """Estimated along-track angles minus the laboratory's, (m,) for m angles, in radians."""
         return np.asarray(self.estimate.along.values - values_of(self.laboratory.along_track))
 
     @property
@@ -253,15 +255,18 @@ class SimulatedAngleRun(AngleRun):
     flight : AnglePass
         True geometry at the moment of the angles.
     frames : tuple of FrameRow
-        All methods in all frames.
+        Angles by every plane-fitting method in every coordinate frame.
     effects : tuple of EffectRow
-        Each effect alone and all together, without errors.
+        Errors of the angles due to each effect on the light alone and to all together, for points without random
+        errors.
     planes, resection, along : Scatter
-        Scatter of the dihedral angles (tls), of the resection's angles, and of the planes' angles along the track.
+        Scatter over the passes of the dihedral angles (total least squares), of the resection's angles, and of the
+        planes' along-track angles.
     difference_sigma : (m,) ndarray for m angles
         Standard deviation of planes minus resection over the passes, in radians.
     table : tuple of Sensitivity
-        Sensitivity of tls planes in the Earth-fixed frame.
+        Sensitivities of the angles between planes (total least squares, Earth-fixed frame) to errors of station and
+        points.
     height : Mapping[str, float or None]
         Angle -> height error for an error of one arcsecond, in metres; None where the orbit is too short.
     """
@@ -299,7 +304,7 @@ class SimulatedAngleRun(AngleRun):
 
     @property
     def narrow(self) -> np.ndarray:
-        """Mask (m,) of those of the m angles, below 5 deg, that a rotation about the lines of sight changes."""
+        """Mask (m,), True for each of the m angles below 5 deg, which a rotation about the lines of sight changes."""
         return narrow(self.flight)
 
     @property
@@ -399,7 +404,7 @@ def run_angle(setup: AngleSetup, backend: Backend | None, seed: int, advance: Ad
 
 
 def _streams(seed: int) -> tuple[np.random.SeedSequence, np.random.SeedSequence, np.random.SeedSequence]:
-    """Return the random streams of the terrain, of the errors of the pass that is shown, and of its repeats."""
+    """Return the random streams of the terrain, of the errors of the reported pass, and of the repeated passes."""
     terrain, shown, repeats = np.random.SeedSequence(seed).spawn(3)
     return terrain, shown, repeats
 
@@ -421,13 +426,21 @@ def resect_measurement(measurement: Measurement) -> Resection:
 
 
 def _resected_angles(measurement: Measurement, section: Resection) -> AlongTrackAngles:
-    """Return the angles of a resection, signed like those along the track."""
+    """Return the angles of a resection, with the signs of the along-track angles."""
     pairs = tuple(measurement.pairs.values())
     return AlongTrackAngles(section.angles(pairs), section.angle_covariance(pairs))
 
 
 def reduce_to_station(measurement: Measurement, section: Resection) -> Measurement:
-    """Return the measurement as it would be with all projection centres at the station."""
+    """Move the ground points to where they would lie if all lines had their projection centres at the station.
+
+    Parameters
+    ----------
+    measurement : Measurement
+        Measured station and points.
+    section : Resection
+        Space resection of the measurement, which gives the attitude.
+    """
     strips = dict(measurement.strips)
     for name, offset in measurement.offset.items():
         if np.any(offset):
@@ -443,7 +456,7 @@ def tls_angles(common: Measurement) -> PlaneAngles:
 
 
 def line_of_sight_angles(measurement: Measurement, section: Resection) -> tuple[np.ndarray, AlongTrackAngles]:
-    """Return the m angles between central lines of sight, (m,), in radians, and their along-track parts."""
+    """Return the m angles between the lines' central lines of sight, (m,), in radians, and along-track components."""
     common, frames = reduce_to_station(measurement, section), []
     for name, strip in common.strips.items():
         distance = np.linalg.norm(strip.points - common.station.position, axis=1)[:, None]
@@ -471,7 +484,15 @@ def estimate_angles(measurement: Measurement) -> Estimate:
 
 
 def frame_rows(flight: AnglePass, common: Measurement) -> tuple[FrameRow, ...]:
-    """Estimate the angles by every plane-fitting method in every frame, from a measurement of `reduce_to_station`."""
+    """Estimate the angles by every plane-fitting method in every coordinate frame.
+
+    Parameters
+    ----------
+    flight : AnglePass
+        Simulated pass, which defines the frames: Earth-fixed, local level, orbital, and that of the reference line.
+    common : Measurement
+        Measurement with all projection centres at the station, from `reduce_to_station`.
+    """
     places = {
         "Earth-fixed": (np.eye(3), np.zeros(3)),
         "local level": (flight.local, flight.middle_point),
@@ -498,9 +519,9 @@ def frame_rows(flight: AnglePass, common: Measurement) -> tuple[FrameRow, ...]:
 
 
 def effect_rows(flight: AnglePass) -> tuple[EffectRow, ...]:
-    """Compute the errors of the angles due to each effect on the light and due to all three, on the true points.
+    """Compute the errors of the angles due to each effect on the light and to all three, for error-free points.
 
-    Where the file has a shift of the datum, the error due to it comes last.
+    Where the file specifies a shift of the datum, the error due to it is the last element.
     """
     truth, names = values_of(flight.dihedral), tuple(flight.pairs)
     none = (0.0, 0.0, 0.0)
@@ -534,12 +555,12 @@ def _by_angle(names: Iterable[str], values: Iterable[float]) -> ByAngle:
 
 
 def _degrees(names: Iterable[str], values: Iterable[float]) -> ByAngle:
-    """Convert radians to degrees, with the unit in the keys, since they stand beside sigmas in arcseconds."""
+    """Convert radians to degrees; the keys name the unit because they appear beside sigmas in arcseconds."""
     return _by_angle([f"{name}_deg" for name in names], np.degrees(list(values)))
 
 
 def _with_sigmas(names: Iterable[str], angles: PlaneAngles | AlongTrackAngles | FrameRow) -> ByAngle:
-    """Return the values of the angles in degrees, then their sigmas in arcseconds, by keys with the unit."""
+    """Return the angles in degrees and their sigmas in arcseconds, with keys that name angle and unit."""
     names = tuple(names)
     return _degrees(names, angles.values) | _by_angle([f"{n}_arcsec_sigma" for n in names], angles.sigma / ARCSEC)
 
@@ -566,7 +587,7 @@ PASS: Record[PassAngles] = Record(
     Quantity("resection_agrees", lambda p: p.estimate.resection.p_value >= UNLIKELY, "true if the resection fits"),
 )
 UNLIKELY = 1e-3
-"""p-value of chi-square below which a resection is reported not to fit."""
+"""p-value of chi-square below which a resection is reported as inconsistent with its sigmas."""
 TRUTH: Record[SimulatedAngleRun] = Record(
     "Angles of the true camera, by each definition.",
     Quantity("look", lambda run: _degrees(run.names, run.flight.look.values()), "between the lines of sight"),

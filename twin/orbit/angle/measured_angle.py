@@ -58,7 +58,16 @@ def run_angle_test(setup: AnyAngle, backend: Backend | None, seed: int, advance:
 
 @one_blas_thread()
 def run_measured_angle(setup: MeasuredAngleSetup, seed: int = 0, advance: Advance = silent) -> AngleRun:
-    """Read the measurements and estimate the angles. Nothing is drawn: the seed is not used.
+    """Read the measurements and estimate the angles.
+
+    Parameters
+    ----------
+    setup : MeasuredAngleSetup
+        Resolved test file and camera.
+    seed : int
+        Not used, because nothing is simulated.
+    advance : Advance
+        Callback that reports the progress.
 
     Raises
     ------
@@ -134,7 +143,7 @@ def _measured_angles(setup: MeasuredAngleSetup, measured: PassMeasurements) -> P
 def _pairs(
     setup: MeasuredAngleSetup, measured: PassMeasurements, enough: tuple[str, ...]
 ) -> Mapping[str, tuple[str, str]]:
-    """Return the two lines of each angle; raise InputError if one of them has too few points."""
+    """Return the two lines of each angle by its name; raise InputError if a line is not in `enough`."""
     test = setup.test
     pairs = test.angles or usual_angles(enough)
     seen = f"{names_text(enough) or 'no line'} of {setup.camera.name} {'has' if len(enough) == 1 else 'have'}"
@@ -159,7 +168,7 @@ def _strip(
     removed: LightEffects,
     errors: ReadingErrorsSpec,
 ) -> Strip:
-    """Return the ground points of a line as it would see them at the moment, with the covariances of all errors."""
+    """Return a line's ground points as it would see them at the moment of the angles, with their full covariances."""
     name, moment = line_and_moment
     earth = Earth()
     times = measured.line_times[name]
@@ -196,11 +205,11 @@ def _strip(
 
 
 def _shared(offset: np.ndarray, path: TabulatedTrajectory, errors: ReadingErrorsSpec) -> tuple[np.ndarray, np.ndarray]:
-    """Return each point's variances of attitude, in rad^2, and station, in m^2, relative to the moment of the angles.
+    """Return each point's variances of attitude (rad^2) and station (m^2), relative to the moment of the angles.
 
-    Points whose attitude or station comes from the same reading of the orbit or attitude share its error: each of n
-    such points is given n times the variance, so that their mean has the right one. A point of the moment's own reading
-    shares the error of the moment, which does not change the angles.
+    Points whose attitude or station comes from the same reading of orbit or attitude share its error: each of n such
+    points gets n times the variance, so that their mean has the correct one. Points that share the reading at the
+    moment of the angles have the error of that moment, which does not change the angles.
 
     Parameters
     ----------
@@ -230,24 +239,26 @@ def _of_readings(offset: np.ndarray, interval: float, sigma: tuple[float, float,
 
 TEST_FILE = "angle.yaml"
 _LINE_TIME = 1e-3
-"""Time per line, in seconds. All points are seen in one line at the moment; a line on either side of it gives the
-times.
+"""Time per image line, in seconds: all points are exported in the one image line at the moment of the angles, and the
+lines before and after it only define the time scale.
 """
 _SPAN, _READINGS = 20.0, 41
-"""Time exported before and after the moment, in seconds, and number of readings in it; one reading is at the moment."""
+"""Time for which orbit and attitude are exported before and after the moment of the angles, in seconds, and number of
+readings in it; one reading is at the moment.
+"""
 _IMAGE_SIGMA = 1e-6
-"""Sigma of exported image points, in pixels: the errors are those of the ground points, and a table's sigmas must be
-positive.
+"""Sigma of exported image points, in pixels, nearly zero: the ground points carry the errors, but a table's sigmas must
+be positive.
 """
 
 
 def angle_exported(run: AngleRun) -> dict[str, str]:
-    """Return the files of the pass that is shown, path -> text, with the errors that were drawn for it.
+    """Return the files of the reported pass, path -> text, with the random errors that were drawn for it.
 
     Raises
     ------
     InputError
-        The measurements are files already, or the lines are those of an instrument, which no payload file describes.
+        The measurements were read from files, or the lines are those of an instrument, which no payload file describes.
     """
     test = run.setup.test
     if not isinstance(run, SimulatedAngleRun):
@@ -261,7 +272,7 @@ def angle_exported(run: AngleRun) -> dict[str, str]:
 
 
 def _measurements(run: SimulatedAngleRun) -> PassMeasurements:
-    """Return the measurements of the pass that is shown, with the effects on the light left in."""
+    """Return the measurements of the reported pass, not corrected for the effects on the light."""
     flight, spec = run.flight, run.flight.spec
     raw = flight.measure(flight.ground(flight.effects), run.shown, NO_EFFECTS)
     station = raw.station.position
@@ -297,7 +308,7 @@ def _measurements(run: SimulatedAngleRun) -> PassMeasurements:
 
 
 def _test(run: SimulatedAngleRun) -> dict[str, Any]:
-    """Return the content of the test file, with the same angles, moment, effects and sigmas."""
+    """Return the content of a test file for the exported measurements, with the simulation's angles and sigmas."""
     spec = run.flight.spec
     plain = spec.plain()
     return {

@@ -28,7 +28,7 @@ ACCURACY: Record[Accuracy] = Record(
     Quantity("points", lambda accuracy: accuracy.count, "number of points"),
 )
 ALARM = 1e-3
-"""p-value below which a test of a run raises a warning; a run has about ten tests."""
+"""p-value below which one of a run's tests (about ten) raises a warning."""
 CONTRIBUTION: Record[SensorContribution] = Record(
     "90% errors of the check points with some of the block's sensors.",
     Quantity("excluded", lambda case: list(case.excluded), "sensors that were not used"),
@@ -51,7 +51,7 @@ GROUP: Record[GroupTest] = Record(
     Quantity(
         "variance_ratio",
         lambda group: group.ratio if np.isfinite(group.ratio) else None,
-        "variance of the residuals over that of the sigmas",
+        "variance of the residuals over that expected from the sigmas",
         "variance ratio",
         2,
     ),
@@ -143,8 +143,8 @@ BLOCK: Record[BlockRun] = Record(
 
 
 _WEAK = 0.1
-"""Observability below which a combination of unknowns is listed as determined by the priors: its prior sigma divided by
-its sigma from the observations alone.
+"""Observability (prior sigma divided by the sigma from the observations alone) below which a combination of unknowns is
+listed as determined by the priors.
 """
 
 
@@ -210,8 +210,8 @@ def _sections(run: BlockRun) -> tuple[Section, ...]:
     groups = GROUP.table(
         "groups",
         "Observations and laws",
-        "Variance of the residuals over that of the sigmas, with the redundancy of the group. Each law of the readings'"
-        " errors is a group.",
+        "Variance of the residuals over that expected from the sigmas, and redundancy, for each group. Readings with"
+        " the same error model are a group.",
         {name: GROUP(group) for name, group in run.adjustment.groups.items()},
         label="group",
     )

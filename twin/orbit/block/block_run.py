@@ -36,16 +36,16 @@ if TYPE_CHECKING:
 _LEAST_CHECK = 2
 """Smallest number of check points from which errors are computed."""
 _OBSERVED = 3e3
-"""Memory that an image point of a simulated block needs in simulation and adjustment, in bytes."""
+"""Memory per image point for simulation and adjustment of a block, in bytes."""
 Rejected = tuple[tuple[str, str], ...]
 """Point and scene of each image point that was rejected as a gross error."""
 DATUM_ALARM = 1e-3
 """p-value below which a common shift of the control points is reported."""
 ALL = "all"
-"""Name, in the table of sensors, of the adjustment with all sensors."""
+"""Name, in the table of contributions of the sensors, of the adjustment with all sensors."""
 TIES_ALONE = "ties alone"
-"""Name, in the table of sensors, of the adjustment with image points of unknown ground points alone, besides the priors
-of orbit and attitude readings and of the cameras.
+"""Name, in the table of sensors, of the adjustment with tie points (image points of unknown ground points) only,
+besides the priors of the orbit and attitude readings and of the cameras.
 """
 
 
@@ -58,11 +58,12 @@ class SensorContribution:
     excluded : tuple of str
         Sensors that were not used.
     predicted : Accuracy
-        CE90 and LE90 of the check points by their covariances; of all tie points where there are no check points.
+        CE90 and LE90 (90 % errors in plan and in height) of the check points by their covariances; of all tie points
+        where there are no check points.
     observed : Accuracy or None
         CE90 and LE90 of the errors at the check points; None without check points.
     normalised_squared_error : float or None
-        Mean square of the errors over their sigmas, of the three coordinates (chi-square per degree of freedom): 1
+        Mean square of the errors of the three coordinates divided by their sigmas (chi-square per degree of freedom): 1
         where the sigmas are right; None without check points.
     plan, height : float
         Predicted CE90 and LE90, divided by those of the adjustment with all sensors.
@@ -80,8 +81,8 @@ class SensorContribution:
 class CameraChange:
     """Change of a camera in one scene since its calibration.
 
-    Each attribute is a (4,) ndarray: the three rotations d_alpha, d_beta, d_gamma, in radians, and the change d_f of
-    the principal distance, in metres.
+    Each attribute is a (4,) ndarray: rotations d_alpha, d_beta and d_gamma about the camera's Y, X and Z (line of
+    sight), in radians, and change d_f of the principal distance, in metres.
 
     Attributes
     ----------
@@ -139,9 +140,9 @@ class BlockRun:
     network : Network
         Connections between the scenes.
     open : tuple of OpenCombination
-        Combinations of unknowns that the observations leave to the priors.
+        Combinations of unknowns that the priors determine better than the observations.
     laws : tuple of LawTest
-        Tests of the error laws whose errors vary with time.
+        Tests of the error laws (noise models in the file) whose errors vary with time.
     datum : DatumTest or None
         Test of a common shift of the control points; None without control points.
     cameras : Mapping[str, CameraChange]
@@ -256,7 +257,7 @@ def run_adjustment(
 
 
 def _require_memory(spec: OrbitAdjustSpec) -> None:
-    """Raise an error if a block, each of whose points all scenes may see, does not fit into the memory."""
+    """Raise an error if a block does not fit into the memory, assuming that every scene sees every point."""
     points = spec.points
     scenes, others = len(spec.passes) * len(spec.lines), points.control + points.check
     require_memory(
@@ -265,11 +266,11 @@ def _require_memory(spec: OrbitAdjustSpec) -> None:
 
 
 def _datum(block: Block, robust: bool, pool: Pool | None) -> tuple[DatumTest | None, Block, Rejected | None]:
-    """Return the test of a common shift of the control points, the block to adjust, and points already rejected.
+    """Test a common shift of the control points; return the test, the block to adjust, and rejected points.
 
     The shift is tested first because control points of another datum would otherwise all be rejected as gross errors.
-    Where there is a shift, gross errors are those that stand out beside it, and the control points keep their given
-    coordinates.
+    Where the shift is significant, gross errors are those in excess of it, and the control points keep the coordinates
+    that the file gives.
     """
     if not np.any(block.points.role == "control"):
         return None, block, None
@@ -292,7 +293,7 @@ def _check(adjustment: BlockAdjustment, reference: _Reference) -> tuple[np.ndarr
 def _contributions(
     accepted: Block, adjustment: BlockAdjustment, reference: _Reference, advance: Advance, pool: Pool | None
 ) -> FrozenMap[str, SensorContribution]:
-    """Return the errors at check points with all sensors, without each, and with tie points alone."""
+    """Return the errors at check points with all sensors, without each one in turn, and with tie points alone."""
     sensors = [name for name in accepted.sensors if name != "ties"]
     # without ties only check points show the errors
     enough = int(np.sum(accepted.points.role == "check")) >= _LEAST_CHECK
@@ -351,7 +352,7 @@ def _cameras(adjustment: BlockAdjustment, reference: _Reference) -> FrozenMap[st
 
 
 _LOST = "a worker was lost with its share of the points; adjust the block again"
-"""Message for a worker that was lost."""
+"""Error message for a worker process that ended before it returned its share of the points."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -372,7 +373,7 @@ class PointWorkers:
     count: int
 
     def hold(self, things: Sequence[Any]) -> Sequence[Any]:
-        """Send each object to a worker, the workers taking turns, and return the futures of the objects."""
+        """Distribute the objects over the workers in rotation, and return a future for each object."""
         client = self.workers.client
         addresses = sorted(client.scheduler_info(n_workers=-1)["workers"])
         return [

@@ -1,4 +1,4 @@
-"""Simulated block of scenes with all its measurements, drawn from the error laws of the file.
+"""Simulated block of scenes with all its measurements, drawn from the noise models (error laws) of the file.
 
 The readings of orbit and attitude are those of a smooth orbit; the true platform departs from them by random processes,
 each simulated by its definition: random readings interpolated by a cubic spline, random walks (sums of steps), or
@@ -45,16 +45,18 @@ from twin.orbit.measured.pass_measurements import ImagePoints, point_names
 Course = Callable[[np.ndarray], np.ndarray]
 Monitored = dict[str, model.CameraPrior] | model.JointCameraPrior
 _BEYOND = 30
-"""Number of readings drawn beyond the ends of a time series of errors: the influence of the ends on a cubic spline
-falls by a factor of 0.27 per reading.
+"""Number of readings simulated beyond both ends of a time series of errors, because the influence of the ends on a
+cubic spline decreases by a factor of 0.27 per reading.
 """
 _SPARE = 4.0
-"""Number of candidates drawn per point; those that fewer than two scenes see are dropped."""
+"""Number of candidate ground points drawn per required point; those that fewer than two scenes see are dropped."""
 _DAY = 86400.0
 _MOST_STEPS = 1e5
-"""Largest number of values in the time series of one error law."""
+"""Largest number of values in the simulated time series of one noise model of the file."""
 _PLACES, _IMAGES, _LASER, _TERRAIN, _CONTROL, _COURSES, _CAMERAS, _GROSS = range(8)
-"""Random streams of the seed."""
+"""Numbers of the random streams of a block's seed: ground points, image points, laser shots, terrain, control points,
+errors over time, cameras, gross errors.
+"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,7 +74,7 @@ class TruePlatform:
     shift : Course
         Function of n times of the block (n,), in seconds, that returns shifts (n, 3) along `axes`, in metres.
     begin : float
-        Zero of the readings' time on that of the block, in seconds.
+        Time of the block at which the readings' time is zero, in seconds.
     """
 
     readings: Platform
@@ -82,16 +84,16 @@ class TruePlatform:
     begin: float
 
     def position(self, seconds: np.ndarray) -> np.ndarray:
-        """Return the true positions at n times of the readings, (n, 3), ITRS, in metres."""
+        """Return the true positions at n times on the readings' time scale, (n, 3), ITRS, in metres."""
         position: np.ndarray = self.readings.position(seconds) + self.shift(seconds + self.begin) @ self.axes.T
         return position
 
     def inertial_velocity(self, seconds: np.ndarray) -> np.ndarray:
-        """Return the true inertial velocities at n times of the readings, (n, 3), in axes of the ITRS, in m/s."""
+        """Return the true inertial velocities at n times on the readings' time scale, (n, 3), ITRS axes, in m/s."""
         return self.readings.inertial_velocity(seconds)
 
     def body_to_itrs(self, seconds: np.ndarray) -> np.ndarray:
-        """Return the true rotation matrices from body to ITRS axes at n times of the readings, (n, 3, 3)."""
+        """Return the true rotations from body to ITRS axes at n times on the readings' time scale, (n, 3, 3)."""
         rotation = Rotation.from_rotvec(self.rotation(seconds + self.begin)).as_matrix()
         return np.asarray(self.readings.body_to_itrs(seconds) @ rotation)
 
@@ -107,7 +109,8 @@ class DrawnBlock:
     ground : (m, 3) ndarray for m points
         True points, ITRS, in metres.
     change : Mapping[str, ndarray]
-        Scene -> (4,) true change of its camera, in radians and metres.
+        Scene -> (4,) true change of its camera since calibration: rotations d_alpha, d_beta, d_gamma, in radians, and
+        change d_f of the principal distance, in metres.
     platforms : Mapping[str, TruePlatform]
         Pass -> true platform.
     gross : Mapping[str, ndarray]
@@ -122,7 +125,7 @@ class DrawnBlock:
 
 
 def draw_course(law: Law, first: float, last: float, random: np.random.Generator) -> Course:
-    """Draw one time series of an error law between two times, in seconds, and return it as a function of time."""
+    """Draw a random time series of a noise model between two times, in seconds; return it as a function of time."""
     sigma, middle = np.array(law.sigma), 0.5 * (first + last)
     if law.kind in ("constant", "rate"):
         value = sigma * random.standard_normal(3)
@@ -155,7 +158,15 @@ def draw_course(law: Law, first: float, last: float, random: np.random.Generator
 
 
 def _slow(steps: np.ndarray, law: Law) -> np.ndarray:
-    """Return a stationary first-order process of unit variance from independent normal numbers, (k, 3) for k times."""
+    """Return a stationary first-order (Gauss-Markov) process of unit variance, (k, 3) for k times and three axes.
+
+    Parameters
+    ----------
+    steps : (k, 3) ndarray
+        Independent standard normal numbers.
+    law : Law
+        Noise model, which gives the interval and the correlation time.
+    """
     correlation = np.exp(-law.interval / law.time)
     values = steps.copy()
     for k in range(1, len(steps)):
@@ -166,7 +177,7 @@ def _slow(steps: np.ndarray, law: Law) -> np.ndarray:
 def _courses(
     spec: OrbitAdjustSpec, laws: ReadingLawsSpec, begin: Mapping[str, float], seed: np.random.SeedSequence
 ) -> tuple[dict[str, list[Course]], dict[str, list[Course]], dict[str, np.ndarray]]:
-    """Draw each pass's errors of attitude and station over time, and the constant rotation of each star tracker."""
+    """Draw errors of attitude and station over time in each pass, and the constant rotation of each star tracker."""
     attitudes: dict[str, list[Course]] = {name: [] for name in begin}
     stations: dict[str, list[Course]] = {name: [] for name in begin}
     constants: dict[str, np.ndarray] = {}
@@ -204,9 +215,11 @@ def _summed(parts: list[Course]) -> Course:
 def _cameras(
     spec: OrbitAdjustSpec, days: np.ndarray, random: np.random.Generator, recorded: model.JointCameraPrior | None
 ) -> tuple[dict[str, np.ndarray], dict[str, model.CameraPrior], Monitored | None]:
-    """Draw each line's true changes (T, 4) in T passes.
+    """Draw the true changes of each line's camera, (T, 4) for T passes.
 
-    They are returned with the priors of the changes before and after monitor readings.
+    The four changes are the rotations d_alpha, d_beta, d_gamma about the camera's Y, X and line of sight (rad), and the
+    change d_f of the principal distance (m). They are returned with their prior distributions before and after the
+    monitor's readings.
     """
     if recorded is not None:
         drawn = covariance_root(recorded.covariance) @ random.standard_normal(len(recorded.covariance))
@@ -317,9 +330,9 @@ Seen = Mapping[str, tuple[np.ndarray, np.ndarray]]
 def _points(
     setup: AdjustSetup, sensors: Mapping[str, Sensor], earth: Earth, random: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray, Seen]:
-    """Draw m points (m, 3), ITRS, in metres, with their roles.
+    """Draw m ground points (m, 3), ITRS, in metres, with their roles (control, check or tie point).
 
-    They are returned with line and pixel by scene, NaN where a point is not seen.
+    They are returned with the image line and pixel of each point in each scene, NaN where it is not seen.
     """
     spec = setup.test
     area, wanted = spec.area, spec.points.control + spec.points.tie + spec.points.check
@@ -379,7 +392,7 @@ def _scenes(
 
 @dataclass(frozen=True, eq=False)
 class _Shots:
-    """Laser shots of a pass: times on the readings, true ground points, measured aims and distances."""
+    """Laser shots of a pass: times, true ground points, measured directions of the beam, and distances."""
 
     of: str
     seconds: np.ndarray
@@ -411,7 +424,7 @@ def _shots(
 
 
 def _pointing(spec: OrbitAdjustSpec) -> float:
-    """Return the standard deviation of the direction from which a range comes, about each axis, in radians.
+    """Return the standard deviation of the direction of a laser range, about each axis, in radians.
 
     It combines the pointing error with the position of the echo within the beam.
     """
@@ -443,7 +456,7 @@ def _footprints(
 def _known_points(
     spec: OrbitAdjustSpec, ground: np.ndarray, role: np.ndarray, earth: Earth, random: np.random.Generator
 ) -> model.Points:
-    """Return the points with names: control points with their errors, first coordinates of the others."""
+    """Return the ground points with names: control points with random errors, first coordinates of the others."""
     plan, height = spec.points.control_sigma
     covariance = level_covariance(ground, plan, height)
     noise = np.einsum("nij,nj->ni", np.linalg.cholesky(covariance), random.standard_normal(ground.shape))

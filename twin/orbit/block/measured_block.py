@@ -36,18 +36,30 @@ of the monitor.
 
 
 def law_of(name: str, spec: LawSpec) -> Term:
-    """Return an error law of the file as the term of the analysis's noise model."""
+    """Convert a noise model of the file's section of errors to a term of the analysis's noise model."""
     sigma: tuple[float, float, float] = spec.sigma  # type: ignore[attr-defined]
     return Term(Law(name, spec.law, sigma, spec.interval, spec.time or 0.0, spec.frequency or 0.0), spec.shared_by)
 
 
 def camera_sigmas(spec: CameraDriftSpec | MonitorReadingSpec) -> np.ndarray:
-    """Return the (4,) standard deviations of d_alpha, d_beta, d_gamma, in radians, and d_f, in metres."""
+    """Return the (4,) standard deviations of a camera's rotations (radians) and principal distance (metres).
+
+    The order is d_alpha, d_beta and d_gamma, about the camera's Y, X and line of sight, and d_f.
+    """
     return np.array([*spec.angles, spec.principal_distance])
 
 
 def change_covariance(spec: CameraChangeSpec, days: np.ndarray) -> np.ndarray:
-    """Return the (4 T, 4 T) prior covariance of a camera's four changes in T passes, at `days` (T,) after the first."""
+    """Return the (4 T, 4 T) prior covariance of a camera's four changes in T passes.
+
+    Parameters
+    ----------
+    spec : CameraChangeSpec
+        Standard deviations of the rotations d_alpha, d_beta, d_gamma (rad) and of the change d_f of the principal
+        distance (m), and their correlation in time.
+    days : (T,) ndarray
+        Times of the passes after the first, in days.
+    """
     lasting, each, walk = (np.diag(camera_sigmas(s) ** 2) for s in (spec.lasting, spec.each_pass, spec.walk))
     ones = np.ones((len(days), len(days)))
     earlier = np.minimum(days[:, None], days)
@@ -195,9 +207,9 @@ def _points(passes: Sequence[PassMeasurements], shared: bool) -> tuple[model.Poi
 def _first_coordinates(
     points: model.Points, raw: Mapping[str, Rays], models: Mapping[str, LineModel], number: Mapping[str, np.ndarray]
 ) -> model.Points:
-    """Return the points with first coordinates of tie and check points.
+    """Return the points with initial coordinates of tie and check points.
 
-    They are intersected where two scenes see a point, and otherwise the mean of all points.
+    These are the intersection of the rays where two scenes see a point, and otherwise the mean of all points.
     """
     rays = {
         scene: Rays(number[scene.rsplit("/", 1)[0]][r.point], r.image, r.station, r.attitude)

@@ -1,1 +1,1 @@
-"""Calibration in orbit over test fields (paper 003): campaign, image points, adjustment and report."""
+"""Calibration in orbit over test fields (paper 003, Mo et al. 2015): campaign, image points, adjustment, report."""

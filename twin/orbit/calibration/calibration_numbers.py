@@ -1,4 +1,4 @@
-"""Numbers of an in-orbit calibration as calibration.json holds them, in metres and radians."""
+"""Result quantities of an in-orbit calibration, written to calibration.json, in metres and radians."""
 
 from __future__ import annotations
 
@@ -172,7 +172,7 @@ def _degrees(parts: Sequence[LineComparison]) -> Array:
 
 
 def _rms(parts: Sequence[LineComparison]) -> Array:
-    """Return the (2,) RMS error of the correct positions, along the track and along the line, in pixels."""
+    """Return the (2,) RMS error of correctly matched positions, along the track and along the line, in pixels."""
     degrees = _degrees(parts)
     square = np.sum([np.nan_to_num(j.rms) ** 2 * n for j, n in zip(parts, degrees, strict=True)], axis=0)
     return np.asarray(np.sqrt(square / max(degrees.sum(), 1.0)))
@@ -193,7 +193,10 @@ MATCHING: Record[Sequence[LineComparison]] = Record(
 
 
 def _by_line(images: FieldImages) -> dict[str, dict[str, list[LineComparison]]]:
-    """Return the comparisons of all patches of a field with the truth: sort of points -> line -> one per patch."""
+    """Return the comparisons of a field's matched points with the truth.
+
+    The result maps the sort of points (control or tie), then the line, to a list with one comparison per patch.
+    """
     parts: dict[str, dict[str, list[LineComparison]]] = {}
     for patch in images.patches:
         for sort, lines in patch.judgements.items():
@@ -273,7 +276,7 @@ SIGMAS: Record[CalibrationRun] = Record(
 
 
 def _free(adjustment: Adjustment) -> list[int]:
-    """Return the indices of the unknowns that the gauge does not hold."""
+    """Return the indices of the estimated unknowns, those that the gauge does not fix."""
     sigma = adjustment.sigma
     return [k for k, name in enumerate(adjustment.names) if sigma[name] > 0.0]
 
@@ -315,7 +318,7 @@ ATTITUDE_DRIFT: Record[AttitudeDrift] = Record(
     ),
 )
 UNLIKELY = 1e-3
-"""p-value of chi-square below which the adjustment is reported not to fit."""
+"""p-value of chi-square below which the adjustment is reported as inconsistent with its sigmas."""
 
 
 def _fits(run: CalibrationRun) -> bool | None:

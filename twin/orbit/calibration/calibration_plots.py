@@ -15,10 +15,22 @@ from twin.orbit.calibration.schemes import RMS, FieldErrors, Monitoring, values_
 
 
 def _expected_height(run: CalibrationRun, study: Monitoring, factor: np.ndarray) -> np.ndarray:
-    """Return the expected height RMS without a monitor, in metres, for the file's drift times each of n factors.
+    """Return the expected RMS height error without a monitor, in metres, for n multiples of the file's drift.
 
-    It is the mean over many campaigns. All fields are adjusted at once and each has one drift. The mean over the fields
-    of the outer lines' d_alpha goes into the parameters and is therefore taken out.
+    Parameters
+    ----------
+    run : CalibrationRun
+        Results of the calibration.
+    study : Monitoring
+        Comparison of calibrations with and without the monitor.
+    factor : (n,) ndarray
+        Factors by which the file's drift is multiplied.
+
+    Notes
+    -----
+    It is the expectation over many campaigns in which all fields are adjusted at once and the cameras' drift is
+    constant within a field. The parameters absorb the mean over the fields of the outer lines' rotation d_alpha about
+    the camera's Y, so that it is subtracted.
     """
     spec = run.campaign.simulated
     square = sum(drift.angles[0] ** 2 for name, drift in spec.drift.items() if name != "nadir")
@@ -143,7 +155,7 @@ def _latitude_figure(run: CalibrationRun) -> Figure:
 
 
 def _correlation_figure(run: CalibrationRun) -> Figure:
-    """Draw the correlation matrix of the simultaneous adjustment, without the unknowns that the gauge holds."""
+    """Draw the correlation matrix of the simultaneous adjustment, without the unknowns that the gauge fixes."""
     adjustment = run.together
     sigma = adjustment.sigma
     free = [k for k, name in enumerate(adjustment.names) if sigma[name] > 0.0]

@@ -29,7 +29,7 @@ _FEW = 30
 _LEAST_CHANCE = 1e-3
 """p-value of the chi-square of the check points' intersections below which there is a warning."""
 _WIDE = 2.0
-"""Factor by which the residuals enlarge the sigmas of a line's image points above which there is a warning."""
+"""Ratio of the residuals of a line's image points to their sigmas above which there is a warning."""
 _MANY = 0.1
 """Share of rejected image points above which there is a warning."""
 

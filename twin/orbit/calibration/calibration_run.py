@@ -1,8 +1,8 @@
-"""Calibration of a camera in orbit over fields of points (paper 003).
+"""Calibration of a camera in orbit over fields of points (paper 003, Mo et al. 2015).
 
 All fields are calibrated in one simultaneous adjustment, and each field by itself as in paper 003, from the
-measurements of a campaign alone; the truth enters only where an estimate is compared with it. `exported` writes the
-measurements as a folder of tables with a test file that reads them back.
+measurements alone; the simulated truth is used only to compare estimates with it. `exported` writes the measurements as
+a folder of tables with a test file that reads them back.
 """
 
 from __future__ import annotations
@@ -68,20 +68,23 @@ if TYPE_CHECKING:
     from scenes.specs.orbit.setup import AnyCalibration, CalibrationSetup
 
 _EVEN = 1e-3
-"""Largest deviation of an interval between readings from their median interval, relative, for which the readings count
-as evenly spaced.
+"""Largest relative deviation of an interval between readings from their median interval for which the readings count as
+evenly spaced.
 """
 _LEAST_EVEN = 5
 """Smallest number of evenly spaced readings from which third differences are computed."""
 STEPWISE_TOLERANCE = 1e-3
-"""Largest step of the last round of the stepwise solution, in sigmas, at which it counts as converged."""
+"""Largest change of an unknown in the last round of the stepwise solution, in sigmas, at which it counts as converged.
+"""
 _TIE = 1.7e5
-"""Memory per tie point of a strip, in each line and field, with the splines that it determines, in bytes."""
+"""Memory that the adjustment of a strip needs per tie point, line and field, in bytes, including the spline
+coefficients of the attitude that the point determines.
+"""
 
 
 @dataclass(frozen=True, eq=False)
 class FieldResult:
-    """Calibration of a single field, with the twelve unknowns of paper 003.
+    """Calibration of a single field, with the twelve unknowns of paper 003 (Mo et al. 2015).
 
     The unknowns are principal distance f and principal point x, y of three lines, and the attitude biases roll, pitch,
     yaw.
@@ -197,13 +200,14 @@ class Unknown:
     value : float
         Estimated value.
     sigma : float
-        Standard deviation if the unknowns that the gauge holds are exact; 0 for those held.
+        Standard deviation if the unknowns that the gauge fixes are exact; 0 for the fixed ones.
     sigma_with_gauge : float
-        Standard deviation that includes the uncertainty, after launch, of the unknowns that the gauge holds.
+        Standard deviation that includes the uncertainty, after launch, of the unknowns that the gauge fixes.
     prior_share : float
-        Share of the variance that comes from the sigmas of launch and season and not from the points, 0 to 1.
+        Share of the variance, 0 to 1, that comes from the prior sigmas (changes at launch and with the season) and not
+        from the points.
     held : bool
-        True where the gauge holds the unknown.
+        True where the gauge fixes the unknown at its laboratory value.
     truth : float or None
         True value; None for measured passes.
     """
@@ -261,13 +265,13 @@ _NOISE_KEYS = {
     "slow attitude": ("errors", "star_tracker", "slow"),
     "station": ("errors", "gps", "noise"),
 }
-"""Source of noise -> its key in the file. Image and control points have keys of their own in a simulation, and sigmas
-in tables of measurements.
+"""Source of noise -> its key in the file. Image and control points are not included: they have separate keys in a
+simulation, and sigmas in tables of measurements.
 """
 
 
 def _key_and_remedy(error: ValueError, measured: bool) -> tuple[tuple[str, ...], str]:
-    """Return the key of the file and the remedy for an error of the adjustment, of measurements or of a simulation."""
+    """Return the key of the file to change and the remedy, for an error of the adjustment."""
     if isinstance(error, RankError):
         return ("data" if measured else "points",), "a field with width and length, and more points"
     if isinstance(error, NoiseError):
@@ -286,7 +290,7 @@ def _key_and_remedy(error: ValueError, measured: bool) -> tuple[tuple[str, ...],
 
 
 def _require_memory(setup: CalibrationSetup) -> None:
-    """Raise an error if the adjustments of all strips, which need the most memory, do not fit."""
+    """Raise an error if the adjustments of all strips, which need the most memory, do not fit into the memory."""
     test, strip = setup.test, setup.test.strip
     if strip is not None:
         each = len(setup.camera.lines) * len(test.fields) * _TIE
@@ -346,7 +350,7 @@ def _run(setup: AnyCalibration, seed: int, advance: Advance) -> CalibrationRun:
 
 
 def source_of(setup: AnyCalibration, seed: np.random.SeedSequence, advance: Advance = silent) -> Campaign:
-    """Return the campaign of a test: read from its files where it names measurements, else simulated.
+    """Return the campaign of a test: read from its files if it names measurements, otherwise simulated.
 
     Points measured in images are screened for gross errors.
 
@@ -398,7 +402,7 @@ def true_values(campaign: Campaign, names: tuple[str, ...]) -> np.ndarray:
 
 
 def third_differences(flight: FieldPass) -> tuple[ThirdDifference | None, ThirdDifference | None]:
-    """Return the third differences of orbit and attitude of a pass; None for fewer than five evenly spaced readings."""
+    """Return third differences of a pass's orbit and attitude readings; None for fewer than five even readings."""
     measured, table = flight.measured, flight.measured.table
     fixes, looks = _even(table.orbit_time), _even(table.attitude_time[measured.covers(table.attitude_time)])
     places = table.position[np.isin(table.orbit_time, fixes)]
@@ -436,7 +440,7 @@ def files_of(setup: AnyCalibration, campaign: Campaign) -> dict[str, str]:
 
 
 def _test(setup: AnyCalibration) -> dict[str, Any]:
-    """Return the content of the test file, with the schemes, sigmas of readings, effects and limits of the test."""
+    """Return the content of a test file for the exported measurements, with the test's schemes, sigmas and limits."""
     spec = setup.test
     plain: Mapping[str, Any] = spec.plain()
     given_errors = plain["errors"]

@@ -31,7 +31,8 @@ from twin.orbit.images.point_report import SORTS, points_png
 _SCALES = {"rad": (ARCSEC, "arcsec"), "rad/s": (1e-3 * ARCSEC, "mas/s"), "m": (1.0, "m")}
 """Unit of an unknown in result files -> unit of the tables of the report, as its size in SI units and its name."""
 MOSTLY = 0.5
-"""Share of an unknown's variance above which the prior of the launch determines it, not the points."""
+"""Share of an unknown's variance above which it counts as determined by the prior (change at launch), not the points.
+"""
 Rows = list[tuple[Cell, ...]]
 
 
@@ -218,7 +219,8 @@ def _limits(run: CalibrationRun) -> str:
     texts = ", ".join(f"{name} {value:.2g} m" for name, value in sorted(parts.items(), key=lambda v: -v[1]) if value)
     return (
         f"Error budget on the ground at nadir (1σ) of a single ray to a single point of {flight.name}: {texts}. "
-        "The largest of these limits the result. More points reduce it, except for slow errors of the attitude."
+        "The largest of these errors limits the accuracy. More points reduce all of them but slow errors of the"
+        " attitude."
     )
 
 

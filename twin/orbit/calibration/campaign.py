@@ -1,15 +1,15 @@
-"""Passes over fields of points as an analysis has them, simulated or measured.
+"""Passes over test fields with the measurements that an analysis has, simulated or real.
 
 Each pass holds what was measured (`twin.orbit.measured.pass_measurements`): readings of orbit and attitude, line times,
 ground and image points. The camera is that of the laboratory. The truth is present only where a simulation knows it,
 for comparisons.
 
-The effects on the light are taken out of the image points. The adjustment's rays are straight lines in Earth-fixed
-axes: the look of a pixel is the direction from which the light seems to come, and the straight line from the measured
-station to the ground point that this look really sees is the direction in which the point lies. The image point is
-moved from the one to the other. Camera and trajectory are those that the analysis has, the laboratory's and the
-measured one: a camera error of 100 m on the ground, 2e-4 rad, changes an aberration of 4 pixels by a thousandth of a
-pixel. Image points may be drawn or measured in images; the code does not distinguish them.
+The image points are corrected for the effects on the light (light time, aberration, refraction). The adjustment's rays
+are straight lines in Earth-fixed axes: the look of a pixel is the direction from which the light seems to come, and the
+straight line from the measured station to the ground point that this look really sees is the direction in which the
+point lies. The image point is moved from the one to the other. Camera and trajectory are those that the analysis has,
+the laboratory's and the measured one: a camera error of 100 m on the ground, 2e-4 rad, changes an aberration of 4
+pixels by a thousandth of a pixel. Image points may be drawn or measured in images; the code does not distinguish them.
 """
 
 from __future__ import annotations
@@ -47,13 +47,15 @@ if TYPE_CHECKING:
     from twin.orbit.images.patch import LineComparison, Patch
 
 EFFECTS = ("light_time", "aberration", "refraction")
-"""Names of the effects on the light, as attributes of `LightEffects`."""
+"""Names of the effects on the light, which are attributes of `LightEffects`."""
 _DISTORTION_STEPS = 8
-"""Number of fixed-point steps. Each step reduces the error by the size of the distortion, 1e-3 of the image or less."""
+"""Number of fixed-point steps that invert the lens distortion; each reduces the error by a factor of the relative
+distortion, 1e-3 or less.
+"""
 
 
 def light_effects(spec: EffectsSpec) -> LightEffects:
-    """Return the effects on the light that a file switches on."""
+    """Return the effects on the light (light time, aberration, refraction) that a file switches on."""
     return LightEffects(spec.light_time, spec.aberration, spec.refraction, spec.wavelength)
 
 
@@ -65,12 +67,12 @@ def any_effect(effects: LightEffects) -> bool:
 def light_shift(
     sensor: Sensor, model: LineModel, line: np.ndarray, pixel: np.ndarray, height: np.ndarray
 ) -> np.ndarray:
-    """Return the displacements that take the effects on the light out of measured image points.
+    """Return the displacements that correct measured image points for the effects on the light.
 
     Parameters
     ----------
     sensor : Sensor
-        The laboratory's line on the measured trajectory, with the effects that are to be taken out.
+        Line camera as the laboratory measured it, on the measured trajectory, with the effects to correct.
     model : LineModel
         The same line as the adjustment models it.
     line : (n,) ndarray for n points
@@ -102,7 +104,7 @@ def light_shift(
 
 
 def _place(direction: np.ndarray, model: LineModel) -> np.ndarray:
-    """Return the images of n directions (n, 3) in the body frame, (n, 2), in metres from the principal point."""
+    """Project n directions (n, 3) in the body frame to the focal plane, (n, 2), in metres from the principal point."""
     a, b, c = (direction @ model.to_body).T
     ideal = -model.interior[0] * np.stack([a / c, b / c], axis=-1)
     distorted = ideal
@@ -113,10 +115,12 @@ def _place(direction: np.ndarray, model: LineModel) -> np.ndarray:
 
 
 _SAME_PHASE = 1e-6
-"""Phase that counts as zero, as a share of the interval between readings, because the times of readings are rounded."""
+"""Largest offset of the readings' times from multiples of their interval, as a share of the interval, that counts as
+zero, because the times are rounded.
+"""
 _HEIGHTS = (-500.0, 9000.0)
-"""Range of heights of land above the ellipsoid, in metres. The calibration refuses control points outside of it, not
-this module.
+"""Range of heights of land above the ellipsoid, in metres, to which heights are limited here; control points outside of
+it are refused by the calibration, not by this module.
 """
 
 
@@ -139,8 +143,8 @@ class PassData:
     lines : Mapping[str, LineCameraSpec]
         Line -> its section of the payload's file.
     unit : float or None
-        Sigma of an image point of weight 1, in metres in the focal plane: every ray carries the covariance of its image
-        point in units of its square. None: rays carry no covariance.
+        Sigma of an image point of weight 1, in metres in the focal plane. Each ray then carries the covariance of its
+        image point divided by the square of this sigma; None for rays without covariances.
     """
 
     name: str
@@ -157,10 +161,10 @@ class PassData:
 
     @property
     def phase(self) -> float:
-        """Time from the nearest whole multiple of the attitude's reading interval to a reading, in seconds.
+        """Offset of the attitude readings from whole multiples of their interval, in seconds.
 
-        Readings of the orbit can differ from their own multiples by half their interval at most. The model of noise
-        that readings share neglects this: its variance is then that of another point of time between two readings.
+        Readings of the orbit can be offset by up to half their interval as well. The model of the noise that
+        neighbouring exposures share neglects this: its variance is then that of another time between two readings.
         """
         path = next(iter(self.sensors.values())).trajectory
         if not isinstance(path, TabulatedTrajectory):
@@ -196,7 +200,7 @@ class PassData:
         return abs(float(x[1] - x[0])) / self.pitch[name]
 
     def rays(self, images: Mapping[str, ImagePoints]) -> dict[str, Rays]:
-        """Return the rays of image points, by line, with the effects on the light left in.
+        """Return the rays of image points, by line, not corrected for the effects on the light.
 
         Raises
         ------
@@ -219,7 +223,7 @@ class PassData:
     def spread(self, name: str, row: ImagePoints) -> np.ndarray:
         """Return the covariances of n image points in the focal plane, (n, 2, 2), in metres^2.
 
-        An error toward a later line counts as one toward a smaller x.
+        An error toward a later image line is an error toward a smaller x.
         """
         scale = self.pitch[name] * np.array([-self.pixels_per_line(name), 1.0])
         return row.covariance * scale[:, None] * scale
@@ -232,19 +236,18 @@ class PassData:
         removed: LightEffects,
         control: np.ndarray | None = None,
     ) -> CalibrationField:
-        """Return the control points, with their corrected rays, as the calibration takes them.
+        """Return the control points and their rays, corrected for effects on the light, as input of the calibration.
 
         Parameters
         ----------
         images : Mapping[str, ImagePoints]
             Line -> image points.
-        ground : (m, 3) ndarray
-            Given coordinates, ITRS, in metres.
-        covariance : float, tuple of float, or (m, 3, 3) ndarray
+        ground : (m, 3) ndarray for m ground points Given coordinates, ITRS, in metres. covariance : float, tuple of
+        float, or (m, 3, 3) ndarray
             Covariances of the coordinates, in m^2 (not used for tie points); or one sigma of each coordinate; or one
             sigma of each axis in plan and one of the height, in metres.
         removed : LightEffects
-            Effects on the light that are taken out.
+            Effects on the light that are corrected.
         control : (m,) ndarray of bool, optional
             True for control points, False for tie points; None if all are control points.
 
@@ -260,10 +263,10 @@ class PassData:
         return replace(field, rays=self.corrected(field.rays, images, removed, self._heights(ground)))
 
     def check_rays(self, images: Mapping[str, ImagePoints], removed: LightEffects, noise: Noise) -> dict[str, Rays]:
-        """Return the rays of points without ground control, by line, with effects on the light taken out.
+        """Return the rays of points without ground control, by line, corrected for effects on the light.
 
-        Refraction depends on the height of the ground, by 8% of it on 700 m. The height comes from a first intersection
-        of the uncorrected rays with the laboratory's camera, which is 100 m wrong.
+        Refraction depends on the height of the ground: 700 m change it by 8 %. The height is taken from a first
+        intersection of the uncorrected rays with the laboratory's camera, whose error is about 100 m.
 
         Raises
         ------
@@ -278,7 +281,7 @@ class PassData:
     def corrected(
         self, rays: Mapping[str, Rays], images: Mapping[str, ImagePoints], removed: LightEffects, height: np.ndarray
     ) -> dict[str, Rays]:
-        """Return the rays with effects on the light taken out, by line.
+        """Return the rays corrected for effects on the light, by line.
 
         Parameters
         ----------
@@ -287,7 +290,7 @@ class PassData:
         images : Mapping[str, ImagePoints]
             Line -> image points.
         removed : LightEffects
-            Effects on the light that are taken out.
+            Effects on the light that are corrected.
         height : (m,) ndarray for m ground points
             Heights of the ground points above the ellipsoid, in metres; NaN where unknown.
 
@@ -360,8 +363,8 @@ class PassTruth:
     errors : MeasurementErrors
         Errors of the readings.
     drift : Mapping[str, ndarray]
-        Line -> (4,) true changes of its camera: rotations d_alpha, d_beta, d_gamma, in radians, and principal distance
-        d_f, in metres; empty without drift.
+        Line -> (4,) true changes of its camera: rotations d_alpha, d_beta, d_gamma about the camera's Y, X and line of
+        sight, in radians, and change d_f of the principal distance, in metres; empty without drift.
     """
 
     bias: np.ndarray
@@ -371,7 +374,7 @@ class PassTruth:
     drift: Mapping[str, np.ndarray] = FrozenMap({})
 
     def bias_at(self, time: float) -> np.ndarray:
-        """Return the true roll, pitch and yaw at a time, (3,), in radians.
+        """Return the true attitude bias (roll, pitch, yaw) at a time, (3,), in radians.
 
         Errors of the readings that vary slowly with time are not part of it.
 
@@ -497,7 +500,8 @@ class FieldPass:
     ties : Mapping[str, Rays]
         Line -> rays of the tie points that are reserved for the strip.
     readings : Mapping[str, ndarray]
-        Line -> (4,) change of its camera that the monitor measured; empty without a monitor.
+        Line -> (4,) change of its camera that the monitor measured: rotations d_alpha, d_beta, d_gamma (radians) and
+        change d_f of the principal distance (metres); empty without a monitor.
     known_truth : PassTruth or None
         Truth of a simulated pass; None for a measured one.
     """
@@ -532,13 +536,13 @@ class FieldPass:
 
     @property
     def truth(self) -> PassTruth:
-        """Truth of a simulated pass; raises AssertionError for a measured one."""
+        """Simulated truth of the pass; raises AssertionError for a measured pass."""
         assert self.known_truth is not None, "the truth of a measured pass is not known"
         return self.known_truth
 
     @property
     def bias(self) -> np.ndarray:
-        """True (3,) roll, pitch and yaw from measured to true attitude, in radiansat the middle of the field."""
+        """True (3,) roll, pitch and yaw from measured to true attitude, in radians, at the middle of the field."""
         return self.truth.bias
 
     @property
@@ -584,9 +588,10 @@ class FieldPass:
         return replace(self, control_ground=ground, control=replace(self.control, ground=ground))
 
     def later(self, seconds: float) -> FieldPass:
-        """Return the pass with rays from the station and attitude `seconds` later; image points do not change.
+        """Return the pass with rays from the station and attitude `seconds` later, with the image points unchanged.
 
-        Beyond the end of the readings, the motion is continued by reflecting that before the exposure.
+        Beyond the end of the readings, the motion is extrapolated by point reflection of the motion before the
+        exposure.
         """
         path = self.measured
 
@@ -668,28 +673,28 @@ class Campaign:
 
     @property
     def reference(self) -> str:
-        """Line whose principal point the gauge holds: the nadir line, or the line that looks down most steeply."""
+        """Line whose principal point the gauge fixes: the nadir line, or the line that looks down most steeply."""
         if "nadir" in self.laboratory:
             return "nadir"
         return max(self.lines, key=lambda name: float(self.laboratory[name].to_body[2, 2]))
 
     @property
     def effects(self) -> LightEffects:
-        """Effects on the light that the file switches on."""
+        """Effects on the light (light time, aberration, refraction) that the file switches on."""
         return light_effects(self.spec.effects)
 
     @property
     def independent(self) -> Campaign:
         """Campaign in which the noise of attitude and orbit is independent from exposure to exposure.
 
-        Estimates are hardly worse and ten times faster; their sigmas are too small where points are exposed within a
-        few readings.
+        Estimates from it are hardly less accurate and ten times faster to compute; their sigmas are too small where
+        points are exposed within a few readings.
         """
         noise = replace(self.noise, attitude_interval=None, station_interval=None, slow_interval=None)
         return replace(self, noise=noise)
 
     def without_effects(self, removed: LightEffects) -> Campaign:
-        """Return the campaign with these effects on the light taken out of its image points.
+        """Return the campaign with its image points corrected for these effects on the light.
 
         Raises
         ------
@@ -720,7 +725,7 @@ class Campaign:
 
 @dataclass(frozen=True)
 class DetectedDrift:
-    """Drift of the attitude during the passes that the file does not specify but the residuals show.
+    """Attitude drift during the passes that the residuals show but the file does not specify.
 
     Attributes
     ----------
@@ -729,7 +734,8 @@ class DetectedDrift:
     walk : float
         Standard deviation of a random walk's increment in one second that the adjustment then assumes, in radians.
     rate_p_value, course_p_value : float
-        p-values of the residuals without rates, and without errors that change slowly.
+        p-values of the tests for a rate and for slowly varying errors (random walk), from the residuals of an
+        adjustment without them.
     """
 
     rate: tuple[float, float, float]
@@ -765,9 +771,9 @@ class Rejected:
     factors: Mapping[str, float]
 
     def after(self, first: Rejected) -> Rejected:
-        """Return the points rejected in two rounds, `first` and this one.
+        """Combine the points rejected in two rounds of screening, `first` and this one.
 
-        The factors on the sigmas are those of this round; those of the first round are 1.
+        The factors on the sigmas are those of this round, because those of the first round are 1.
         """
         points, checks = first.points + self.points, first.check_points + self.check_points
         return Rejected(first.entered, self.left, points, first.check_entered, self.check_left, checks, self.factors)
@@ -796,7 +802,21 @@ def passing_orbit(
     latitude: float,
     direction: Literal["descending", "ascending"] = "descending",
 ) -> OrbitSpec:
-    """Return the orbit that passes over a place at its epoch, propagated for `span` before and after, in SI units."""
+    """Return the orbit that passes over a ground position at its epoch.
+
+    Parameters
+    ----------
+    epoch : str
+        Time of the passage, UTC.
+    span : float
+        Time for which the orbit is propagated before and after the epoch, in seconds.
+    altitude : float
+        Altitude of the orbit, in metres.
+    longitude, latitude : float
+        Ground position, in radians.
+    direction : {'descending', 'ascending'}
+        Direction of the pass.
+    """
     passing = PassingSpec.model_construct(
         longitude=longitude, latitude=latitude, altitude=altitude, direction=direction, inclination=None
     )
@@ -841,7 +861,7 @@ def campaign_of(
     measured: Sequence[PassMeasurements],
     ties_apart: bool,
 ) -> Campaign:
-    """Return the campaign of measured passes, with effects on the light taken out where the test asks for it.
+    """Return the campaign of measured passes, corrected for effects on the light where the test asks for it.
 
     Parameters
     ----------
@@ -870,7 +890,7 @@ def campaign_of(
 
 
 def _noise_of(errors: ErrorsSpec | ReadingErrorsSpec, image: float, paths: Sequence[TabulatedTrajectory] = ()) -> Noise:
-    """Return the noise of the readings, root mean square over the axes, with their intervals.
+    """Return the noise model of the readings: sigmas, as the RMS over the axes, and reading intervals.
 
     Parameters
     ----------
@@ -944,7 +964,7 @@ def _numbered(images: Mapping[str, ImagePoints], chosen: np.ndarray, count: int)
 
 
 def _with_ties(flight: FieldPass, noise: Noise) -> FieldPass:
-    """Return the pass with first coordinates of its tie points, intersected with the laboratory's camera."""
+    """Return the pass with initial coordinates of its tie points, intersected with the laboratory's camera."""
     tie = ~flight.is_control
     if not np.any(tie):
         return flight

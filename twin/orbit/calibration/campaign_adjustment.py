@@ -1,14 +1,15 @@
-"""Adjustment of a campaign, of one field by itself and of all fields at once: unknowns, gauge and priors.
+"""Least-squares calibration of a campaign, field by field or all fields at once: unknowns, gauge and priors.
 
-Fit of the attitude bias against latitude. An adjustment of all fields gives each field's bias with its covariance,
-which includes the offsets of the orbit. For each axis
+The attitude bias is also fitted against latitude. An adjustment of all fields gives each field's bias with its
+covariance, which includes the offsets of the orbit. For each axis
 
     bias(field) = amplitude sin(latitude - reference) + constant + season
 
-is fitted by generalised least squares. The reference is the middle of the fields; another one only changes the
-constant. What remains is first tested against the biases' own covariance (chi-square). Then its standard deviation is
-estimated as the value with which the chi-square equals the degrees of freedom (Paule and Mandel, J. Res. NBS 87, 377
-(1982)), and is included in the sigmas of amplitude and constant.
+is fitted by generalised least squares, where season is a random remainder of each field. The reference is the middle of
+the fields' latitudes; another one only changes the constant. The remainders are first tested against the biases'
+covariance (chi-square). Then their standard deviation is estimated as the value for which the chi-square equals the
+degrees of freedom (Paule and Mandel, J. Res. NBS 87, 377 (1982)), and is included in the sigmas of amplitude and
+constant.
 """
 
 from __future__ import annotations
@@ -33,18 +34,20 @@ GAUGE = Gauge(held=("nadir x", "nadir y"))
 pitch, and its y from roll so weakly that one field would not determine it to a pixel.
 """
 _LEAST_OFFSET = 1e-3
-"""Smallest sigma of an orbit's offset along an axis, in metres, where the file gives no drift along that axis."""
+"""Smallest prior sigma of an orbit's offset along an axis, in metres, used where the file gives no drift along that
+axis.
+"""
 _LEAST_RATE = 1e-11
-"""Smallest sigma of a rate about an axis, in radians per second, where only other axes have rates: 1e-4 arcsec in a
-minute.
+"""Smallest prior sigma of an attitude rate about an axis, in radians per second, used where only other axes have rates:
+1e-4 arcsec in a minute.
 """
 
 
 def gauge_of(campaign: Campaign) -> Gauge:
-    """Return the gauge, which holds the principal point of one line at its laboratory value.
+    """Return the gauge, which fixes the principal point of one line at its laboratory value.
 
-    Unknowns that the points determine less well than the prior stay near the laboratory's values, within the sigmas of
-    launch and season.
+    Unknowns that the points determine less well than the prior stay near the laboratory's values, within the prior
+    sigmas of changes at launch and with the season.
     """
     launch, season = campaign.spec.launch, np.array(campaign.spec.errors.season)
     start = dict.fromkeys(campaign.inner, launch.interior)
@@ -85,7 +88,7 @@ def _rate_priors(campaign: Campaign, passes: Sequence[FieldPass], common: Sequen
 
 
 def calibrated_alone(campaign: Campaign, flight: FieldPass) -> Adjustment:
-    """Calibrate one field by itself, with paper 003's unknowns other than those that the gauge holds.
+    """Calibrate one field by itself, with the unknowns of paper 003 (Mo et al. 2015) that the gauge leaves free.
 
     Paper 003 has twelve: principal distance and principal point of three lines, and the attitude biases about three
     axes. A rate of the attitude is added where the attitude drifts.
@@ -116,8 +119,8 @@ def calibrated_alone(campaign: Campaign, flight: FieldPass) -> Adjustment:
 def with_detected_drift(campaign: Campaign, rates: tuple[Prior, ...] = ()) -> Campaign:
     """Return the campaign with a drift of the attitude in its noise model, if the residuals show one.
 
-    Tested is a drift that the file does not specify. It is modelled as a random walk, sized by its variance component,
-    and a rate of each pass. The false-alarm rate of either test is `FALSE_ALARM`.
+    Only a drift that the file does not specify is tested. It is modelled as a random walk, whose sigma is estimated as
+    a variance component, and a rate of each pass. The false-alarm rate of either test is `FALSE_ALARM`.
 
     Parameters
     ----------
@@ -207,15 +210,15 @@ def simultaneous(
 
 
 LEAST_FIELDS = 4
-"""Smallest number of fields of a fit against latitude: the fit uses two degrees of freedom, and a single further one
-does not estimate the remainder.
+"""Smallest number of fields for a fit against latitude: the fit has two parameters, and a single degree of freedom does
+not suffice to estimate the scatter beyond the sigmas.
 """
 _LEAST_FREEDOM = 3
-"""Smallest number of degrees of freedom of a fit against latitude from which rates during the passes are predicted;
-Student's variance needs three.
+"""Smallest number of degrees of freedom of a fit against latitude from which rates during the passes are predicted: the
+variance of Student's t exists from three on.
 """
 _ONE_LATITUDE = np.radians(1.0)
-"""Range of latitudes, in radians, below which fields count as lying at one latitude."""
+"""Range of the fields' latitudes, in radians, below which no fit against latitude is made."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -288,9 +291,9 @@ def latitude_fits(campaign: Campaign, together: Adjustment) -> tuple[LatitudeFit
 def rate_priors(campaign: Campaign, fits: tuple[LatitudeFit, ...]) -> tuple[Prior, ...]:
     """Return priors of the biases' rates during the passes, predicted from their change with latitude.
 
-    A rate is the amplitude times the change of the sine of latitude in a second, mean of the passes. The outer lines
-    see a field half a minute before and after the nadir line, so that otherwise their x and y take up the drift. The
-    result is empty for fits of fewer than `_LEAST_FREEDOM` degrees of freedom.
+    A rate is the fitted amplitude times the rate of sin(latitude - reference), mean of the passes. The outer lines see
+    a field half a minute before and after the nadir line, so that without these priors their principal points x, y
+    would absorb the drift. The result is empty for fits of fewer than `_LEAST_FREEDOM` degrees of freedom.
     """
     if not fits or fits[0].degrees_of_freedom < _LEAST_FREEDOM:
         return ()
@@ -321,7 +324,10 @@ def fit_latitude(axis: str, latitude: np.ndarray, value: np.ndarray, covariance:
     freedom = len(value) - 2
 
     def solved(extra: float) -> tuple[np.ndarray, np.ndarray, float]:
-        """Solve with an extra standard deviation of each field: parameters (2,), covariance (2, 2) and chi-square."""
+        """Solve the fit with an extra standard deviation; return parameters (2,), covariance (2, 2) and chi-square.
+
+        The extra standard deviation, in radians, is added in quadrature to that of each field's bias.
+        """
         weight = np.linalg.inv(covariance + extra**2 * np.eye(len(value)))
         spread = np.linalg.inv(design.T @ weight @ design)
         best = spread @ design.T @ weight @ value

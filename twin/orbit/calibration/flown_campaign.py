@@ -2,12 +2,13 @@
 
 Ground points are drawn in the nadir line's image, on terrain of given relief. Every line sees them through the rigorous
 sensor of `twin.orbit.flight.sensor`, from the true orbit and attitude, with light time, aberration and refraction. The
-analysis gets image points, control coordinates and the measured orbit and attitude, and takes the effects on the light
-out of the image points with the laboratory's camera (`twin.orbit.calibration.campaign`).
+analysis gets image points, control coordinates and the measured orbit and attitude, and corrects the image points for
+the effects on the light with the laboratory's camera (`twin.orbit.calibration.campaign`).
 
 Instead of drawn points, the image points of a field can be measured in rendered images of patches of its ground. Every
-patch is rendered through the true sensors and measured with what a user has (`twin.orbit.images.image_points`). The
-truth enters only the record of wrong matches and the true coordinates of check points.
+patch is rendered through the true sensors, and its points are matched with the data that a user has
+(`twin.orbit.images.image_points`). The truth is used only to record wrong matches and for the true coordinates of check
+points.
 """
 
 from __future__ import annotations
@@ -68,7 +69,9 @@ _OFFSET = 9000.0
 km x 32 km.
 """
 _LEAST_CONTROL = 6
-"""Smallest number of control points of a field that must be matched in every line; twelve unknowns need three."""
+"""Smallest number of control points of a field that must be matched in every line; the twelve unknowns require three,
+the others are redundant.
+"""
 _REMEDIES: Mapping[str, tuple[KeyPath, str]] = FrozenMap(
     {
         "span": (("span",), "a longer pass, or patches nearer to the field's middle"),
@@ -216,7 +219,7 @@ class Imager:
 
 
 _EXACT = 1e-3
-"""Sigma of control points without errors, in metres: an adjustment needs weights."""
+"""Sigma assumed for control points that are simulated without errors, in metres: an adjustment needs weights."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -258,7 +261,7 @@ def _joined(parts: list[_SelectedPoints], data: PassData) -> _SelectedPoints:
 
 
 def _match_counts(records: list[PatchRecord]) -> str:
-    """Return a text with the numbers of points sought, matched, and consistent with their neighbours, by line."""
+    """Return a text with the numbers of points searched for, matched, and consistent with their neighbours, by line."""
     words = []
     for name in records[0].judgements["control"]:
         lines = [r.points.control.lines[name] for r in records if r.points.control is not None]
@@ -284,13 +287,16 @@ def _middle(patch: PatchPlaceSpec, nadir: Sensor, height: float) -> tuple[float,
 
 
 _DRIFT, _READING = 6, 7
-"""Random streams of a field's seed for drift and monitor readings; its other draws do not change with them."""
+"""Numbers of the random streams of a field's seed for the cameras' drift and the monitor's readings, so that these do
+not change the other random numbers.
+"""
 
 
 def _sample_drift(spec: OrbitCalibrationSpec, seed: np.random.SeedSequence) -> FrozenMap[str, np.ndarray]:
-    """Draw the true change of each line camera during one field: d_alpha, d_beta, d_gamma (rad) and d_f (m), (4,).
+    """Draw the true change (4,) of each line camera in one field: d_alpha, d_beta, d_gamma (rad) and d_f (m).
 
-    The result is empty for cameras without drift. The draws of a line do not depend on the sigmas of the others.
+    These are rotations about the camera's Y, X and line of sight, and the change of the principal distance. The result
+    is empty for cameras without drift. The random numbers of a line do not depend on the sigmas of the others.
 
     Parameters
     ----------
@@ -309,16 +315,10 @@ def _sample_drift(spec: OrbitCalibrationSpec, seed: np.random.SeedSequence) -> F
 def _sample_readings(
     spec: OrbitCalibrationSpec, drift: Mapping[str, np.ndarray], seed: np.random.SeedSequence
 ) -> FrozenMap[str, np.ndarray]:
-    """Draw the (4,) change of each line that the monitor measures, in radians and metres; empty without a monitor.
+    """Draw the monitor's noisy measurement (4,) of each line camera's change; empty without a monitor.
 
-    Parameters
-    ----------
-    spec : OrbitCalibrationSpec
-        Content of the test file.
-    drift : Mapping[str, ndarray]
-        True drift by line.
-    seed : np.random.SeedSequence
-        Seed of the field.
+    The elements are the rotations d_alpha, d_beta, d_gamma, in radians, and the change d_f of the principal distance,
+    in metres.
     """
     if spec.monitor is None:
         return FrozenMap({})
@@ -328,22 +328,25 @@ def _sample_readings(
 
 
 def reading_sigma(spec: OrbitCalibrationSpec) -> np.ndarray:
-    """Return the (4,) standard deviations of the monitor's readings of a camera, in radians and metres.
+    """Return the (4,) standard deviations of the monitor's readings of a camera's change.
 
-    The test must have a monitor.
+    The elements belong to three rotations, in radians, and the principal distance, in metres. The test must have a
+    monitor.
     """
     assert spec.monitor is not None
     return np.array([*spec.monitor.angles, spec.monitor.principal_distance])
 
 
 _LEAST_IMAGE = 0.02
-"""Sigma of image points without errors, in pixels: an adjustment needs weights."""
+"""Sigma assumed for image points that are simulated without errors, in pixels: an adjustment needs weights."""
 _SPARE = 1.25
-"""Number of candidates drawn per ground point; those that a line does not see are dropped."""
+"""Number of candidates drawn per required ground point; those that a line does not see are dropped."""
 _PICTURES = 5
-"""Random stream of a field's seed for its images, separate from the draws of fields without images."""
+"""Number of the random stream of a field's seed for its images, separate from the draws of fields without images."""
 _TIES = 8
-"""Random stream of a field's seed for the tie points of its strip; `_DRIFT` and `_READING` are the two before it."""
+"""Number of the random stream of a field's seed for the tie points of its strip; `_DRIFT` and `_READING` are the two
+numbers before it.
+"""
 _MARGIN = 6.0
 """Smallest distance of a point from the edge of an image, in sigmas, so that its measured position cannot lie outside.
 """
@@ -379,7 +382,10 @@ def fly_fields(setup: CalibrationSetup, seed: np.random.SeedSequence, advance: A
 
 
 def true_bias(spec: OrbitCalibrationSpec, latitude: np.ndarray) -> np.ndarray:
-    """Return roll, pitch, yaw from measured to true attitude at n latitudes, (n, 3), in radians, without season."""
+    """Return the true attitude bias (roll, pitch, yaw) at n latitudes, (n, 3), in radians, without season.
+
+    The bias is the rotation from measured to true attitude; its random seasonal part is not included.
+    """
     tracker = spec.errors.star_tracker
     drift = np.array(tracker.thermal.amplitude) * spec.errors.switched_on
     rotation = np.array(tracker.bias) + np.sin(latitude - tracker.thermal.reference)[:, None] * drift
@@ -459,7 +465,7 @@ def _measurements_of(
     ties: Mapping[str, ImagePoints],
     datum: tuple[float, float, float],
 ) -> PassMeasurements:
-    """Return the measurements of a simulated pass, in the form in which files hold them.
+    """Return the measurements of a simulated pass, in the form in which they are written to files.
 
     Parameters
     ----------

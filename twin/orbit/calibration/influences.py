@@ -1,10 +1,9 @@
 """Errors that the fit of a calibration hardly shows, and the changes of the parameters that they cause.
 
-Effects on the light that are left in the image points, and ground coordinates in a wrong datum, are absorbed by the
-parameters; the size of these changes is found by calibrating again from the same measurements. These comparisons treat
-the noise of attitude and orbit as independent, which takes a tenth of the time. A drift of the attitude within the
-passes and steps between the chips of a line are tested on the residuals: the smallest detectable size, and whether they
-are significant.
+Uncorrected effects on the light and ground coordinates in a wrong datum are absorbed by the parameters; how much these
+change is found by calibrating again from the same measurements. These comparisons treat the noise of attitude and orbit
+as independent, which takes a tenth of the time. A drift of the attitude within the passes and steps between the chips
+of a line are tested on the residuals: the smallest detectable size, and whether they are significant.
 """
 
 from __future__ import annotations
@@ -32,11 +31,11 @@ UNEXPECTED_SIGMAS = 4.0
 reported; with seventy unknowns, a false alarm occurs in 1 of 200 campaigns.
 """
 UNDETECTED_SIGMAS = 3.0
-"""Error of an unknown, in units of its sigma, above which a file has to specify whether the attitude drifts: the error
-due to a drift that the residuals show in only half of all cases.
+"""Error of an unknown due to a barely detectable drift, in its sigmas, above which the file must specify whether the
+attitude drifts; barely detectable is a drift that the residuals show in half of all cases.
 """
 _STEP_ALARM = 1e-4
-"""Probability of a false alarm in any of the tests of steps between chips of a run."""
+"""Probability that any of a run's tests of steps between chips raises a false alarm."""
 _TRIAL_TIME = 0.01
 """Delay of the line times that is tested, in seconds; 70 m on the ground."""
 _TRIAL_SHIFT = 100.0
@@ -45,24 +44,26 @@ _TRIAL_SHIFT = 100.0
 
 @dataclass(frozen=True, eq=False)
 class LightRow:
-    """Calibration with some effects on the light left in the image points.
+    """Results of a calibration with some effects on the light not corrected.
 
     Attributes
     ----------
     left : tuple of str
-        Effects that are not taken out, among `EFFECTS`.
+        Effects that are not corrected, among `EFFECTS`.
     moved : Mapping[str, ndarray]
-        Line -> (2,) RMS displacement of the check points' image points by these effects, x and y, in metres.
+        Line -> (2,) RMS displacement of the check points' image points due to these effects, x and y in the focal
+        plane, in metres.
     before : FieldErrors
         Mean of the fields' RMS errors with the laboratory's camera.
     after : FieldErrors
         Mean of the fields' RMS errors, each field with its own parameters.
     shift : Mapping[str, float]
-        Change of each parameter of the simultaneous adjustment from the case with all effects taken out.
+        Change of each parameter of the simultaneous adjustment, in metres or radians, relative to the adjustment with
+        all effects corrected.
     sigma : Mapping[str, float]
-        Standard deviation of each parameter.
+        Standard deviation of each parameter, in the same unit.
     p_value : float
-        p-value of the adjustment.
+        p-value of the adjustment's chi-square.
     """
 
     left: tuple[str, ...]
@@ -74,7 +75,7 @@ class LightRow:
     p_value: float
 
     def most(self, names: tuple[str, ...]) -> tuple[str, float]:
-        """Return the unknown of `names`, not held by the gauge, that changes by the most sigmas, and the change."""
+        """Return the estimated unknown of `names` that changes by the most sigmas, and its change in sigmas."""
         size = {n: self.shift[n] / self.sigma[n] for n in names if self.sigma[n] > 0.0}
         worst = max(size, key=lambda n: abs(size[n]))
         return worst, size[worst]
@@ -82,7 +83,7 @@ class LightRow:
 
 @dataclass(frozen=True, eq=False)
 class DatumRow:
-    """Calibration with a common shift of all control points, or with late line times.
+    """Results of a calibration with a common shift of all control points, or with late line times.
 
     Attributes
     ----------
@@ -97,9 +98,9 @@ class DatumRow:
     fit : float
         Change of the chi-square of the simultaneous adjustment.
     p_value : float
-        p-value of the adjustment with the shift.
+        p-value of the chi-square of the adjustment with the shift.
     after : FieldErrors
-        Mean of the fields' RMS errors in the right datum, each field with its own parameters.
+        Mean of the fields' RMS errors at check points in the right datum, each field with its own parameters.
     late : float
         Delay of the line times, in seconds, instead of a shift.
     sigma : Mapping[str, float]
@@ -163,7 +164,7 @@ class UnexpectedChange:
 
 
 def light_rows(campaign: Campaign, sigma: Mapping[str, float]) -> tuple[LightRow, ...]:
-    """Calibrate with all effects on the light corrected, with each one left in alone, and with all left in.
+    """Calibrate with all effects on the light corrected, with each in turn uncorrected, and with none corrected.
 
     Only effects that are switched on are considered.
 
@@ -213,9 +214,9 @@ def light_rows(campaign: Campaign, sigma: Mapping[str, float]) -> tuple[LightRow
 
 
 def datum_rows(campaign: Campaign) -> tuple[DatumRow, ...]:
-    """Calibrate with wrong datums: that of the file, or 100 m along each axis and lines 10 ms late.
+    """Calibrate with a wrong datum: the file's, or trial shifts of 100 m on each axis and 10 ms late line times.
 
-    The trial errors are used where the file has no wrong datum.
+    The trial errors are used where the file specifies no wrong datum.
 
     Raises
     ------
@@ -254,14 +255,14 @@ def datum_rows(campaign: Campaign) -> tuple[DatumRow, ...]:
 
 
 def _warned(campaign: Campaign, change: Mapping[str, float], size: float) -> float | None:
-    """Return the size of an error, in metres or seconds, above which `unexpected_changes` reports its effect.
+    """Return the size of a datum or time error, in metres or seconds, above which `unexpected_changes` reports it.
 
     Parameters
     ----------
     campaign : Campaign
         Measurements of the passes.
     change : Mapping[str, float]
-        Change of each unknown that the error causes at `size`.
+        Change of each unknown due to an error of this `size`.
     size : float
         Size of the error that was tested, in metres or seconds.
     """
@@ -271,7 +272,7 @@ def _warned(campaign: Campaign, change: Mapping[str, float], size: float) -> flo
 
 
 def unexpected_changes(campaign: Campaign, adjustment: Adjustment) -> tuple[UnexpectedChange, ...]:
-    """Return the estimates beyond `UNEXPECTED_SIGMAS` of their expected sigmas, the largest ratio first."""
+    """Return the estimates that differ from expectation by over `UNEXPECTED_SIGMAS` sigmas, largest ratio first."""
     expected = _expected(campaign)
     all_of_them = [
         UnexpectedChange(n, float(adjustment.value(n) - v), s)
@@ -300,30 +301,31 @@ def _expected(campaign: Campaign) -> dict[str, tuple[float, float]]:
 
 
 def _after(campaign: Campaign) -> FieldErrors:
-    """Return the means of the fields' RMS errors, each field with its own parameters."""
+    """Return the means of the fields' RMS errors at check points, each field with its own parameters."""
     alone = {p.name: calibrated_alone(campaign, p) for p in campaign.passes}
     return FieldErrors.mean(list(scheme_errors(campaign, alone).values())[-1])
 
 
 @dataclass(frozen=True)
 class AttitudeDrift:
-    """Drift of the attitude during the passes: its effect on the unknowns, and its test on the residuals.
+    """Effect of an attitude drift during the passes on the unknowns, and its test on the residuals.
 
     Attributes
     ----------
     seconds : float
         Time from when the first line sees a field to when the last one does, mean of the passes.
     sigmas_per_arcsec : Mapping[str, float] or None
-        Change of each unknown, in its sigmas, for a drift of 1 arcsec in these seconds (one standard deviation about
-        each axis in each pass) that is not estimated; None where rates are unknowns.
+        Change of each unknown, divided by its sigma, due to a drift that is not estimated and has a standard deviation
+        of 1 arcsec in `seconds` about each axis in each pass; None where rates are unknowns.
     detectable : (3,) ndarray or None
-        Drift about body X, Y, Z in these seconds that residuals show in half of all cases, in radians; None where rates
-        are unknowns.
+        Drift about body X, Y, Z within `seconds` that the test on the residuals detects in half of all cases, in
+        radians; None where rates are unknowns.
     undetected_sigmas : float or None
-        Error of the most sensitive unknown for that drift, in its sigmas; None where rates are unknowns.
+        Error of the most sensitive unknown due to the `detectable` drift, divided by its sigma; None where rates are
+        unknowns.
     rate_p_value, course_p_value : float or None
-        p-values of the residuals without rates, and without errors that change slowly along the lines; below
-        `FALSE_ALARM` they count as detected.
+        p-values of the tests for rates and for slowly varying errors, from the residuals of an adjustment without them;
+        below `FALSE_ALARM` they count as detected.
     assumed : DetectedDrift or None
         Drift that was added to the noise model; None where none was detected.
     """
@@ -338,7 +340,7 @@ class AttitudeDrift:
 
     @classmethod
     def of(cls, campaign: Campaign, fit: Adjustment) -> Self:
-        """Return the effect and the test of an attitude drift, from an adjustment of all fields."""
+        """Compute the effect of an attitude drift on the unknowns, and its test, from an adjustment of all fields."""
         seconds = float(np.mean([p.seconds_apart for p in campaign.passes]))
         effect = detectable = undetected = None
         rate_p_value = None
@@ -362,14 +364,17 @@ class AttitudeDrift:
 
     @property
     def most(self) -> tuple[str, float]:
-        """Unknown that a drift changes by the most sigmas, and that change; ("", 0) where rates are unknowns."""
+        """Name of the unknown that a drift changes by the most sigmas, and this change in sigmas.
+
+        The value is ("", 0) where rates are estimated as unknowns.
+        """
         if not self.sigmas_per_arcsec:
             return "", 0.0
         return max(self.sigmas_per_arcsec.items(), key=lambda item: item[1])
 
 
 def drift_warnings(campaign: Campaign, drift: AttitudeDrift) -> list[str]:
-    """Return warnings of a detected drift, or of a file that does not specify a drift that would matter."""
+    """Return warnings of a detected attitude drift, or of one that may be harmful without being detectable."""
     if drift.assumed is not None:
         rate = max(drift.assumed.rate) * drift.seconds / ARCSEC
         p_value = min(drift.course_p_value, 1.0 if drift.rate_p_value is None else drift.rate_p_value)
@@ -377,7 +382,7 @@ def drift_warnings(campaign: Campaign, drift: AttitudeDrift) -> list[str]:
             "the attitude drifts during the passes, or errors of image points are correlated along the lines: residuals"
             f" of neighbouring exposures are correlated (p = {p_value:.1g}). The sigmas include a random walk of"
             f" {drift.assumed.walk / ARCSEC:.2g} arcsec in a second and rates of {rate:.2g} arcsec in"
-            f" {drift.seconds:.0f} s, estimated from these residuals: state errors.star_tracker.drift and walk"
+            f" {drift.seconds:.0f} s, estimated from these residuals: specify errors.star_tracker.drift and walk"
         ]
     name, ratio = drift.most
     spec, undetected = campaign.spec, drift.undetected_sigmas or 0.0
@@ -388,9 +393,9 @@ def drift_warnings(campaign: Campaign, drift: AttitudeDrift) -> list[str]:
     ):
         least = float(np.min(drift.detectable)) / ARCSEC if drift.detectable is not None else np.inf
         return [
-            f"the file does not state a drift of the attitude within a pass: 1 arcsec in {drift.seconds:.0f} s changes"
+            f"the file specifies no drift of the attitude within a pass: 1 arcsec in {drift.seconds:.0f} s changes"
             f" {name} by {ratio:.2g} of its sigmas, and the residuals show a drift only above {least:.2g} arcsec:"
-            " state errors.star_tracker.drift, [0 arcsec, 0 arcsec, 0 arcsec] where there is none"
+            " specify errors.star_tracker.drift, [0 arcsec, 0 arcsec, 0 arcsec] where there is none"
         ]
     return []
 
@@ -410,7 +415,8 @@ class ChipStep:
     step : float
         Estimated displacement of all pixels beyond the joint, in metres.
     sigma : float or None
-        Standard deviation of the step, estimated together with all others, in metres; None where it is not observable.
+        Standard deviation of the step, estimated together with all other unknowns, in metres; None where it is not
+        observable.
     detectable : float or None
         Step that is detected in half of all cases, in metres; None where it is not observable.
     detected : bool
@@ -427,7 +433,7 @@ class ChipStep:
 
     @classmethod
     def of(cls, campaign: Campaign, together: Adjustment) -> tuple[Self, ...]:
-        """Return the tests of the steps of all lines of a campaign, from the adjustment of all fields."""
+        """Test the steps between the chips of all lines, with the residuals of the adjustment of all fields."""
         steps = Steps(_joints(campaign))
         test = together.omitted_terms_test(steps)
         limit = float(norm.isf(0.5 * _STEP_ALARM / max(steps.size, 1)))

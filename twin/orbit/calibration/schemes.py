@@ -1,8 +1,9 @@
 """Errors at check points without ground control, by scheme of averaged parameters, and their dependence on the method.
 
-Schemes (paper 003, section 4.4): the parameters of several fields, each calibrated by itself, are averaged and tested
-on all fields by forward intersection, on one campaign and on campaigns repeated with new random errors. The gain of
-averaging depends on how well the parameters repeat from field to field, which `repeatability` computes.
+Schemes (paper 003, section 4.4): the parameters of several fields, each calibrated by itself, are averaged, and tested
+by forward intersection of the check points of all fields, in one campaign and in campaigns repeated with new random
+errors. The gain of averaging depends on how well the parameters repeat from field to field, which `repeatability`
+computes.
 
 Strips: passes are adjusted on tie points before their check points are intersected. Slow errors of the attitude over a
 field's control points go into its interior orientation and bias. Adjusting the attitude afterwards with these
@@ -13,8 +14,8 @@ Monitoring: the gain of an on-board monitor where the cameras change from field 
 from campaigns with the same random numbers and drifts of several sizes, adjusted as if nothing drifted and with the
 monitor's readings.
 
-Effects on the light that are corrected are excluded from these campaigns, and attitude and orbit noise is treated
-as independent: both take most of the time and hardly change the errors at check points.
+Effects on the light that are corrected are not simulated in these repeated campaigns, and attitude and orbit noise is
+treated as independent: both take most of the time and hardly change the errors at check points.
 """
 
 from __future__ import annotations
@@ -46,7 +47,7 @@ if TYPE_CHECKING:
     from scenes.specs.orbit.setup import CalibrationSetup
 
 RMS = ("plan_rms", "height_rms")
-"""Attributes of `CheckErrors` and `FieldErrors` with the RMS error in plan and in height."""
+"""Names of the attributes of `CheckErrors` and `FieldErrors` with the RMS errors in plan and in height."""
 
 
 @dataclass(frozen=True)
@@ -66,7 +67,7 @@ class FieldErrors:
 
     @classmethod
     def pooled(cls, errors: Iterable[CheckErrors]) -> FieldErrors:
-        """Return the RMS errors over all check points, so that each field is weighted by the number of its points."""
+        """Return the RMS errors over the check points of all fields together, each point with equal weight."""
         rows = list(errors)
         count = [e.count for e in rows]
         plan, height = (np.average(np.square([getattr(e, what) for e in rows]), weights=count) for what in RMS)
@@ -85,7 +86,7 @@ def meets(errors: Mapping[str, CheckErrors], limits: MapLimitsSpec) -> bool:
 
 @dataclass(frozen=True, eq=False)
 class SchemeMeans:
-    """Errors of the schemes of averaged parameters over the fields, fewest averaged fields first.
+    """Means over the fields of each scheme's errors, the scheme with the fewest averaged fields first.
 
     Attributes
     ----------
@@ -123,12 +124,14 @@ class SchemeMeans:
 
 
 _LEAST_SCHEMES = 3
-"""Smallest number of schemes for a comparison: two of averaged parameters, and each field with its own."""
+"""Smallest number of schemes for a comparison: two with averaged parameters, and the one in which each field uses its
+own.
+"""
 
 
 @dataclass(frozen=True, eq=False)
 class Repeats:
-    """Campaigns over the same fields with new random errors.
+    """Errors at check points of N campaigns over the same fields, each with new random errors.
 
     Attributes
     ----------
@@ -170,8 +173,8 @@ def evaluate_schemes(
     alone : Mapping[str, Adjustment]
         Calibration of each field by itself, by field.
     test : callable
-        Function of a field's pass, the cameras and the bias (3,). Cameras and bias are means of the scheme's fields,
-        and the field's own in the last scheme.
+        Function of a field's pass, the cameras and the attitude bias (3,). Cameras and bias are means over the scheme's
+        fields; in the last scheme they are those of the tested field.
     """
     results = {}
     for k, scheme in enumerate((*campaign.spec.schemes, None)):
@@ -208,7 +211,19 @@ def laboratory_errors(campaign: Campaign) -> FrozenMap[str, CheckErrors]:
 def check_point_errors(
     campaign: Campaign, flight: FieldPass, cameras: Mapping[str, LineModel], bias: np.ndarray
 ) -> CheckErrors:
-    """Return the errors at a field's check points, intersected with these cameras and this attitude bias (3,)."""
+    """Intersect a field's check points with the given cameras and attitude bias and return their errors.
+
+    Parameters
+    ----------
+    campaign : Campaign
+        Campaign whose noise weights the rays.
+    flight : FieldPass
+        Pass over the field.
+    cameras : mapping of str to LineModel
+        Line -> camera model.
+    bias : (3,) ndarray
+        Attitude bias (rotations about three axes), radians.
+    """
     return check_errors(intersect(flight.check, cameras, campaign.noise, bias=bias).ground, flight.check_ground)
 
 
@@ -306,7 +321,7 @@ class Strips:
     Attributes
     ----------
     ties : Mapping[str, int]
-        Field -> number of tie points that two lines or more see.
+        Field -> number of tie points that at least two lines see.
     schemes : Mapping[str, Mapping[str, CheckErrors]]
         Scheme -> field -> errors at its check points, calibrated on control and tie points and adjusted on tie points;
         in the last scheme each field uses its own parameters.
@@ -323,7 +338,7 @@ class Strips:
 
 
 def adjust_strips(campaign: Campaign, advance: Advance) -> Strips | None:
-    """Adjust every field's strip with every scheme; None for a file without a strip.
+    """Adjust every field's strip with every scheme's parameters; return None for a file without a strip.
 
     Parameters
     ----------
@@ -411,7 +426,7 @@ def strip_check_errors(
 
 
 FACTORS = (0.0, 0.5, 1.0, 2.0, 4.0)
-"""Factors by which the simulated drift of the cameras differs from that of the file."""
+"""Factors by which the drift that the file specifies is multiplied in the simulations."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -461,9 +476,10 @@ class Monitoring:
     sizes : tuple of DriftSize
         Errors for each of the `FACTORS`.
     angle : float
-        Standard deviation of d_alpha in the file, root mean square over the lines that drift, in radians.
+        Standard deviation of the rotation d_alpha about the camera's Y in the file, root mean square over the lines
+        that drift, in radians.
     metres : float
-        Change of heights for 1 arcsec of d_alpha of the forward line, mean of the first field, in metres.
+        Mean change of heights of the first field for 1 arcsec of d_alpha of the forward line, in metres.
     """
 
     sizes: tuple[DriftSize, ...]
@@ -476,14 +492,14 @@ class Monitoring:
 
 
 def study_monitoring(setup: CalibrationSetup, seed: np.random.SeedSequence, advance: Advance) -> Monitoring | None:
-    """Simulate the same campaign with drifts of several sizes; None for a file without drift.
+    """Simulate the same campaign with drifts of several sizes; return None for a file without drift.
 
     Parameters
     ----------
     setup : CalibrationSetup
         Resolved test file and camera.
     seed : np.random.SeedSequence
-        Seed of the campaign; it is not changed.
+        Seed of the campaign, used unchanged for all sizes.
     advance : Advance
         Callback that reports the progress.
 
@@ -510,9 +526,9 @@ def study_monitoring(setup: CalibrationSetup, seed: np.random.SeedSequence, adva
 
 
 def fly_with_drift(setup: CalibrationSetup, factor: float, seed: np.random.SeedSequence) -> Campaign:
-    """Simulate the campaign with the file's drift times a factor, without correctable effects on the light.
+    """Simulate the campaign with the file's drift times a factor, without the effects on the light.
 
-    All other random numbers are those of the campaign without drift. The seed is not changed.
+    All other random numbers are those of the campaign without drift; the object `seed` is not modified.
     """
     test = setup.test
     drift = {
@@ -547,7 +563,7 @@ def without_monitor(campaign: Campaign) -> Treatment:
 
 
 def with_monitor(campaign: Campaign) -> Treatment:
-    """Adjust a campaign with the monitor's readings.
+    """Adjust a campaign with the monitor's readings, and return the errors at its check points.
 
     The readings enter the calibration of a field as observations, and correct the cameras when its check points are
     intersected.
@@ -562,14 +578,14 @@ def with_monitor(campaign: Campaign) -> Treatment:
 
 
 def adjust_with_readings(campaign: Campaign) -> Adjustment:
-    """Adjust all fields at once, with every camera's drift in every field as unknowns that the readings observe."""
+    """Adjust all fields at once, with each camera's drift in each field as unknowns that the monitor observes."""
     return simultaneous(
         campaign, drift=True, monitor=tuple(p for flight in campaign.passes for p in _reading_priors(campaign, flight))
     )
 
 
 def adjust_field_with_readings(campaign: Campaign, flight: FieldPass) -> Adjustment:
-    """Adjust one field with its readings; the interior orientation is that of the cameras without their drift."""
+    """Adjust one field with the monitor's readings, for the interior orientation of the cameras without drift."""
     return adjust(
         [flight.control],
         campaign.laboratory,
@@ -581,7 +597,10 @@ def adjust_field_with_readings(campaign: Campaign, flight: FieldPass) -> Adjustm
 
 
 def height_per_arcsec(campaign: Campaign) -> float:
-    """Return the mean height error, in metres, of the first field for 1 arcsec of d_alpha of the forward line."""
+    """Return the mean height error of the first field, in metres, for a 1 arcsec pitch of the forward line camera.
+
+    The rotation is d_alpha, about the camera's Y axis.
+    """
     flight, cameras = campaign.passes[0], dict(campaign.truth)
     ground = [
         intersect(flight.check, {**cameras, "forward": turned}, campaign.noise, bias=flight.bias).ground

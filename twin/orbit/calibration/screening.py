@@ -28,46 +28,48 @@ from twin.orbit.measured.pass_measurements import ImagePoints, listed
 _ROUNDS = 3
 """Largest number of rounds in which the adjustment is repeated with rescaled sigmas of image points."""
 _SETTLED = 1.05
-"""Factor on the sigmas of all lines together below which no factor is applied; factors below 1 are never applied.
-Errors that the three lines' matches with one template have in common do not show in residuals, because they move the
-adjusted point.
+"""Smallest factor on the sigmas of all lines together that is applied; factors below 1 are never applied. Errors common
+to the matches of the three lines with one template cannot be seen in residuals, because they move the adjusted
+point.
 """
 _OWN_SIGMAS = 4.0
-"""Sigmas by which the variance of a line of a pass must exceed the others to get a separate factor; by chance this
-happens with a probability of 3e-5. A variance from the median of n good points has a relative uncertainty of 1.44 /
-sqrt(n) (1 / ln 2 that of the root mean square).
+"""Number of sigmas by which the variance of one line in one pass must exceed those of the others to get a separate
+factor; by chance this happens with a probability of 3e-5. A variance from the median of n correct points has a
+relative standard deviation of 1.44 / sqrt(n), where 1.44 = 1 / ln 2.
 """
 _MEDIAN_SPREAD = 1.0 / np.log(2.0)
 """Relative standard deviation of a variance estimated from the median of n squared residuals, times the square root of
 n.
 """
 _FALSE_ALARM = 1e-4
-"""False-alarm probability of the test of check points, the same as for image points in the adjustment."""
+"""Probability that a correct check point is rejected, the same as for image points in the adjustment."""
 
 
 _FAR_SCATTERS, _FAR_SIGMAS = 10.0, 20.0
-"""Limits beyond which an image point does not belong to the ground point of its name: scatters of a line's image points
-about their common misclosure, and sigmas of an image point. The nearest of 100 points in a strip of 60 km lies 1000
-sigmas away in the median."""
+"""Limits of the distance of an image point from its expected position, beyond which it is taken to show another ground
+point than that of its name: in units of the scatter of the line's image points about their common misclosure, and in
+sigmas of an image point. The nearest of 100 points in a strip of 60 km is typically (median) 1000 sigmas away.
+"""
 _LEAST_OF_LINE = 8
-"""Smallest number of control points in a line at which wrongly named points are searched for."""
+"""Smallest number of control points in a line from which wrongly named points are searched for."""
 _SLOPE_POINTS = 500
-"""Largest number of points from which the slope of the misclosures is computed."""
+"""Largest number of points from which the slope of the misclosures over the pixel is computed."""
 _Accepted = dict[str, dict[str, np.ndarray]]
 
 
 def mislabelled_points(campaign: Campaign, flight: FieldPass) -> tuple[dict[str, np.ndarray], np.ndarray]:
     """Return masks of the image points that do not show the ground point of their name.
 
-    Errors of camera and platform move the image points of a line alike, slightly rotated and scaled: a straight line in
-    the pixel through the medians of misclosures, a fit that tolerates up to half of the points being wrong.
+    Errors of camera and platform displace the image points of a line almost equally, apart from a small rotation and
+    change of scale. They are modelled by a straight line over the pixel, fitted to the misclosures by medians, which
+    tolerates up to half of the points being wrong.
 
     Returns
     -------
     wrong : dict of str to (n,) ndarray of bool for n image points
-        Line -> mask of its image points, for control points alone.
+        Line -> mask of its wrong image points of control points.
     wrong_check : (m,) ndarray of bool for m check points
-        Check points that at least one line shows elsewhere.
+        Check points that are wrong in at least one line.
     """
     wrong, wrong_check, still = {}, np.zeros(len(flight.check_ground), bool), np.zeros(3)
     for name, rays in flight.control.rays.items():
@@ -179,8 +181,8 @@ def _robust(campaign: Campaign) -> tuple[Adjustment, _Accepted]:
 def _factors(fit: Adjustment, good: _Accepted) -> dict[tuple[str, str], float]:
     """Return factors on image sigmas by (field, line), from the median of the accepted standardised residuals.
 
-    A line has a factor of its own where its residuals stand out from the sigmas and from all other lines; all others
-    share one factor. The result is empty where no factor is needed.
+    A line has a separate factor where its residuals are significantly larger than its sigmas and than those of all
+    other lines; all others share one factor. The result is empty where no factor is needed.
     """
     squares = {
         (name, line): np.sum(residual**2, axis=1)[good[name][line]]
@@ -229,9 +231,10 @@ def _rescaled(campaign: Campaign, factors: Mapping[tuple[str, str], float]) -> C
 def _without(
     campaign: Campaign, flight: FieldPass, good: dict[str, np.ndarray], fit: Adjustment
 ) -> tuple[FieldPass, np.ndarray]:
-    """Return a pass without rejected points, and the mask of accepted check points.
+    """Return a pass without its rejected points, and the mask of accepted check points.
 
-    Rejected are image points, tie points that only one line still sees, and check points whose rays do not intersect.
+    The rejected points are the outliers among image points, tie points that only one line still sees, and check points
+    whose rays do not intersect.
     """
     count = len(flight.control_ground)
     seen = np.zeros(count, int)
@@ -276,7 +279,7 @@ def _renumbered(row: ImagePoints, retained: np.ndarray) -> ImagePoints:
 def _rejected(
     flight: FieldPass, good: dict[str, np.ndarray], check: np.ndarray, factors: Mapping[str, float]
 ) -> Rejected:
-    """Return the names of the rejected points and the counts before and after."""
+    """Return the names of the rejected points and the numbers of points before and after screening."""
     points = [
         (str(flight.control_ids[point]), name)
         for name, row in flight.control_images.items()
@@ -319,8 +322,8 @@ class IntersectionFit:
     def p_value(self) -> float:
         """Probability of a chi-square at least as large.
 
-        Points exposed within a few readings have correlated errors, and the errors of the calibration itself are
-        included.
+        The test takes into account that points exposed within a few readings have correlated errors, and the errors of
+        the calibration itself.
         """
         return statistics.p_value(self.chi_square, self.degrees_of_freedom)
 

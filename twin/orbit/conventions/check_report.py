@@ -1,6 +1,7 @@
-"""Report and result records of a check of conventions: each is confirmed, wrong or undetermined.
+"""Report and result quantities of a check of file conventions: each is confirmed, wrong or undetermined.
 
-A reading here is one interpretation of the files' numbers. The records define the quantities of check.json.
+In names, a reading is one interpretation of the files' numbers, such as axes, time scale and pixel count. The
+quantities are those of check.json.
 """
 
 from __future__ import annotations
@@ -79,9 +80,10 @@ CONVENTION: Record[tuple[ValueTest, ...]] = Record(
 
 
 def places_of(run: Check, changes: Changes) -> list[dict[str, Any]]:
-    """Return where one interpretation of the files places the first points on the ground, one row per point.
+    """Return the ground positions of the first image points under one interpretation of the files.
 
-    A row has longitude, latitude and the distance from the ground point, east and north in metres.
+    The list has one entry per point: longitude, latitude, and the distances from the given ground point, east and north
+    in metres.
     """
     positions = run.places[changes]
     if isinstance(positions, str):
@@ -113,7 +115,7 @@ PLACE: Record[PlacedReading] = Record(
 
 
 def _best(run: Check) -> dict[str, Any]:
-    """Return the value of every convention of the best interpretation of the files."""
+    """Return the value of each convention in the best interpretation of the files."""
     reading = changed(run.stated, run.best.changes)
     return {name: TESTED_CONVENTIONS[name].get(reading) for name in run.answers}
 
@@ -143,7 +145,7 @@ CHECK: Record[Check] = Record(
 
 
 OTHER_READING, NO_READING = 3, 4
-"""Exit codes if another reading than the stated one explains the points, and if none does."""
+"""Exit codes if another interpretation of the files than the specified one explains the points, and if none does."""
 _LISTED = 12
 """Number of interpretations in the table of the report."""
 _NAMED = 6
@@ -192,7 +194,7 @@ def _verdict(run: Check) -> tuple[str, tuple[str, ...]]:
 
 
 def _undetermined(answers: tuple[ValueTest, ...]) -> bool:
-    """Return whether the points allow more than one value of a convention."""
+    """Return whether more than one value of a convention is consistent with the points."""
     return sum(test.possible for test in answers) > 1
 
 

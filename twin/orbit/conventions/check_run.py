@@ -1,6 +1,7 @@
-"""Search for the conventions of a pass that explain its ground points: ``python -m twin.orbit check``.
+"""Search for file conventions of a pass that explain its ground points: ``python -m twin.orbit check``.
 
-Here a reading is one interpretation of the files' numbers, under one set of conventions.
+A convention is, for example, the order of quaternion elements, a time scale, or the direction in which pixels count. In
+names, a reading is one interpretation of the files' numbers under one set of conventions.
 """
 
 from __future__ import annotations
@@ -44,14 +45,14 @@ if TYPE_CHECKING:
 
 Verdict = Literal["confirmed", "another", "none"]
 DECIDED = 20.0
-"""Difference of cost (minus twice the log likelihood) from which two interpretations of the files are separated.
+"""Difference of cost (minus twice the log likelihood) from which one interpretation of the files is rejected.
 
-One is then exp(-10) = 1/22 000 as likely as the other: a few hundred are tried, so that one in a hundred checks is
-wrong at most.
+The rejected one is then exp(-10) = 1/22 000 times as likely as the other. As a few hundred are tried, at most one check
+in a hundred is wrong.
 """
 _FITS = 9.0
-"""Chi-square per degree of freedom up to which an interpretation explains the points: it allows sigmas three times too
-small.
+"""Chi-square per degree of freedom up to which an interpretation of the files explains the points: it allows for sigmas
+that are three times too small.
 """
 _ROUGH_POINTS = 8
 """Number of points of each line in the rough comparison that precedes the fits."""
@@ -98,10 +99,10 @@ class ValueTest:
     value : str, float, bool or tuple
         Value of the convention.
     stated, best : bool
-        True for the specified value, and for that of the best interpretation.
+        True if the value is the one that the test file specifies, and if it is that of the best interpretation.
     excess : float
-        Cost (minus twice the log likelihood) beyond that of the best interpretation, divided by the factor of the
-        variances.
+        Cost (minus twice the log likelihood) minus that of the best interpretation, divided by the factor by which the
+        variances are too small.
     moved : float or None
         RMS displacement of the points from their positions under the best interpretation, metres; None if they have no
         position on the ground.
@@ -131,13 +132,13 @@ class Check:
     setup : CheckSetup
         Test file with the camera.
     readings : PassReadings
-        Numbers of the files.
+        Content of the files before interpretation.
     stated : PassConventions
         Conventions that the test file specifies.
     tried : tuple of TriedReading
         Interpretations with a fit, the likeliest first, then those that are impossible.
     best : TriedReading
-        Interpretation with the fewest changes among those that explain the points as well as any.
+        Interpretation with the fewest changes among those that explain the points equally well.
     verdict : Verdict
         "confirmed" if the specified interpretation explains the points, "another" if another one does, or "none".
     factor : float
@@ -146,7 +147,7 @@ class Check:
     answers : dict of str to tuple of ValueTest
         Tested values of each convention.
     first_points : dict of str to ndarray
-        Rows of the ground points whose positions are listed, by line.
+        Indices of the ground points whose positions are listed, by line.
     places : dict
         Ground positions of the first points of each line, ITRS, metres, by changes of one convention; a text says why
         there are none.
@@ -170,15 +171,16 @@ class Check:
     wrong: dict[str, tuple[str, ...]]
 
     def excess(self, tried: TriedReading) -> float:
-        """Return the cost of an interpretation minus that of the best one, divided by the factor of the variances.
+        """Return the cost of an interpretation (minus twice its log likelihood) relative to that of the best one.
 
-        It is infinite for an impossible interpretation.
+        It is the difference divided by `factor`, by which the variances are too small; infinite for an impossible
+        interpretation.
         """
         return (tried.cost - self.best.cost) / self.factor
 
     @property
     def equally_likely(self) -> tuple[Changes, ...]:
-        """Interpretations with no more changes than the best one that the points do not separate from it."""
+        """Interpretations that the points do not distinguish from the best one and that have no more changes."""
         return tuple(
             tried.changes
             for tried in self.tried
@@ -192,7 +194,9 @@ class Check:
 
 
 def run_check(setup: CheckSetup, backend: Backend | None, seed: int, advance: Advance = silent) -> Check:
-    """Try the interpretations of a pass's files; nothing is traced or drawn at random.
+    """Find the interpretation of a pass's files that explains its ground points best.
+
+    Nothing is ray-traced or drawn at random: backend and seed are not used.
 
     Raises
     ------
@@ -228,7 +232,7 @@ def run_check(setup: CheckSetup, backend: Backend | None, seed: int, advance: Ad
 
 
 def _bench(setup: CheckSetup, readings: PassReadings, stated: PassConventions) -> PassBench:
-    """Return the object that fits interpretations to the points, with the image points reduced to the test's number."""
+    """Return the object that fits interpretations of the files to at most the test's number of image points."""
     cameras = line_cameras(setup.camera)
     images = {}
     for name, raw in readings.images.items():
@@ -272,7 +276,7 @@ def _best_reading(
 
 
 def _key(changes: Changes) -> frozenset[str]:
-    """Return a key for dictionaries of a set of changed conventions that does not depend on their order."""
+    """Return a dictionary key for a set of changed conventions, independent of their order."""
     return frozenset(f"{name}={value}" for name, value in changes)
 
 
@@ -293,7 +297,7 @@ def _tried(bench: PassBench, stated: PassConventions, changes: Changes) -> Tried
 
 
 def _best(tried: Sequence[TriedReading]) -> TriedReading:
-    """Return the interpretation with the fewest changes among those that are as likely as any."""
+    """Return the interpretation with the fewest changes among those that explain the points equally well."""
     least = min(tried, key=lambda reading: reading.cost)
     if least.fit is None:
         return next(reading for reading in tried if not reading.changes)
@@ -303,7 +307,7 @@ def _best(tried: Sequence[TriedReading]) -> TriedReading:
 
 
 def _wrong(bench: PassBench, fit: Fit) -> dict[str, np.ndarray]:
-    """Return the masks of gross errors by line: residuals far beyond noise and the others' scatter."""
+    """Return masks of gross errors by line: residuals far beyond the noise and the scatter of the other points."""
     square = np.einsum("ni,nij,nj->n", fit.left, np.linalg.inv(fit.noise), fit.left)
     scale = max(float(np.median(square)) / float(chi2.median(2)), 1.0)
     bad = square > scale * chi2.isf(_WRONG_SHARE, 2)

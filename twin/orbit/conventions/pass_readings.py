@@ -1,11 +1,11 @@
 """Files of a pass, their interpretation under any conventions, and the fit of an interpretation to ground points.
 
-Every image point is followed down to the height of its ground point, and the difference of the two in plan is the
-residual. It may come from the image point, from the ground point, and from camera and platform, whose errors are within
-the uncertainty that the file specifies: a rotation and a shift of the platform and a shift of the times that all points
-share, a shift and a scale of each line. So the residuals have a covariance with large common parts. A wrong convention
-whose effect looks like one of these errors cannot be detected by the points; one with any other effect is detected at
-once.
+Each image point is projected to the height of its ground point, and the difference of the two in plan is the residual.
+It is due to errors of the image point, of the ground point, and of camera and platform. The latter are within the
+uncertainty that the file specifies: a rotation and a shift of the platform and a shift of the times, which all points
+share, and a shift and a scale of each line. The residuals are therefore strongly correlated. A wrong convention whose
+effect looks like one of these errors cannot be detected from the points; any other wrong convention is clearly
+detected.
 """
 
 from __future__ import annotations
@@ -50,15 +50,16 @@ _LINES = (
     Column("date_time", text=True, needed=False),
 )
 _AROUND = 120.0
-"""Duration of orbit and attitude kept before and after the times of the lines, in seconds: time scales differ by 70 s.
+"""Duration of orbit and attitude data retained before and after the times of the lines, in seconds, because time scales
+(such as UTC and TAI) differ by up to 70 s.
 """
 _LEAST_AROUND = 12
-"""Smallest number of readings of orbit and attitude kept before and after the times of the lines."""
+"""Smallest number of readings of orbit and attitude retained before and after the times of the lines."""
 
 
 @dataclass(frozen=True, eq=False)
 class LineClock:
-    """Exposure times of lines as clock readings.
+    """Exposure times of image lines as clock readings, before interpretation.
 
     Attributes
     ----------
@@ -93,7 +94,7 @@ class PassConventions:
     first_pixel_sees : str
         Side of the track to which the first pixel looks, right or left.
     backward : bool
-        True if lines are counted from the last.
+        True if image lines are counted from the last one exposed.
     """
 
     platform: Conventions
@@ -108,7 +109,7 @@ class PassConventions:
 
 @dataclass(frozen=True, eq=False)
 class PassReadings:
-    """Numbers of a pass's files before interpretation.
+    """Content of a pass's files before interpretation.
 
     Attributes
     ----------
@@ -206,7 +207,7 @@ def read_line_clocks(spec: LineTimesFileSpec, cameras: tuple[str, ...], folder: 
 
 
 def _scene_lines(spec: LineTimesFileSpec, cameras: tuple[str, ...], folder: Path) -> dict[str, LineClock]:
-    """Return the line times of a DIMAP file, which has one line camera; its lines count from 0."""
+    """Return the line times of a DIMAP file, which has a single line camera; its lines count from 0."""
     if len(cameras) != 1:
         allowed = "a camera of one line, or a table"
         raise spec.error("a scene has the times of one line", ("file",), found=names_text(cameras), allowed=allowed)
@@ -223,7 +224,7 @@ def _scene_lines(spec: LineTimesFileSpec, cameras: tuple[str, ...], folder: Path
 def _image_points(
     spec: ImagePointsFileSpec, ground: GroundFile, lines: Mapping[str, LineClock], folder: Path
 ) -> Mapping[str, ImagePoints]:
-    """Read the table of image points."""
+    """Read the table of image points, with the line and pixel numbers of the file."""
     table = read_table(folder / spec.file, COLUMNS["image_points"])
     known = {str(name): k for k, name in enumerate(ground.points.ids)}
     names, cameras = table["point"].astype(str), table["camera"].astype(str)
@@ -247,7 +248,7 @@ def _image_points(
 def _gcp_points(
     spec: OrbitCheckSpec, ground: GroundFile, lines: Mapping[str, LineClock], folder: Path
 ) -> Mapping[str, ImagePoints]:
-    """Return the image points of the .gcp file of the ground points; an image belongs to the line of its name."""
+    """Return the image points in the .gcp file of the ground points; an image's name is that of its line camera."""
     file = spec.image_points.file
     if (folder / file) != (folder / spec.ground.file):
         allowed = "the file of `ground`, or a table"
@@ -267,7 +268,7 @@ def _gcp_points(
 
 
 def _around(platform: PlatformReadings, lines: Mapping[str, LineClock]) -> PlatformReadings:
-    """Return the part of orbit and attitude that any interpretation of the line times can need."""
+    """Cut orbit and attitude to the part that some interpretation of the line times can need."""
     ends = [(c.clock.day[k], c.clock.second[k]) for c in lines.values() for k in (0, -1)]
     day, second = min(ends)
     last = max((d - day) * 86400.0 + s - second for d, s in ends)
@@ -291,20 +292,20 @@ _TURNED = {"forward": "back", "back": "forward", "right": "left", "left": "right
 
 @dataclass(frozen=True)
 class TestedConvention:
-    """Convention with its possible values.
+    """Convention that a check tests, with its possible values.
 
     Attributes
     ----------
     title : str
-        Name for readers.
+        Name of the convention in reports.
     get : callable
-        Function that returns its value in an interpretation (`PassConventions`).
+        Function that returns the convention's value in an interpretation (`PassConventions`).
     put : callable
-        Function that returns an interpretation with another value.
+        Function of an interpretation and a value that returns the interpretation with this value.
     values : callable
-        Function that returns its possible values, for the specified interpretation.
+        Function that returns the convention's possible values, given the specified interpretation.
     text : callable
-        Function that returns a value as text for readers.
+        Function that returns a value as text for reports.
     """
 
     title: str
@@ -334,7 +335,7 @@ def _turned(c: PassConventions) -> tuple[tuple[str, str, str], ...]:
 
 
 def _seconds(value: float) -> str:
-    """Return an offset of the times, in seconds, as text for readers."""
+    """Return an offset of the times, in seconds, as text for reports."""
     return f"{value:+g} s" if value else "none"
 
 
@@ -399,14 +400,14 @@ Changes = tuple[tuple[str, Any], ...]
 
 
 def singles_and_pairs(others: Mapping[str, tuple[Any, ...]], start: Changes = ()) -> Iterator[Changes]:
-    """Yield changes of one or two conventions in addition to those of `start`, which comes first.
+    """Yield `start`, then `start` with each change of one or two further conventions.
 
     Parameters
     ----------
     others : mapping of str to tuple
         Values of each convention other than the specified one.
     start : Changes
-        Changes that all of them have.
+        Changes that all yielded sets of changes include.
     """
     yield start
     taken = {name for name, _ in start}
@@ -427,18 +428,23 @@ def changed(stated: PassConventions, changes: Changes) -> PassConventions:
 
 
 _TURN, _SHIFT, _DELAY, _RISE = 1e-5, 10.0, 1e-3, 10.0
-"""Steps of the numerical derivatives: radians, metres, seconds, metres."""
+"""Steps of the numerical derivatives with respect to rotation (radians), shift (metres), delay (seconds) and height
+(metres).
+"""
 _TICKS = 1000
-"""Number of lines of the auxiliary sensor, which only divide its span of time."""
+"""Number of lines of the auxiliary sensor; they only subdivide its time span."""
 
 
 class ImpossibleError(ValueError):
-    """Error of an interpretation under which the points cannot have been imaged; the text says why."""
+    """Error raised for an interpretation of the files under which the points cannot have been imaged.
+
+    The message gives the reason.
+    """
 
 
 @dataclass(frozen=True, eq=False)
 class _PerturbedPlatform:
-    """Platform with a small rotation and shift added at each of a number of times."""
+    """Platform with a small rotation and shift added at each of several times, for numerical derivatives."""
 
     path: TabulatedTrajectory
     turn: np.ndarray | None = None
@@ -466,15 +472,15 @@ class Fit:
     residual : (n, 2) ndarray for n image points
         Residuals east and north, metres.
     rms : float
-        RMS of both together, metres.
+        RMS distance in plan, metres.
     rms_pixels : float
-        RMS along the lines' own axes, pixels.
+        RMS of the residuals in the image (along the track and along the line), pixels.
     left : (n, 2) ndarray
-        Residuals after removal of the likeliest errors of camera and platform, metres.
+        Residuals after removal of the most likely errors of camera and platform, metres.
     noise : (n, 2, 2) ndarray
         Covariance of each point's residual without the part shared with others, m^2.
     chi_square : float
-        Chi-square of the residuals under their covariance.
+        Chi-square of the residuals with their full covariance.
     cost : float
         Chi-square plus the logarithm of the covariance's determinant: minus twice the log likelihood.
     freedom : int
@@ -493,12 +499,12 @@ class Fit:
 
 @dataclass(eq=False)
 class PassBench:
-    """Files of a pass with its cameras, which tries interpretations (readings) of the files.
+    """Files of a pass with its cameras, and methods that fit interpretations (readings) of the files.
 
     Attributes
     ----------
     readings : PassReadings
-        Numbers of the files.
+        Content of the files before interpretation.
     cameras : mapping of str to LineCamera
         Geometry of each line.
     uncertainty : UncertaintySpec
@@ -506,7 +512,7 @@ class PassBench:
     effects : LightEffects
         Effects on the light.
     epoch : str
-        Zero of the times, UTC.
+        Instant from which times count, UTC.
     """
 
     readings: PassReadings
@@ -517,7 +523,7 @@ class PassBench:
     _paths: dict[Conventions, TabulatedTrajectory | ImpossibleError] = field(default_factory=dict)
 
     def without(self, wrong: Mapping[str, np.ndarray]) -> PassBench:
-        """Return this object without the wrong image points, given as a mask (n,) for the n points of each line."""
+        """Return a copy without the wrong image points, given as a mask (n,) for the n points of each line."""
         images = {name: raw.taken(~wrong[name]) for name, raw in self.readings.images.items()}
         remaining = {name: raw for name, raw in images.items() if len(raw.line)}
         return replace(self, readings=replace(self.readings, images=remaining), _paths=self._paths)
@@ -626,9 +632,10 @@ class PassBench:
     def _steps(
         self, name: str, reading: PassConventions, raw: ImagePoints, path: TabulatedTrajectory
     ) -> tuple[list[np.ndarray], np.ndarray, np.ndarray]:
-        """Return ground positions for finite differences, the pixels' steps, and line times.
+        """Return ground positions for finite differences, the steps of the pixels, and line times.
 
-        The positions are those as read, with rotations, shifts, a delay, the next pixel and a height.
+        The positions are the unchanged ones, and those after a small rotation about and shift along each axis, a delay,
+        a step of one pixel, and a step in height.
         """
         n, pixels = len(raw.line), self.cameras[name].pixels
         rotation, shift = np.broadcast_to(np.eye(3), (10, n, 3, 3)).copy(), np.zeros((10, n, 3))
@@ -652,7 +659,7 @@ class PassBench:
         step: np.ndarray | float = 0.0,
         rise: np.ndarray | float = 0.0,
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Return n image points' ITRS positions at the ground points' heights, (n, 3), metres, and line times, s."""
+        """Return n image points' ITRS positions at their ground points' heights, (n, 3), in m, and line times, in s."""
         clock = self.readings.lines[name]
         number = line_of(reading, raw, clock)
         for worst in number[~in_span(number, clock.line[0] - 1.0, clock.line[-1] + 1.0)][:1]:
@@ -691,9 +698,9 @@ def line_times(
     reading : PassConventions
         Interpretation of the files.
     epoch : str
-        Zero of the times, UTC.
+        Instant from which times count, UTC.
     line : (n,) ndarray
-        Line numbers of the table of times.
+        Line numbers, counted as in the table of times.
 
     Raises
     ------
@@ -735,9 +742,9 @@ def _plan(known: np.ndarray, computed: np.ndarray) -> np.ndarray:
 
 
 def _ground_noise(known: Any, point: np.ndarray, rise: np.ndarray) -> np.ndarray:
-    """Return the covariances of n points' residuals due to those of the ground points, (n, 2, 2), in m^2.
+    """Return the covariances of n residuals due to errors of the ground points, (n, 2, 2), in m^2.
 
-    `rise` (n, 2) is the displacement east and north for a metre of height.
+    `rise` (n, 2) is the displacement of the imaged position east and north per metre of height.
     """
     lon, lat, _ = Earth().geodetic(known.itrs[point])
     axes = east_north_up(lon, lat)
@@ -749,7 +756,7 @@ def _ground_noise(known: Any, point: np.ndarray, rise: np.ndarray) -> np.ndarray
 def _covariance(
     noise: list[np.ndarray], common: list[np.ndarray], line_terms: list[np.ndarray]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the covariance of all residuals of n points, and its part common to points, (2n, 2n) each, in m^2."""
+    """Return the covariance of all residuals of n points, and its part due to shared errors, (2n, 2n), in m^2."""
     common_terms = np.concatenate(common).reshape(-1, common[0].shape[-1])
     shared = common_terms @ common_terms.T
     start = 0

@@ -27,7 +27,7 @@ from twin.orbit.export.line_scanner import ModelError
 from twin.orbit.export.rational_polynomial import residual_sigma
 
 _UNLIKELY = 1e-3
-"""p-value of chi-square below which the covariances of control points are reported as too small."""
+"""p-value of chi-square below which the covariances given for control points are reported as too small."""
 _MOST_PANELS = 6
 _MOST_ROWS = 400
 """Largest number of control points in the table of a report."""
@@ -99,7 +99,7 @@ def quality_sections(quality: Quality) -> tuple[Section, ...]:
 
 
 def quality_answers(quality: Quality) -> tuple[str, ...]:
-    """Return sentences on control points and accuracy for the head of a report."""
+    """Return sentences on control points and accuracy for the beginning of a report."""
     sentences = []
     for name, controlled in quality.control.items():
         used = int(np.sum(controlled.correction.used))
@@ -230,7 +230,7 @@ def _figure(maps: Mapping[str, AccuracyMap]) -> Figure:
 
 
 FOLDER = "models"
-"""Folder of the models in the run folder."""
+"""Name of the folder of the camera models in the run folder."""
 
 
 def _names(line: ExportedLine) -> dict[str, str]:

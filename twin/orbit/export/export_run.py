@@ -1,8 +1,8 @@
 """Export of a camera's lines on their trajectory as models for other software, with images where there are any.
 
-The lines come from a simulated pass or a test in orbit. Camera and trajectory are the laboratory's and the measured
-one, as the user of the images knows them, or, on request, the true ones. An instrument's cameras can be those that its
-monitor has estimated in orbit. The scene of a DIMAP file has the rigorous model of that file.
+The lines come from a simulated pass or a test in orbit. The camera is that of the laboratory and the trajectory the
+measured one, as the user of the images knows them; on request, both are the true ones. An instrument's cameras can be
+those that its monitor has estimated in orbit. The scene of a DIMAP file has the rigorous model of that file.
 
 The quality of exported models comprises their errors on the ground due to the uncertainty of camera and trajectory, the
 correction of the polynomials by control points, and the difference of a product's own polynomials from its rigorous
@@ -60,7 +60,7 @@ class ControlPoints:
     read : GroundFile
         Content of the file; image positions count from the centre of the first pixel.
     kind : Kind
-        Kind of the correction that they determine.
+        Kind of image correction that is fitted to them, shift or affine.
     """
 
     file: str
@@ -70,7 +70,7 @@ class ControlPoints:
 
 @dataclass(frozen=True, eq=False)
 class ControlledPolynomial:
-    """Polynomials of a line corrected by control points.
+    """Rational polynomials of a line, corrected with control points.
 
     Attributes
     ----------
@@ -96,7 +96,7 @@ class ControlledPolynomial:
 class ProductPolynomial:
     """Comparison of a product's rational polynomials with its rigorous model: polynomials minus rigorous model.
 
-    It covers the image and the heights of the polynomials.
+    The comparison covers the whole image and the range of heights of the polynomials.
 
     Attributes
     ----------
@@ -126,11 +126,12 @@ class Quality:
     Attributes
     ----------
     maps : Mapping[str, AccuracyMap]
-        Line, or `together` for points intersected from all lines -> errors on the ground; empty where not requested.
+        Name of the line, or `together` for points intersected from all lines -> map of errors on the ground; empty
+        where not requested.
     control : Mapping[str, ControlledPolynomial]
-        Line -> polynomials corrected by control points.
+        Line -> rational polynomials corrected with control points.
     products : Mapping[str, ProductPolynomial]
-        Line -> comparison of the polynomials that came with it.
+        Line -> comparison of the product's own polynomials with its rigorous model.
     """
 
     maps: Mapping[str, AccuracyMap] = field(default_factory=FrozenMap)
@@ -146,7 +147,7 @@ def read_control(path: Path, kind: Kind) -> ControlPoints:
     path : Path
         Path of the file; without a header `# WKT:`, its latitudes, longitudes and heights refer to WGS 84.
     kind : Kind
-        Kind of the correction.
+        Kind of the image correction to be fitted, shift or affine.
 
     Raises
     ------
@@ -211,12 +212,12 @@ class SceneSource:
 
     @property
     def folder(self) -> None:
-        """None: a scene has no run folder."""
+        """Run folder of a simulation, always None: a scene has none."""
         return None
 
     @property
     def seed(self) -> int:
-        """Seed 0, which is not used: nothing is drawn."""
+        """Seed of random numbers, always 0 and not used: nothing is simulated."""
         return 0
 
 
@@ -237,7 +238,7 @@ class ImagedWindow:
     frame : (lines, pixels) ndarray or None
         Grey values; None where nothing was rendered.
     calibrated : CalibratedLine or None
-        Line before its estimated change; None where none was estimated.
+        Line camera without its change estimated in orbit; None where none was estimated.
     """
 
     name: str
@@ -264,7 +265,7 @@ class ExportedLine:
     refused : str
         Reason why there are no polynomials; empty where there are.
     ground : GroundSigma or None
-        Uncertainty of the camera's estimated change on the ground; None where none was estimated.
+        Ground error due to the uncertainty of the camera's estimated change; None where none was estimated.
     """
 
     window: ImagedWindow
@@ -404,7 +405,7 @@ def run_export(
     advance: Advance = silent,
     changes: Mapping[str, EstimatedChange] | None = None,
 ) -> Export:
-    """Fit the models of all lines.
+    """Fit the export models (line scanner and rational polynomials) of all lines.
 
     Parameters
     ----------
@@ -413,8 +414,8 @@ def run_export(
     backend : Backend
         Backend on which the lines of an instrument are traced.
     heights : tuple of float, optional
-        Lowest and highest ground above the ellipsoid, in metres; None for those of a run's elevation model, else 0 to
-        2000 m.
+        Lowest and highest ground above the ellipsoid, in metres; None for those of a run's elevation model, or 0 to
+        2000 m where there is none.
     truth : bool
         True for the true camera and orbit instead of those that the user knows.
     advance : Advance
@@ -449,7 +450,7 @@ def run_export(
 USUAL_HEIGHTS = (0.0, 2000.0)
 """Lowest and highest ground by default, in metres above the ellipsoid."""
 _ROOM = 100.0
-"""Margin about the heights of an elevation model, which has errors, in metres."""
+"""Margin added below and above the heights of an elevation model, which has errors, in metres."""
 
 
 def _heights(source: ExportSource | SceneSource, heights: tuple[float, float] | None) -> tuple[float, float, float]:
@@ -472,7 +473,7 @@ def _level(source: ExportSource | SceneSource, heights: tuple[float, float, floa
 def _windows(
     source: ExportSource | SceneSource, backend: Backend, truth: bool, changes: Mapping[str, EstimatedChange] | None
 ) -> tuple[str, dict[str, ImagedWindow]]:
-    """Return the epoch, and the windows of the images by line."""
+    """Return the epoch (UTC), and the image window to be exported of each line."""
     if isinstance(source, SceneSource):
         return source.scene.epoch, _of_scene(source.scene, truth)
     setup = source.setup
@@ -500,7 +501,7 @@ def _windows(
 def _of_angle(
     setup: AngleSetup, backend: Backend, seed: int, truth: bool, changes: Mapping[str, EstimatedChange] | None
 ) -> dict[str, ImagedWindow]:
-    """Return square images about the moment of a test, with lines spaced as the pixels are."""
+    """Return square image windows about the moment of a test of angles, with line spacing equal to pixel spacing."""
     camera = angle_camera(setup, backend)
     flight = fly(setup, camera, np.random.SeedSequence(seed))
     windows = {}
@@ -524,7 +525,7 @@ def _of_angle(
 
 
 def _of_scene(scene: DimapScene, truth: bool) -> dict[str, ImagedWindow]:
-    """Return the single image of a scene, which has no known truth."""
+    """Return the image window of a scene, its whole image; raise an error if the truth is requested."""
     read = scene.read
     if truth:
         raise InputError(Issue("the truth of a scene is not known", read.file, allowed="no --truth"))
@@ -533,11 +534,11 @@ def _of_scene(scene: DimapScene, truth: bool) -> dict[str, ImagedWindow]:
 
 
 _UNSAFE = re.compile(r"[^A-Za-z0-9_-]")
-"""Characters of a data set's name that are replaced in names of files."""
+"""Characters of a data set's name that are replaced in file names."""
 _LONGEST = 100
 _USUAL_PITCH = 13e-6
-"""Pixel pitch of Pleiades, in metres; a camera model is the same for every pitch, as its principal distance scales with
-it.
+"""Pixel pitch assumed where the file gives none, that of Pleiades, in metres; its value has no effect, because the
+principal distance scales with it.
 """
 
 
@@ -554,7 +555,7 @@ _PROBE = 1e-3
 
 
 def _line_time(line: LineCamera, trajectory: Trajectory, earth: Any, time: float) -> float:
-    """Return the time in which the image of the line's middle moves by a pixel along the track, in seconds."""
+    """Return the time in which the image at the line's middle moves by one pixel along the track, in seconds."""
     middle = np.array([0.5 * (line.pixels - 1)])
     probe = Sensor(line, trajectory, earth, _PROBE, time, 1)
     ground = probe.ground(np.array([0.0, 0.0]), middle + np.array([-0.5, 0.5]), 0.0)

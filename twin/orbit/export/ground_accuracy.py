@@ -1,14 +1,15 @@
 """Errors on the ground due to errors of camera, orbit and attitude: covariances of points over a scene, CE90 and LE90.
 
-The rigorous sensor computes where pixels see the ground after each error is changed by a small step; these derivatives
-propagate the covariances to the ground. A point of one line has a height from another source. A point that several
-lines see is intersected from all of them, weighted by the covariance of its image positions; the errors of orbit and
-attitude are those of the pass, which its lines share, and each line has its own interior orientation.
+The derivatives of the ground positions that pixels see with respect to each error are computed by finite differences of
+the rigorous sensor, and propagate the covariances to the ground. A point seen by one line only needs a height from
+another source. A point that several lines see is intersected from all of them, weighted by the covariance of its image
+positions; the errors of orbit and attitude are those of the pass, which its lines share, and each line has its own
+interior orientation.
 
-`ground_sigma` propagates the uncertainty of a camera's change that was estimated in orbit. On the ground it is the
-error of the exported models, which rational polynomials state as ERR_BIAS and ERR_RAND. A line is corrected by the
-estimate; the derivatives with respect to the four numbers of the change take the covariance of the estimate's error to
-the horizontal plane of each point.
+`ground_sigma` propagates the uncertainty of a camera's change that was estimated in orbit. It is the error of the
+exported models on the ground, which files of rational polynomials give as ERR_BIAS and ERR_RAND. A line is corrected
+with the estimate; the derivatives with respect to the four elements of the change propagate the covariance of the
+estimate's error to the horizontal plane of each point.
 """
 
 from __future__ import annotations
@@ -32,7 +33,8 @@ _GRID = (13, 13)
 _MOVED = 1.0
 """Step of the derivatives with respect to position, in metres."""
 _TURNED = 1e-6
-"""Step of the derivatives with respect to rotation, in radians: metres on the ground, over which it is linear to 1e-6.
+"""Step of the derivatives with respect to rotation, in radians: about a metre on the ground, over which the ground
+position is linear to 1e-6.
 """
 _RAISED = 10.0
 """Step of the derivatives with respect to height, in metres."""
@@ -144,7 +146,7 @@ class AccuracyMap:
 
     @property
     def valid(self) -> NDArray[np.bool_]:
-        """Mask of those of the N points that have a covariance, (N,)."""
+        """Mask of the N points that have a covariance, (N,): True where the lines of sight meet the ground."""
         return np.isfinite(self.longitude)
 
     def horizontal(self) -> tuple[float, float]:
@@ -162,7 +164,7 @@ class AccuracyMap:
 
 @dataclass(frozen=True, eq=False)
 class _Derivatives:
-    """Derivatives of the ground positions, east and north, in metres, that N pixels see at a height.
+    """Derivatives of the ground positions, east and north, in metres, that N pixels see at a fixed height.
 
     Attributes
     ----------
@@ -260,13 +262,13 @@ def intersected_accuracy(
     Parameters
     ----------
     sensors : Mapping[str, Sensor]
-        Line -> its sensor; the grid is that of the first one's image.
+        Line -> its sensor; the grid covers the image of the first sensor.
     uncertainty : CameraUncertainty
         Uncertainty of camera and trajectory; heights from another source are not used.
     height : float
         Height of the ground above the ellipsoid, in metres.
     first_pixel : int
-        First pixel of the first one's image on its line.
+        First pixel of the first sensor's image on its line.
     pixels : int, optional
         Number of pixels of that image; None for the whole line.
 
@@ -318,7 +320,7 @@ def intersected_accuracy(
 
 
 def _places(sensor: Sensor, line: Array, pixel: Array, height: float) -> tuple[Array, Array, Array]:
-    """Return longitude and latitude (N,), in radians, that N pixels see, and the level frames there (N, 3, 3)."""
+    """Return longitude and latitude (N,), in radians, that N pixels see, and east-north-up axes there (N, 3, 3)."""
     ground = sensor.ground(line, pixel, height)
     if not np.any(np.isfinite(ground)):
         raise ValueError("no line of sight meets the Earth")
@@ -327,7 +329,7 @@ def _places(sensor: Sensor, line: Array, pixel: Array, height: float) -> tuple[A
 
 
 def _propagate(rows: Array, covariance: ArrayLike) -> Array:
-    """Return the covariances of K quantities at N points, (N, K, K), from P errors and derivatives (N, K, P)."""
+    """Propagate a covariance of P errors by derivatives (N, K, P) to K quantities at N points, (N, K, K)."""
     return np.asarray(rows @ np.asarray(covariance) @ np.swapaxes(rows, 1, 2))
 
 
@@ -367,12 +369,13 @@ def accuracy_maps(
 
 
 TOGETHER = "together"
-"""Key of the map of intersected points."""
+"""Key, among the names of lines, of the accuracy map of points intersected from all lines."""
 
 
 _STEPS = (1e-7, 1e-7, 1e-7, 1e-6)
-"""Half steps of d_alpha, d_beta, d_gamma (rad) and d_f (m): centimetres on the ground, over which it is linear to 1e-7,
-while its coordinates are rounded to 1e-9 m.
+"""Half steps of the derivatives with respect to a camera's rotations d_alpha, d_beta, d_gamma (rad) and change d_f of
+the principal distance (m): centimetres on the ground, over which the ground position is linear to 1e-7, while its
+coordinates are rounded to 1e-9 m.
 """
 _CHANGE_GRID = (3, 9)
 """Number of lines and pixels of the grid over an image at which errors due to a camera's change are computed; they are
@@ -389,11 +392,11 @@ class EstimatedChange:
     values : (4,) ndarray
         Rotations d_alpha, d_beta, d_gamma (rad) and change d_f of the principal distance (m).
     constant : (4, 4) ndarray
-        Covariance of the part of their error that persists from image to image.
+        Covariance of the part of the values' error that persists from image to image.
     random : (4, 4) ndarray
-        Covariance of the part that is independent in every image.
+        Covariance of the part of their error that is independent in every image.
     notes : tuple of str
-        Remarks on the estimate, for formats that hold remarks.
+        Remarks on the estimate, for export formats that allow remarks.
     """
 
     values: Array
@@ -411,15 +414,15 @@ class GroundSigma:
     Attributes
     ----------
     height_m : float
-        Height of the points above the ellipsoid.
+        Height of the points above the ellipsoid, in metres.
     bias_m : float
-        Error of each horizontal axis that other images near in time share: ERR_BIAS.
+        Error per horizontal axis that is shared with images near in time, in metres (ERR_BIAS of rational polynomials).
     random_m : float
-        Error of each horizontal axis that is independent in every image: ERR_RAND.
+        Error per horizontal axis that is independent in every image, in metres (ERR_RAND of rational polynomials).
     bias_east_m, bias_north_m : float
-        Errors of the two axes, whose mean square is that of ``bias_m``.
+        Shared errors of the two axes, in metres, whose root mean square is ``bias_m``.
     random_east_m, random_north_m : float
-        Errors of the two axes, whose mean square is that of ``random_m``.
+        Independent errors of the two axes, in metres, whose root mean square is ``random_m``.
     """
 
     height_m: float
@@ -432,10 +435,10 @@ class GroundSigma:
 
 
 def ground_rows(sensor: Sensor, calibrated: CalibratedLine, values: Array, height: float) -> Array:
-    """Return the derivatives of the ground position, east and north, with respect to the camera's change, (N, 2, 4).
+    """Return derivatives of N ground positions, east and north, with respect to a camera's change, (N, 2, 4).
 
-    For each of N points of a grid over the image: in metres per radian for d_alpha, d_beta and d_gamma, and in metres
-    per metre for the principal distance d_f.
+    The N points form a grid over the image. Derivatives are in metres per radian for the rotations d_alpha, d_beta and
+    d_gamma, and in metres per metre for the change d_f of the principal distance.
 
     Parameters
     ----------
@@ -474,7 +477,7 @@ def ground_rows(sensor: Sensor, calibrated: CalibratedLine, values: Array, heigh
 
 
 def ground_sigma(sensor: Sensor, calibrated: CalibratedLine, change: EstimatedChange, height: float) -> GroundSigma:
-    """Return the error of an estimated change on the ground.
+    """Return the horizontal error on the ground due to the error of a camera's estimated change.
 
     Parameters
     ----------

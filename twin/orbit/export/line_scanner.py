@@ -1,11 +1,12 @@
-"""Line sensor as an image support data file (ISD) of the community sensor model, for Ames Stereo Pipeline and ISIS.
+"""Export of a line sensor as image support data (ISD) of the community sensor model, for Ames Stereo Pipeline and ISIS.
 
 The model is USGS_ASTRO_LINE_SCANNER_SENSOR_MODEL: a station and a rotation over time, both interpolated by Lagrange
-polynomials through eight nodes, and one camera with a distortion cubic in its coordinates, constant in time. It has no
-effects on the light. The file therefore gets the camera and the attitude from which the light seems to come: at every
-node, the directions from the station to where the rigorous sensor sees the ground, at one height, are compared with one
-common camera, and the rotation that fits them best is the attitude. Aberration and light time are nearly the same at
-all heights and are almost fully included; of refraction, only its value at that height.
+polynomials through eight nodes, and one camera with a distortion cubic in its coordinates, constant in time. It does
+not model light time, aberration and refraction. The file therefore gets the camera and the attitude that reproduce the
+apparent directions: at every node, the directions from the station to the ground positions that the rigorous sensor
+sees at one height are compared with one common camera, and the rotation that fits them best is the attitude. Aberration
+and light time are nearly the same at all heights and are almost fully included; refraction is included with its value
+at that height only.
 
 Conventions of the model: image coordinates count from the corner, the centre of the first pixel is (0.5, 0.5);
 quaternions are w, x, y, z and rotate Earth-fixed axes into the camera's; the focal plane is in millimetres, x along the
@@ -29,7 +30,7 @@ from twin.orbit.flight.platform_table import continuous_quaternions
 from twin.orbit.flight.sensor import Sensor
 
 MODEL = "USGS_ASTRO_LINE_SCANNER_SENSOR_MODEL"
-"""Name of the sensor model."""
+"""Name of the community sensor model for line scanners that the files specify."""
 _TICK = 2.0**-20
 """Time unit of which times of nodes are whole multiples, in seconds. A float64 holds such ephemeris times (seconds
 since the year 2000) exactly, but decimal fractions only to 6e-8 s, a thousandth of a line.
@@ -38,7 +39,9 @@ _SPARE = 6
 """Number of nodes of the trajectory beyond either end of the image."""
 _FEWEST, _MOST = 64, 8192
 _PIXELS = 33
-"""Number of positions along the line at which directions are compared; they are smooth to 1e-10 of a pixel."""
+"""Number of positions along the line at which directions are compared; between them, directions are interpolated to
+1e-10 of a pixel.
+"""
 _ROUNDS = 4
 """Number of alternations between fitting the rotations at all nodes and the camera that they share."""
 _CUBIC = (0, 2, 5, 9)
@@ -49,12 +52,12 @@ no extent in x, so that the others are zero.
 
 @dataclass(frozen=True, eq=False)
 class EffectiveCamera:
-    """Camera and trajectory that see, with straight light, what a sensor sees at one height.
+    """Camera and trajectory that see by straight rays the ground positions that a sensor sees at one height.
 
     Attributes
     ----------
     seconds : (N,) ndarray for N nodes
-        Evenly spaced times of the nodes, of the trajectory.
+        Evenly spaced times of the nodes, on the trajectory's time scale.
     station : (N, 3) ndarray
         Projection centre, ITRS, in metres.
     velocity : (N, 3) ndarray
@@ -71,8 +74,8 @@ class EffectiveCamera:
         Coefficients of the powers 0 to 3 of the ideal position y along the line that give the real y, both in
         millimetres.
     across : (4,) ndarray
-        Coefficients of the powers 0 to 3 of the ideal y that give what is added to the ideal x of a point on the line
-        to make it 0, in millimetres.
+        Coefficients of the powers 0 to 3 of the ideal y that give the correction to be added to the ideal x of a point
+        on the line so that x is 0, in millimetres.
     """
 
     seconds: Array
@@ -137,7 +140,7 @@ class LineScanner:
     isd : Mapping[str, Any]
         Content of the file, plain data.
     camera : EffectiveCamera
-        Camera that it describes.
+        Camera and trajectory that the file describes.
     errors : tuple of ModelError
         Differences at the heights that were requested.
     """
@@ -156,12 +159,12 @@ def line_scanner(
     window: tuple[int, int] | None = None,
     notes: tuple[str, ...] = (),
 ) -> LineScanner:
-    """Fit the ISD of an image, or of a window of it.
+    """Fit the image support data (ISD) of a line's image, or of a window of it.
 
     Parameters
     ----------
     sensor : Sensor
-        Line on its trajectory; its lines are those of the window, its camera is the whole line.
+        Line camera on its trajectory; its image lines are those of the window, its camera is the whole line.
     name : str
         Name of the line.
     epoch : str
@@ -173,7 +176,7 @@ def line_scanner(
     window : tuple of int, optional
         First pixel of the window on the line, and number of pixels; None for the whole line.
     notes : tuple of str
-        Further notes on the camera.
+        Further remarks on the camera, to be written into the file.
 
     Raises
     ------
@@ -189,7 +192,7 @@ def line_scanner(
 
 
 def _effective_camera(sensor: Sensor, pitch: float, height: float, epoch: str) -> EffectiveCamera:
-    """Return the camera with straight light that sees what a sensor sees at a height.
+    """Return the camera that sees by straight rays the ground positions that a sensor sees at one height.
 
     Parameters
     ----------
@@ -218,7 +221,7 @@ def _effective_camera(sensor: Sensor, pitch: float, height: float, epoch: str) -
 
 
 def _ephemeris_time(epoch: str) -> tuple[int, float]:
-    """Return the ephemeris time of an epoch (UTC) in seconds since noon of 2000-01-01, whole and fractional part.
+    """Return the ephemeris time of an epoch (UTC), in seconds since noon of 2000-01-01, as integer and fraction.
 
     It is terrestrial time, which differs from barycentric time by at most 2 ms; only the position of the Sun depends on
     it.
@@ -328,7 +331,7 @@ def _quaternions(rotation: Rotation) -> Array:
 
 
 def _smooth(camera: EffectiveCamera) -> bool:
-    """Return True if every second node predicts the nodes between them to `_FOLLOWED` pixels.
+    """Return True if interpolation between every second node reproduces the other nodes to `_FOLLOWED` pixels.
 
     The interpolation between all nodes is then more accurate still.
     """
@@ -343,13 +346,15 @@ def _smooth(camera: EffectiveCamera) -> bool:
 
 
 _FOLLOWED = 0.01
-"""Largest interpolation error between nodes, in pixels."""
+"""Largest accepted interpolation error of the trajectory between nodes, in pixels."""
 _NEAREST = 2e5
-"""Smallest height of a satellite, in metres, at which a shift of the station is converted to an angle."""
+"""Height of a satellite, in metres, with which a shift of the station is converted to an angle: a low one, for which
+the angle is largest.
+"""
 
 
 def _error(sensor: Sensor, camera: EffectiveCamera, height: float, window: tuple[int, int]) -> ModelError:
-    """Compare a camera with the rigorous sensor on a grid of its image that is not the one of the fit."""
+    """Compare a camera with the rigorous sensor on an image grid other than that of the fit."""
     line = np.linspace(-0.5, sensor.lines - 0.5, _GRID[0])
     pixel = window[0] + np.linspace(-0.5, window[1] - 0.5, _GRID[1])
     at, which = (v.ravel() for v in np.meshgrid(line, pixel, indexing="ij"))
@@ -369,7 +374,7 @@ _GRID = (37, 41)
 
 
 def _image(camera: EffectiveCamera, seconds: Array, ground: Array) -> Array:
-    """Return the image of N ground points at given times: distance from the line and position along it, (N, 2), px."""
+    """Project N ground points at given times: distance from the line and position along it, (N, 2), in pixels."""
     rotation = Rotation.from_quat(_lagrange(camera.seconds, _quaternions(camera.rotation), seconds))
     look = rotation.apply(ground - _lagrange(camera.seconds, camera.station, seconds))
     ideal = 1e3 * camera.focal_length * look[:, :2] / look[:, 2:]
@@ -378,7 +383,7 @@ def _image(camera: EffectiveCamera, seconds: Array, ground: Array) -> Array:
 
 
 class _AtNodes:
-    """Trajectory evaluated at its nodes alone: a sensor evaluates it half a line beyond them, where it may end."""
+    """Trajectory tabulated at its nodes only, for a sensor that also asks half a line beyond them, where it may end."""
 
     def __init__(self, sensor: Sensor, seconds: Array) -> None:
         self._known, self._first, self._last = sensor.trajectory, seconds[0], seconds[-1]
@@ -402,7 +407,7 @@ def _isd(
     window: tuple[int, int],
     errors: tuple[ModelError, ...],
 ) -> dict[str, Any]:
-    """Return the content of the ISD file."""
+    """Return the content of the image support data (ISD) file, as plain data."""
     whole, fraction = _ephemeris_time(epoch)
     ends = sensor.time(np.array([-0.5, sensor.lines - 0.5]))
     # ephemeris times at whole ticks from a whole second are exact
@@ -480,9 +485,9 @@ def _rotation_record(number: int, nodes: list[float], quaternion: Array, rate: A
 
 
 def _angular_velocity(camera: EffectiveCamera) -> Array:
-    """Return the angular velocity of the camera's axes in the Earth-fixed frame at N nodes, (N, 3), in rad/s.
+    """Return the angular velocity of the camera relative to Earth-fixed axes, in these axes, (N, 3), in rad/s.
 
-    It is relative to the Earth-fixed axes.
+    It is computed at the N nodes of the trajectory.
     """
     step = camera.seconds[1] - camera.seconds[0]
     rate = (camera.rotation[1:] * camera.rotation[:-1].inv()).as_rotvec() / step

@@ -1,6 +1,6 @@
 """Accuracy of exported models: errors on the ground, correction by control points, a product's polynomials.
 
-Rational polynomials without a rigorous model can also be corrected by control points alone.
+Rational polynomials that come without a rigorous model can also be corrected with control points.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ _COMPARED = (15, 15, 3)
 
 
 def with_quality(run: Export, uncertainty: CameraUncertainty | None, points: ControlPoints | None) -> Export:
-    """Return the export with the requested corrections of its polynomials, ERR_BIAS, ERR_RAND and notes.
+    """Return the export with the requested corrections of its polynomials and errors (ERR_BIAS, ERR_RAND).
 
     Parameters
     ----------
@@ -146,7 +146,7 @@ def correct_line(
 
 
 def _products(run: Export, scene: DimapScene) -> Mapping[str, ProductPolynomial]:
-    """Return the comparison of the polynomials beside a scene's file, where it names some."""
+    """Return the comparison of the polynomials that a scene's file names with its rigorous model; empty if none."""
     folder = Path(scene.read.file).parent
     (name, line), *_ = run.lines.items()
     for href in scene.read.rpc:
@@ -158,7 +158,7 @@ def _products(run: Export, scene: DimapScene) -> Mapping[str, ProductPolynomial]
 
 
 def compare_product(sensor: Sensor, model: RationalPolynomial, file: str) -> ProductPolynomial:
-    """Compare polynomials with the sensor over the heights that they cover, beyond which they are not valid."""
+    """Compare a product's polynomials with the rigorous sensor, over the heights for which they are valid."""
     low, high = (model.offset[4] + sign * model.scale[4] for sign in (-1.0, 1.0))
     axes = (
         np.linspace(0.0, sensor.lines - 1.0, _COMPARED[0]),

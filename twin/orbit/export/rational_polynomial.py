@@ -1,4 +1,4 @@
-"""Line sensor as rational polynomials (RPC00B, NIMA STDI-0002), their files, and their correction by control points.
+"""Rational polynomials (RPC00B, NIMA STDI-0002) of a line sensor: fit, files, and correction by control points.
 
 Line and sample are ratios of cubics in latitude, longitude and height, the one model that all photogrammetric software
 reads. Coordinates are scaled to -1 .. 1 over the ground that the fit covers; beyond it the polynomials are not valid.
@@ -96,7 +96,17 @@ def _image_to_ground(
 
 
 def _chebyshev_grid(middle: Array, half: Array, counts: tuple[int, ...], at_ends: bool) -> list[Array]:
-    """Return lines, samples and heights of a grid of Chebyshev points, with the ends or between its points."""
+    """Return lines, samples and heights of a grid of Chebyshev points.
+
+    Parameters
+    ----------
+    middle, half : (3,) ndarray
+        Middle and half width of the ranges of line, sample and height.
+    counts : tuple of int
+        Number of points of each.
+    at_ends : bool
+        True for points that include the ends of the ranges, False for points between these.
+    """
     angles = (np.linspace(0.0, np.pi, n) if at_ends else (np.arange(n) + 0.5) * np.pi / n for n in counts)
     axes = (m - h * np.cos(angle) for m, h, angle in zip(middle, half, angles, strict=True))
     return [v.ravel() for v in np.meshgrid(*axes, indexing="ij")]
@@ -113,7 +123,7 @@ _LEAST_SCALE = 1e-9
 
 
 def read_rpc(path: str | Path) -> RationalPolynomial:
-    """Read the polynomials of a file; its content or ending decides on the format.
+    """Read rational polynomials from a file, whose format is recognised by its content or ending.
 
     Parameters
     ----------
@@ -231,13 +241,13 @@ def _from_tiff(path: Path) -> RationalPolynomial:
 
 
 _SLOPE_STEP = 10.0
-"""Step of a derivative on the ground, in metres; polynomials are linear to 1e-9 over it."""
+"""Step of numerical derivatives on the ground, in metres; the polynomials are linear to 1e-9 over it."""
 _CORRECTED_GRID = (21, 21, 7)
 """Number of lines, samples and heights of the grid to which corrected polynomials are fitted."""
 _GROUND_GRID = 5
 """Number of lines and of samples at which errors on the ground are computed."""
 _UNLIKELY = 0.05
-"""p-value of chi-square below which residuals count as scattering beyond their covariances."""
+"""p-value of chi-square below which residuals are treated as larger than their covariances predict."""
 
 
 def polynomial_correction(
@@ -249,7 +259,7 @@ def polynomial_correction(
     kind: Kind,
     screened: bool = True,
 ) -> ImageCorrection:
-    """Estimate the correction of polynomials in the image from control points.
+    """Estimate a correction of line and sample of rational polynomials from control points.
 
     Parameters
     ----------
@@ -307,7 +317,7 @@ def image_slope(polynomial: RationalPolynomial, latitude: Array, longitude: Arra
 
 
 def corrected_polynomial(polynomial: RationalPolynomial, correction: ImageCorrection) -> RationalPolynomial:
-    """Return the polynomials with a correction included, and with the errors on the ground that it leaves.
+    """Return polynomials that include a correction, with its remaining ground errors as ERR_BIAS and ERR_RAND.
 
     Parameters
     ----------
@@ -336,7 +346,7 @@ def corrected_polynomial(polynomial: RationalPolynomial, correction: ImageCorrec
 
 
 def _on_the_ground(polynomial: RationalPolynomial, correction: ImageCorrection) -> tuple[float, float]:
-    """Return the root mean square errors of a horizontal axis over the image, in metres, as ERR_BIAS and ERR_RAND.
+    """Return the RMS errors per horizontal axis over the image, in metres, as ERR_BIAS and ERR_RAND.
 
     They are the error of the correction, and the scatter of the control points beyond their own covariances.
     """

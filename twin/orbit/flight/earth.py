@@ -30,14 +30,14 @@ if TYPE_CHECKING:
 
 
 DAY = 86400.0
-"""Length of a day of 86 400 SI seconds, in seconds."""
+"""Length of a day, in SI seconds."""
 RATE = 2.0 * np.pi * 1.00273781191135448 / DAY
 """Rotation rate of the Earth, in rad/s (IERS Conventions 2010, eq. 5.15)."""
 
 _NODE_STEP = 3600.0
 """Interval of the nodes at which the celestial pole is computed for interpolation, in seconds."""
 _NODES_AROUND = 3
-"""Number of interpolation nodes beyond each end of the span."""
+"""Number of interpolation nodes of the celestial pole beyond each end of the span."""
 _DIFFERENCE_STEP = 600.0
 """Half step of the central difference that gives the celestial pole's rate, in seconds."""
 
@@ -92,12 +92,12 @@ def ut1_of(epoch: str, dut1: float) -> tuple[float, float]:
 
 @dataclass(frozen=True, eq=False)
 class EarthRotation:
-    """Rotation GCRS -> ITRS around an epoch, made by `Earth.rotation`; times are SI seconds of atomic time.
+    """Rotation GCRS -> ITRS around an epoch, from `Earth.rotation`; times are SI seconds of TAI from the epoch.
 
     Attributes
     ----------
     pole : callable
-        Spline of the celestial pole's X and Y and of the locator s, radians, over seconds.
+        Function of the time that returns the celestial pole's X and Y and the CIO locator s, radians.
     angle : float
         Earth rotation angle at the epoch, radians.
     polar : ndarray
@@ -163,7 +163,9 @@ _E2 = FLATTENING * (2.0 - FLATTENING)
 """Squared first eccentricity of the WGS84 ellipsoid."""
 _NEWTON_STEPS = 30
 _HEIGHT_TOLERANCE = 2e-8
-"""Largest height error of an intersection, in metres; rounding of a point 7000 km from the centre is 1e-9 m."""
+"""Largest height error of an intersection of a ray with a surface of equal height, in metres; rounding of a point 7000
+km from the centre is 1e-9 m.
+"""
 
 
 @cache
@@ -208,7 +210,7 @@ class Earth:
     def rotation(self, epoch: str, first: float, last: float) -> EarthRotation:
         """Compute the Earth's rotation from `first` to `last`, for many look-ups.
 
-        UT1 runs on evenly from the epoch, also over a leap second.
+        UT1 is taken to run at a constant rate from the epoch, also over a leap second.
 
         Parameters
         ----------
@@ -268,8 +270,9 @@ class Earth:
     def geodetic(self, ecef: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return longitude, latitude (radians) and height (metres) of points (..., 3) in the ITRS; NaN stays NaN.
 
-        PROJ's inverse is one step of Bowring's method: right to a micrometre near the ground, but 2 mm off at 500 km.
-        One Newton step with the exact forward formula, in the local level frame, leaves rounding.
+        PROJ's inverse is one step of Bowring's method: accurate to a micrometre near the ground, but only to 2 mm at a
+        height of 500 km. One Newton step with the exact forward formula, in the local level frame, reduces the error to
+        rounding.
         """
         p = np.asarray(ecef, dtype=np.float64)
         start = _cartesian().transform(p[..., 0], p[..., 1], p[..., 2], radians=True, direction="INVERSE")
@@ -317,10 +320,11 @@ class Earth:
 
 
 def _nearer_root(o: np.ndarray, d: np.ndarray, h: np.ndarray) -> np.ndarray:
-    """Return the distances (...) along rays from origins o in directions d to the ellipsoid enlarged by a height h.
+    """Return the distances (...) along rays from origins `o` in directions `d` to the enlarged ellipsoid.
 
-    Both semi-axes are enlarged by h, in metres. The distance is NaN where a ray misses clearly, and that of the nearest
-    point where it misses by less than the two surfaces can differ.
+    Both semi-axes are enlarged by the height `h`, in metres. The distance is NaN where a ray clearly misses the
+    ellipsoid. Where it misses by less than this ellipsoid can differ from the surface of height `h`, the distance to
+    the ray's nearest point is returned.
     """
     axes = EQUATORIAL_RADIUS * np.array([1.0, 1.0, 1.0 - FLATTENING]) + h[..., None]
     p, q = o / axes, d / axes

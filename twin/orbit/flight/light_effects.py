@@ -1,8 +1,8 @@
 """Light between the ground and a moving camera: light time, stellar aberration, refraction.
 
-Each effect has a sign and a size in orbit at 500 km: the Earth rotates by 0.8 m (equator) during the light time;
-aberration is v/c = 25 urad (5.2 arcsec), 12.7 m on the ground along the track; refraction moves the point of a look at
-25 degrees by 1.5 m toward the satellite.
+Sizes in an orbit at 500 km: the Earth rotates by 0.8 m (equator) during the light time; aberration is v/c = 25 urad
+(5.2 arcsec), 12.7 m on the ground along the track; refraction moves the ground point of a line of sight at 25 degrees
+by 1.5 m toward the satellite's nadir.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 SPEED_OF_LIGHT = 299_792_458.0
 """Speed of light in vacuum, in m/s."""
 EARTH_RATE = 7.292115146706979e-5
-"""Rotation of the Earth, rad/s: derivative of the Earth rotation angle (IERS Conventions 2010, eq. 5.15)."""
+"""Rotation rate of the Earth, rad/s: derivative of the Earth rotation angle (IERS Conventions 2010, eq. 5.15)."""
 _FIXED_POINT_STEPS = 3
 
 
@@ -69,7 +69,7 @@ class LightEffects:
 
     @classmethod
     def of(cls, spec: EffectsSpec | LightEffectsSpec) -> LightEffects:
-        """Return the effects that a test's file switches on."""
+        """Return the effects on the light that a test's file switches on."""
         return cls(spec.light_time, spec.aberration, spec.refraction, spec.wavelength)
 
     @property
@@ -146,7 +146,7 @@ def standard_refractivity(wavelength: float) -> float:
 
 
 def refractive_shift(zenith: np.ndarray, height: np.ndarray, radius: np.ndarray, wavelength: float) -> np.ndarray:
-    """Return the shift, due to refraction, of the ground point of a look from space, toward the satellite's nadir.
+    """Return the shift due to refraction of the ground point of a line of sight, toward the satellite's nadir.
 
     In a spherically layered atmosphere p = n r sin z, with refractive index n, distance r from the Earth's centre and
     zenith angle z, is constant along the ray (Bouguer's invariant; Noerdlinger, ISPRS J. 54, 360 (1999)), and in space
@@ -156,8 +156,9 @@ def refractive_shift(zenith: np.ndarray, height: np.ndarray, radius: np.ndarray,
         r0 integral_{r0}^{inf} (p/r) [1/sqrt(r^2 - p^2) - 1/sqrt(n^2 r^2 - p^2)] dr  ~  tan z sec^2 z integral (n-1) dh.
 
     n - 1 falls off exponentially above the point, with density and scale height (R T/(M g)) of the standard atmosphere
-    at the point's height. The column of air, which alone counts for small z, is therefore the one whose weight is the
-    pressure there (2.33 m at sea level). The integral is evaluated by 12-point Gauss-Laguerre quadrature.
+    at the point's height. The column of air, the only quantity that matters for small z, therefore agrees with the
+    pressure at the point (integral of n - 1: 2.33 m at sea level). The integral is evaluated by 12-point Gauss-Laguerre
+    quadrature.
 
     Parameters
     ----------
@@ -193,13 +194,13 @@ def refractive_shift(zenith: np.ndarray, height: np.ndarray, radius: np.ndarray,
 
 
 def refracted(point: np.ndarray, station: np.ndarray, earth: Earth, wavelength: float) -> np.ndarray:
-    """Return the points at which refracted looks meet the ground.
+    """Return the points at which refracted lines of sight meet the ground.
 
     Parameters
     ----------
     point : ndarray
-        Points at which the straight continuation of the look from space meets a height, ITRS, metres, (N, 3) for N
-        points.
+        Points at which the straight continuation of the line of sight from space reaches the height of the ground,
+        ITRS, metres, (N, 3) for N points.
     station : ndarray
         Positions of the satellite when the light left the ground, ITRS, metres, (N, 3).
     earth : Earth
@@ -226,10 +227,10 @@ def refracted(point: np.ndarray, station: np.ndarray, earth: Earth, wavelength: 
 
 
 def unrefracted(point: np.ndarray, station: np.ndarray, earth: Earth, wavelength: float) -> np.ndarray:
-    """Return the points that straight looks would reach if refracted looks meet `point`.
+    """Return the points that lines of sight would reach without refraction, if refracted ones meet `point`.
 
-    This is the inverse of `refracted`, by fixed-point steps; each reduces the error by a factor of shift over distance,
-    3e-6 at 500 km.
+    This is the inverse of `refracted`, computed by fixed-point steps. Each reduces the error by the ratio of the shift
+    to the satellite's distance, 3e-6 at 500 km.
     """
     straight = point
     for _ in range(_FIXED_POINT_STEPS):

@@ -1,13 +1,14 @@
-"""Line cameras in orbit: looks of pixels in the body frame, exposure times of lines, changes of geometry.
+"""Line cameras in orbit: lines of sight of pixels in the body frame, exposure times, changes of geometry.
 
 Body frame (the instrument's base): X forward, Z toward the scene, Y = Z x X. The look of a pixel is its line of sight,
-a direction toward the scene. A pixel's ray has an origin as well as a direction, because the chief rays of a mirror
-camera do not meet in one exact point. Both are smooth functions of the pixel and are kept as Chebyshev series over the
-line: exact for an ideal projection with distortion, which is a polynomial, and for a traced line as good as the trace.
+a unit vector toward the scene. A pixel's ray has an origin as well as a direction, because the chief rays of a mirror
+camera do not meet in one exact point. Both are smooth functions of the pixel and are stored as Chebyshev series over
+the line: exact for an ideal projection with distortion, which is a polynomial, and as accurate as the ray trace for a
+traced line.
 
 The module also corrects the lines of an instrument for changes that its on-board monitor has estimated. The effect of a
-change on the looks of a line is `analysis.orbit.forward_intersection.CalibratedLine.corrected`, which also corrects
-lines that are intersected; here the corrected looks go back into the line of a flying sensor.
+change on the lines of sight is computed by `analysis.orbit.forward_intersection.CalibratedLine.corrected`, which is
+also used for forward intersection; here the result is converted to the line of an orbiting sensor.
 """
 
 from __future__ import annotations
@@ -44,7 +45,9 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class LineTimes:
-    """Exposure times at lines of an image, linear between them and up to half a line beyond the first and the last.
+    """Exposure times of image lines, interpolated linearly between tabulated lines.
+
+    The table extends to half a line beyond its first and its last line.
 
     Attributes
     ----------
@@ -134,7 +137,8 @@ def drifted_payload(payload: ThreeLineCameraSpec, drift: Mapping[str, np.ndarray
     payload : ThreeLineCameraSpec
         Payload before the drift.
     drift : mapping of str to (4,) ndarray
-        Changes d_alpha, d_beta, d_gamma (radians) and d_f (metres) by name of the line.
+        Name of the line -> rotations d_alpha, d_beta, d_gamma (radians) and change d_f of the principal distance f
+        (metres).
     """
     lines = dict(payload.lines)
     for name, (alpha, beta, gamma, d_f) in drift.items():
@@ -150,28 +154,32 @@ def drifted_payload(payload: ThreeLineCameraSpec, drift: Mapping[str, np.ndarray
 
 
 TRACED_POINTS = 49
-"""Number of traced points of a line; an unperturbed line needs nine terms, the rest is for figure errors."""
+"""Number of traced points of a line; an unperturbed line needs nine Chebyshev terms, the others represent figure errors
+of the mirrors.
+"""
 _NOISE = 1e-14
-"""Relative size below which terms of a traced series are rounding and are dropped (one pixel is 1e-6 rad)."""
+"""Relative size below which terms of a traced Chebyshev series are rounding errors and are dropped (one pixel is 1e-6
+rad).
+"""
 _PLANE_POINTS = 1001
 """Number of evenly spread pixels to which the plane of a whole line is fitted."""
 _LOOK_TERMS = 12
 """Number of Chebyshev terms for the tangent of a look angle within 30 deg over one CCD.
 
-The terms fall off by a thousandfold every few terms.
+The terms decrease by a factor of a thousand every few terms.
 """
 
 
 @dataclass(frozen=True, eq=False)
 class LinePiece:
-    """Single CCD of a line with its looks.
+    """Single CCD of a line, with the lines of sight of its pixels.
 
     Attributes
     ----------
     first, last : int
         First and last pixel of the CCD, counted over the line.
     directions : (K, 3) ndarray
-        K Chebyshev coefficients, over the CCD's pixels, of a vector along the look, body frame.
+        K Chebyshev coefficients, over the CCD's pixels, of a vector along the line of sight, body frame.
     """
 
     first: int
@@ -181,7 +189,7 @@ class LinePiece:
 
 @dataclass(frozen=True, eq=False)
 class LineCamera:
-    """Line of pixels with their rays in the body frame.
+    """Line of pixels with their rays (origins and lines of sight) in the body frame.
 
     Pixels are counted along +Y' of the real focal plane, the centre of the first is 0, so they see the scene from +Y to
     -Y of the body. A position on the line is any real number from -0.5 to pixels - 0.5.
@@ -193,12 +201,13 @@ class LineCamera:
     pixels : int
         Number of pixels.
     directions : (K, 3) ndarray
-        K Chebyshev coefficients over the line of a vector along the look, body frame; its length does not matter.
+        K Chebyshev coefficients over the line of a vector along the line of sight, body frame; its length does not
+        matter.
     origins : (J, 3) ndarray
         J Chebyshev coefficients over the line of a point on the ray, body frame, metres.
     pieces : tuple of LinePiece
-        CCDs of a line that consists of several, from its first pixel on; their looks replace `directions`, which then
-        are those of a line without offsets.
+        CCDs of a line that consists of several, in the order of the pixels; their directions replace `directions`,
+        which then describe a line without offsets of its CCDs.
     """
 
     name: str
@@ -208,12 +217,12 @@ class LineCamera:
     pieces: tuple[LinePiece, ...] = ()
 
     def turned(self, rotation: np.ndarray) -> LineCamera:
-        """Return the line with its looks rotated in body axes by a (3, 3) matrix: new look = look @ rotation."""
+        """Return the line with its lines of sight rotated by a (3, 3) matrix in body axes: new = old @ rotation."""
         pieces = tuple(replace(piece, directions=piece.directions @ rotation) for piece in self.pieces)
         return replace(self, directions=self.directions @ rotation, pieces=pieces)
 
     def look(self, pixel: np.ndarray) -> np.ndarray:
-        """Return unit directions toward the scene, body frame: (N, 3) for N pixels.
+        """Return the lines of sight of N pixels: unit vectors toward the scene, body frame, (N, 3).
 
         Raises
         ------
@@ -224,9 +233,9 @@ class LineCamera:
         return vector / np.linalg.norm(vector, axis=-1, keepdims=True)
 
     def look_and_slope(self, pixel: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the looks of N pixels and their derivatives with respect to the pixel, in rad per pixel, both (N, 3).
+        """Return the lines of sight of N pixels and their derivatives with respect to the pixel (rad/pixel), (N, 3).
 
-        The derivative is perpendicular to the look.
+        The lines of sight are unit vectors in the body frame; the derivatives are perpendicular to them.
         """
         vector, change = self._vector(pixel)
         length = np.linalg.norm(vector, axis=-1, keepdims=True)
@@ -260,7 +269,7 @@ class LineCamera:
         return self._series(self.origins, self._checked(pixel))
 
     def _vector(self, pixel: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return a vector along the look of N pixels and its derivative with respect to the pixel, both (N, 3)."""
+        """Return vectors along the lines of sight of N pixels and their derivatives per pixel, both (N, 3)."""
         pixels = self._checked(pixel)
         change = self._series(chebyshev.chebder(self.directions), pixels) * (2.0 / self.pixels)
         vector = self._series(self.directions, pixels)
@@ -274,7 +283,7 @@ class LineCamera:
         return vector, change
 
     def _checked(self, pixel: np.ndarray) -> np.ndarray:
-        """Return pixels on the line; those outside it by rounding are clipped to its end."""
+        """Return pixel positions, those outside the line by rounding clipped; raise ValueError for others outside."""
         if not np.all(in_span(pixel, -0.5, self.pixels - 0.5)):
             raise ValueError(
                 f"a pixel lies outside the line {self.name!r}, which extends from -0.5 to {self.pixels - 0.5}"
@@ -288,14 +297,14 @@ class LineCamera:
 
 
 def line_cameras(spec: ThreeLineCameraSpec) -> dict[str, LineCamera]:
-    """Return the lines of a payload of ideal projections with distortion, by name (no approximation)."""
+    """Return the line cameras of a payload, ideal projections with distortion, by name (exact Chebyshev series)."""
     return {
         name: _ideal_line(name, line, spec.pixels_of(name), spec.pitch_of(name)) for name, line in spec.lines.items()
     }
 
 
 def polynomial_line(name: str, pixels: int, forward: ArrayLike, right: ArrayLike) -> LineCamera:
-    """Return a line whose looks have polynomials of the pixel as tangents (no approximation).
+    """Return a line camera whose look angles have tangents that are polynomials in the pixel (exact).
 
     Parameters
     ----------
@@ -304,9 +313,9 @@ def polynomial_line(name: str, pixels: int, forward: ArrayLike, right: ArrayLike
     pixels : int
         Number of pixels.
     forward : (K,) array_like for K coefficients
-        Coefficients of the tangent of the look's angle forward, ascending powers of the pixel.
+        Coefficients of the tangent of the forward look angle, ascending powers of the pixel.
     right : (K,) array_like
-        Coefficients of the tangent of the look's angle to the right, ascending powers of the pixel.
+        Coefficients of the tangent of the look angle to the right, ascending powers of the pixel.
     """
     ahead, aside = np.atleast_1d(forward), np.atleast_1d(right)
 
@@ -382,27 +391,7 @@ def _ccd_positions(
 
 
 def traced_line_cameras(instrument: Instrument, backend: Backend, state: State | None = None) -> dict[str, LineCamera]:
-    """Return the lines of an instrument of mirror cameras, by exact chief rays of their pixels.
-
-    Parameters
-    ----------
-    instrument : Instrument
-        Cameras on their base, which is the satellite's body frame.
-    backend : Backend
-        Array backend that traces the rays.
-    state : State or None
-        Perturbation of the instrument; None for the nominal state.
-
-    Returns
-    -------
-    dict of str to LineCamera
-        Line of each camera. The origins are the points of the chief rays nearest to the camera's nominal origin.
-
-    Raises
-    ------
-    AimError, BeamMissedError
-        The perturbation moves the image off the mirrors.
-    """
+    """Trace the chief rays of an instrument of mirror cameras and return its line cameras, by name."""
     names = list(instrument.cameras)
     states: list[State] = [state or {}]
     placed = instrument.assembly.place(states)
@@ -428,7 +417,7 @@ def traced_line_cameras(instrument: Instrument, backend: Backend, state: State |
 
 
 def look_angle(a: LineCamera, b: LineCamera) -> float:
-    """Return the angle between the looks of the middles of two lines, in radians, 0 to pi."""
+    """Return the angle between the lines of sight of the middles of two lines, in radians, 0 to pi."""
     first, second = (camera.look(np.array([0.5 * (camera.pixels - 1)]))[0] for camera in (a, b))
     return _angle(first, second)
 
@@ -436,9 +425,10 @@ def look_angle(a: LineCamera, b: LineCamera) -> float:
 def along_track_angle(a: LineCamera, b: LineCamera) -> float:
     """Return the angle along the track from the middle of line b to that of line a, in radians.
 
-    It is a rotation about the lines' mean direction, positive where a looks ahead of b: the part of `look_angle` that
-    makes heights. Lines that look the same way but side by side have none. A line's direction is perpendicular to the
-    look of its middle, in its plane.
+    It is the rotation about the mean direction of the two detector lines, positive where `a` looks ahead of `b`: the
+    part of `look_angle` that determines heights by parallax. Lines that look in one direction side by side have the
+    angle 0. The direction of a detector line is perpendicular to its central line of sight, in the plane of its lines
+    of sight.
     """
     first, second = (camera.look(np.array([0.5 * (camera.pixels - 1)]))[0] for camera in (a, b))
     sides = [np.cross(look, line_normal(camera)) for look, camera in ((first, a), (second, b))]
@@ -452,9 +442,9 @@ def dihedral_angle(
 ) -> float:
     """Return the angle between the planes of two lines, in radians, 0 to pi/2.
 
-    A line's plane is the one through the station from which its looks deviate least (total least squares over the whole
-    line, or over the given `pixels` of each line). Ground points of the strips give this angle (paper 000, eqs. 1 to
-    7). It differs from `look_angle` when the lines are not parallel.
+    The plane of a line goes through the station and fits its lines of sight best (total least squares over the whole
+    line, or over the given `pixels` of each line). Ground points of the strips give this angle (paper 000, Liu and
+    Huang 2014, eqs. 1 to 7). It differs from `look_angle` when the lines are not parallel.
     """
     angle = _angle(*(line_normal(camera, pixel) for camera, pixel in zip((a, b), pixels, strict=True)))
     return min(angle, np.pi - angle)
@@ -485,7 +475,7 @@ class LineAngles:
 
     @property
     def along_track(self) -> dict[str, float]:
-        """Signed part of `look` along the track, positive where the first line looks ahead of the second."""
+        """Signed along-track components of `look`, in radians, positive where the first line looks ahead."""
         return {name: along_track_angle(self.cameras[a], self.cameras[b]) for name, (a, b) in self.pairs.items()}
 
     @property
@@ -524,7 +514,7 @@ def _nodes(pixels: int, count: int) -> np.ndarray:
 
 
 def _through(values: np.ndarray) -> np.ndarray:
-    """Return the K coefficients (K, 3) of the Chebyshev series that has these values (K, 3) at the Chebyshev points."""
+    """Return the coefficients (K, 3) of the Chebyshev series with given values (K, 3) at K Chebyshev points."""
     count = len(values)
     basis = chebyshev.chebvander(chebyshev.chebpts1(count), count - 1)
     weight = np.full(count, 2.0 / count)
@@ -538,21 +528,21 @@ def _coefficients(function: Callable[[np.ndarray], np.ndarray], pixels: int, cou
 
 
 def _chopped(coefficients: np.ndarray) -> np.ndarray:
-    """Return the Chebyshev series without its last terms that are only rounding errors."""
+    """Return the Chebyshev series without those of its last terms that are only rounding errors."""
     size = np.max(np.abs(coefficients), axis=-1)
     used = np.flatnonzero(size > _NOISE * np.max(size))
     return coefficients[: used[-1] + 1]
 
 
 def calibrated_line(line: LineCamera, axes: np.ndarray, principal_distance: float) -> CalibratedLine:
-    """Return a traced line in the form that the analysis uses.
+    """Convert a traced line to the camera model that the analysis uses.
 
     Parameters
     ----------
     line : LineCamera
         Line of one CCD.
     axes : (3, 3) ndarray
-        Columns X, Y, Z of its camera in the body frame, about which changes are counted.
+        Axes X, Y, Z of its camera in the body frame as columns, about which the camera's changes are rotations.
     principal_distance : float
         Principal distance of the line, metres.
     """
@@ -562,7 +552,7 @@ def calibrated_line(line: LineCamera, axes: np.ndarray, principal_distance: floa
 def calibrated_lines(
     lines: Mapping[str, LineCamera], instrument: Instrument, backend: Backend
 ) -> dict[str, CalibratedLine]:
-    """Return the lines of an instrument in the form that the analysis uses, by camera.
+    """Convert the lines of an instrument to the camera models that the analysis uses, by camera.
 
     Parameters
     ----------
@@ -584,11 +574,12 @@ def corrected_line(line: LineCamera, calibrated: CalibratedLine, change: ArrayLi
     Parameters
     ----------
     line : LineCamera
-        Line as it was calibrated.
+        Line camera as it was calibrated.
     calibrated : CalibratedLine
-        The same line, by `calibrated_lines`.
+        The same line as the analysis models it, from `calibrated_lines`.
     change : (4,) array_like
-        d_alpha, d_beta, d_gamma (rad) and d_f (m) since the calibration.
+        Rotations d_alpha, d_beta, d_gamma about the camera's Y, X and line of sight (rad), and change d_f of the
+        principal distance (m), since the calibration.
 
     Raises
     ------

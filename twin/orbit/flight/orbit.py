@@ -1,8 +1,8 @@
 """Satellite orbits, integrated numerically under gravity with the Earth's flattening (J2) and any other `FORCES`.
 
 The flattening's axis is the celestial pole of the epoch; within a day the pole moves by some 0.1 arcsec. Drag, other
-terms of the field, Sun and Moon are omitted: over a pass they displace the orbit smoothly by metres, and change
-nothing in the geometry of an image, because a precise orbit determination follows them.
+terms of the field, Sun and Moon are omitted: over a pass they displace the orbit smoothly by metres, and change nothing
+in the geometry of an image, because a precise orbit determination includes them.
 """
 
 from __future__ import annotations
@@ -27,9 +27,9 @@ GM = 3.986004415e14
 J2 = 1.0826266835e-3
 """Second zonal coefficient of the gravity field (EGM96): -sqrt(5) times the normalised C20, -484.165371736e-6."""
 FIELD_RADIUS = 6378136.3
-"""Reference radius of the field's expansion, metres (EGM96)."""
+"""Reference radius of the spherical harmonic expansion of the gravity field, metres (EGM96)."""
 SUN_RATE = 2.0 * math.pi / (365.2421897 * DAY)
-"""Mean motion of the mean Sun in right ascension, rad/s; tropical year."""
+"""Mean motion of the mean Sun in right ascension, rad/s, from the tropical year."""
 TOLERANCE = 1e-12
 """Relative error tolerance of one integration step."""
 
@@ -38,7 +38,7 @@ _ABSOLUTE = np.array([1.0, 1.0, 1.0, 1e-3, 1e-3, 1e-3]) * 1e-5
 _LONGEST_STEP = 60.0
 """Longest integration step, in seconds."""
 _MOST_KEPT = 1 << 14
-"""Largest number of times for which an orbit keeps positions and velocities in its cache."""
+"""Largest number of times whose positions and velocities an orbit stores in its cache."""
 _POLAR_RADIUS = EQUATORIAL_RADIUS * (1.0 - FLATTENING)
 
 
@@ -70,15 +70,26 @@ def _gravity(_: float, position: np.ndarray, velocity: np.ndarray) -> np.ndarray
 FORCES = ExtensionTable[Force]("forces", {"gravity": _gravity})
 """Forces on every satellite by name; the accelerations add.
 
-New forces are added here. Orbits that are called sun-synchronous follow the mean Sun by J2 alone.
+New forces are added here. The inclination of orbits that are specified as sun-synchronous is computed from J2 alone.
 """
 
 
 def node_rate(semi_major_axis: float, eccentricity: float, inclination: float) -> float:
-    """Return the secular rate of the ascending node due to J2, in rad/s, from mean elements.
+    """Return the secular rate of the ascending node due to J2, in rad/s.
 
+    Parameters
+    ----------
+    semi_major_axis : float
+        Mean semi-major axis, metres.
+    eccentricity : float
+        Mean eccentricity.
+    inclination : float
+        Mean inclination i, radians.
+
+    Notes
+    -----
     The rate is -3/2 J2 (R/p)^2 n cos i (Kaula 1966, eq. 3.74), with the Earth's radius R, the orbit's semi-latus rectum
-    p, mean motion n and inclination i.
+    p and mean motion n.
     """
     n = math.sqrt(GM / semi_major_axis**3)
     p = semi_major_axis * (1.0 - eccentricity**2)
@@ -105,7 +116,7 @@ def _osculating_inclination(semi_major_axis: float, eccentricity: float, argumen
     The input elements are osculating. The short-period terms of first order for a small eccentricity (Kozai 1959) lead
     to the mean elements: a = a' + 3/2 J2 R^2/a sin^2 i cos 2u and i = i' + 3/8 J2 (R/p)^2 sin 2i cos 2u. Here a, i and
     p are semi-major axis, inclination and semi-latus rectum, a prime marks mean elements, and u is the argument of
-    latitude. Where it is None, sin u follows from z = sin i sin u.
+    latitude. Where `argument` is None, sin u follows from z = sin i sin u, the sine of the declination.
     """
     ratio = J2 * (FIELD_RADIUS / semi_major_axis) ** 2
     inclination = sun_synchronous_inclination(semi_major_axis, eccentricity)
@@ -120,7 +131,7 @@ def _osculating_inclination(semi_major_axis: float, eccentricity: float, argumen
 
 @dataclass(frozen=True, eq=False)
 class Orbit:
-    """Orbit over a span of time, made by `propagate`.
+    """Satellite orbit over a span of time, from `propagate`.
 
     Attributes
     ----------
@@ -233,7 +244,7 @@ def propagate(spec: OrbitSpec, earth: Earth, tolerance: float = TOLERANCE) -> Or
 
 
 def _local_time(right_ascension: float, angle: float, ut1: tuple[float, float]) -> float:
-    """Return UT1 plus the longitude of the meridian, in seconds of the day."""
+    """Return the local time of a meridian, UT1 plus its longitude, in seconds of the day."""
     # A Julian day begins at noon.
     noon = (ut1[0] % 1.0 + ut1[1] % 1.0 + 0.5) * DAY
     return (noon + (right_ascension - angle) / (2.0 * math.pi) * DAY) % DAY
@@ -300,7 +311,7 @@ def _element_state(spec: ElementsSpec, rotation: EarthRotation, ut1: tuple[float
 
 
 def _passing_state(spec: PassingSpec, earth: Earth, from_itrs: np.ndarray) -> np.ndarray:
-    """Return position and velocity, (6,), at the epoch on the osculating circular orbit through a point.
+    """Return position and velocity, (6,), at the epoch on the osculating circular orbit over a ground point.
 
     The point's declination gives the argument of latitude and, with its right ascension, the node.
     """

@@ -28,17 +28,19 @@ _FOURTH_DERIVATIVE = 1.1e-5
 _LAGRANGE_NODES = 10
 """Number of readings through which an interpolating Lagrange polynomial goes."""
 _LEAST_ROWS = 12
-"""Smallest number of readings for which every fourth reading still defines a curve."""
+"""Smallest number of readings for which every fourth reading still defines an interpolating curve."""
 _GROWS = 4.0
-"""Factor by which the interpolation error must grow at twice the step to be attributed to the interpolation and not to
-the noise of the readings.
+"""Factor by which the interpolation error must grow when the step is doubled to be attributed to the interpolation and
+not to the noise of the readings.
 """
 _SURELY = 1e3
-"""Interpolation error, in metres, above which it cannot be due to the noise of the readings."""
+"""Interpolation error, in metres, that is too large to be attributed to the noise of the readings."""
 _GAP = 5.0
-"""Interval between readings, in median intervals, above which it is a gap without interpolation."""
+"""Interval between readings, in units of the median interval, above which it is a gap that is not interpolated."""
 _UNIT_TOLERANCE = 1e-3
-"""Largest departure of a quaternion's norm from 1: four decimals pass, and a rotation vector does not."""
+"""Largest accepted deviation of a quaternion's norm from 1: it accepts numbers with four decimals and rejects other
+rotation parameters.
+"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,8 +60,8 @@ class PlatformTable:
     attitude_time : (M,) ndarray for M attitude readings
         Times of the attitude readings, seconds, increasing.
     quaternion : (M, 4) ndarray
-        x, y, z, w (scalar last) of unit length, neighbours on one side; rotates body axes into those of the ITRS,
-        v_itrs = R(q) v_body.
+        Unit quaternions x, y, z, w (scalar last) with continuous signs, which rotate body axes to ITRS axes: v_itrs =
+        R(q) v_body.
     usable : tuple of float
         Two times, seconds, between which the orbit may be used; readings beyond them only support the interpolation.
     """
@@ -82,7 +84,7 @@ class PlatformTable:
         attitude_time: ArrayLike,
         quaternion: ArrayLike,
     ) -> PlatformTable:
-        """Make the table from readings, with checks; quaternions are normalised and brought to one side.
+        """Make the table from readings, with checks; quaternions are normalised and get continuous signs.
 
         Parameters
         ----------
@@ -133,7 +135,7 @@ class PlatformTable:
 
 
 def continuous_quaternions(quaternion: Array) -> Array:
-    """Return quaternions of the same rotations whose neighbours lie on one side of the sphere, for interpolation.
+    """Return quaternions of the same rotations with signs such that neighbours can be interpolated.
 
     Parameters
     ----------
@@ -150,9 +152,9 @@ def continuous_quaternions(quaternion: Array) -> Array:
 
 
 def _moments(trajectory: Trajectory, step: float) -> Array:
-    """Return times of readings inside a trajectory and its ends.
+    """Return the times of readings at multiples of `step` within a trajectory, and at both of its ends, in seconds.
 
-    A reading that all but coincides with an end is dropped.
+    A reading that nearly coincides with an end is dropped.
     """
     first, last = trajectory.first, trajectory.last
     times = readings(first, last, step)
@@ -162,13 +164,15 @@ def _moments(trajectory: Trajectory, step: float) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class TabulatedTrajectory:
-    """Position and attitude between the readings of a table, seconds from its epoch; times have shape (...).
+    """Position and attitude interpolated between the readings of a table.
 
-    Positions are interpolated by a cubic spline (not-a-knot) where that is good to 1 mm on a smooth orbit, which it is
-    up to 14 s between readings, and by Lagrange's polynomial of ten readings around each time where readings are
+    Times are seconds from the table's epoch, of any shape (...).
+
+    Positions are interpolated by a cubic spline (not-a-knot) where it is accurate to 1 mm on a smooth orbit, which is
+    so for up to 14 s between readings, and by Lagrange's polynomial of ten readings around each time where readings are
     farther apart. Velocities are interpolated likewise, or are the derivative of the positions. Components of
-    quaternions are interpolated by a cubic spline and normalised: good to 1e-9 rad for a satellite that rotates by 0.1
-    deg between readings.
+    quaternions are interpolated by a cubic spline and normalised: accurate to 1e-9 rad for a satellite that rotates by
+    0.1 deg between readings.
 
     Every method raises ValueError for a time outside the readings or in a gap of them.
 
@@ -259,7 +263,7 @@ class TabulatedTrajectory:
         return CubicSpline(self.table.attitude_time, self.table.quaternion)
 
     def _joined(self, values: Array) -> Any:
-        """Return an interpolating function of values (N, 3) at the N orbit readings."""
+        """Return a function that interpolates values (N, 3) given at the N orbit readings."""
         if self.interpolation == "spline":
             return CubicSpline(self.table.orbit_time, values)
         return _Lagrange(self.table.orbit_time, values)

@@ -1,10 +1,10 @@
-"""Line sensor in orbit: from pixel and time to the ground and back. The look of a pixel is its line of sight.
+"""Rigorous model of a line sensor in orbit: from pixel and time to the ground and back.
 
 Nothing is interpolated along the track, so that no smoothness of attitude or orbit is assumed.
 
-The two directions are written separately, each from the physics: `ground` follows a pixel's look down to a height,
-`image` searches the line and the pixel on which the light from a point falls. They share no solution, so that the round
-trip tests both.
+The two directions are implemented independently, each from the physics: `ground` intersects a pixel's line of sight
+with the surface of a height, `image` searches the line and the pixel on which the light from a point falls. The round
+trip therefore tests both.
 """
 
 from __future__ import annotations
@@ -24,9 +24,9 @@ from twin.orbit.flight.line_camera import LineCamera, LineTimes
 _MOST_STEPS = 30
 """Largest number of Newton steps of the search for the line and pixel that see a ground point."""
 _ARRIVED = 1e-7
-"""Length of the last Newton step, in pixels and lines, below which the search ends.
+"""Length of a Newton step, in pixels and lines, below which the search for the image of a ground point ends.
 
-Each step is a thousandth of the one before, so the error that remains is far smaller.
+Each step is a thousand times smaller than the one before, so that the remaining error is far smaller.
 """
 
 
@@ -48,12 +48,12 @@ class Platform(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class OffsetPlatform:
-    """Platform with a constant offset of position and attitude.
+    """Trajectory with a constant offset of position and attitude in body axes.
 
     Attributes
     ----------
     base : Platform
-        Platform without the offset.
+        Trajectory without the offset.
     shift : (3,) ndarray
         Offset of position in body axes, metres.
     turn : (3,) ndarray
@@ -159,7 +159,7 @@ class Sensor:
         Returns
         -------
         (N, 3) ndarray
-            Points in the ITRS, metres; NaN where the look misses the Earth.
+            Points in the ITRS, metres; NaN where the line of sight misses the Earth.
 
         Raises
         ------
@@ -187,8 +187,8 @@ class Sensor:
     def image(self, point: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the image coordinates of ground points.
 
-        Newton's method on line and pixel, on the two components of the light's direction perpendicular to the pixel's
-        look.
+        Newton's method finds the line and pixel for which the two components of the light's direction perpendicular to
+        the pixel's line of sight vanish.
 
         Parameters
         ----------
@@ -199,7 +199,7 @@ class Sensor:
         -------
         tuple of ndarray
             Line and pixel, (N,) each; both NaN for a point outside the image (the mask of those inside is
-            ``np.isfinite(line)``), for a NaN, and for a point that the body of the Earth hides.
+            ``np.isfinite(line)``), for a NaN, and for a point that is hidden behind the Earth.
         """
         point = np.asarray(point, dtype=np.float64).reshape(-1, 3)
         line, pixel = np.full(len(point), np.nan), np.full(len(point), np.nan)

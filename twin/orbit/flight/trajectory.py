@@ -5,15 +5,15 @@ angular momentum.
 
 Readings come at a fixed interval. Random errors are drawn for every reading of the span beforehand and interpolated by
 a cubic spline, as a user of the data would do: at a reading the error has the specified standard deviation, halfway
-between two it is somewhat smaller. Each error term has its own random stream, so that leaving one out does not change
+between two it is somewhat smaller. Each error term has its own random stream, so that switching one off does not change
 the others.
 
 Jitter is small fast rotations of the body about its own axes, specified by frequency. It is a sum of sinusoids and is
-evaluated, never interpolated. The noise of a band consists of sinusoids, too: the band is cut into equal parts, each
-has one frequency drawn uniformly within it, and two normal amplitudes whose variance is the level times the part's
-width. The motion is then Gaussian at every time with exactly the specified variance, its expected spectrum is exactly
-the specified one, and it does not repeat. Over longer than the inverse width of a part, some seconds, its spectrum
-shows as the lines that it consists of.
+evaluated, never interpolated. The noise of a frequency band consists of sinusoids, too: the band is divided into equal
+parts, and each part gets one frequency drawn uniformly within it, with normally distributed sine and cosine amplitudes
+whose variance is the specified power spectral density times the part's width. The motion is then Gaussian at every time
+with exactly the specified variance, its expected spectrum is exactly the specified one, and it does not repeat. Over
+times longer than the inverse width of a part, some seconds, the single lines of its spectrum can be resolved.
 """
 
 from __future__ import annotations
@@ -38,20 +38,20 @@ if TYPE_CHECKING:
 JITTER_STREAM = 2**31
 """Number of the random stream of jitter among those of a pass, far above the numbers of the other streams."""
 _RESOLVED = 10.0
-"""Duration over which the noise of a band is distinguishable from lines, in seconds."""
+"""Duration over which the single sinusoids that make up the noise of a band can be distinguished, in seconds."""
 _LEAST, _MOST = 64, 4096
-"""Smallest and largest number of sinusoids of a band."""
+"""Smallest and largest number of sinusoids that represent the noise of a frequency band."""
 _AT_ONCE = 4_000_000
-"""Largest number of phases of sinusoids that are evaluated at a time, to bound memory."""
+"""Largest number of sine phases that are evaluated at a time, to limit memory."""
 _MOMENTS = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48)
-"""Numbers of moments within a light collection that are tried in turn, until the image's position and smear are exact
-enough.
+"""Numbers of moments within the light collection of a pixel that are tried in turn, until position and smear of the
+image are accurate enough.
 """
 
 
 @dataclass(frozen=True, eq=False)
 class Jitter:
-    """Rotations of a body over time as a sum of sinusoids, instantaneous or averaged over a collection.
+    """Rotations of the satellite's body over time as a sum of sinusoids, instantaneous or averaged over the exposure.
 
     Attributes
     ----------
@@ -60,7 +60,7 @@ class Jitter:
     sine, cosine : (K, 3) ndarray
         Amplitudes as rotation vectors about body X, Y and Z, radians.
     collection : Collection or None
-        Collection over which the rotation is averaged; None for instantaneous values.
+        Light collection (exposure) over which the rotation is averaged; None for instantaneous values.
     """
 
     frequency: np.ndarray
@@ -70,12 +70,12 @@ class Jitter:
 
     @classmethod
     def of(cls, spec: JitterSpec, seed: np.random.SeedSequence) -> Jitter | None:
-        """Make the jitter that an input file specifies; None where it specifies none.
+        """Make the jitter that an input file specifies; return None where it specifies none.
 
         Parameters
         ----------
         spec : JitterSpec
-            Lines and bands of the spectrum.
+            Lines (single frequencies) and bands of the spectrum.
         seed : SeedSequence
             Seed of random phases and of bands. Each line and each band has its own stream.
         """
@@ -123,16 +123,16 @@ class Jitter:
         return replace(self, sine=sine, cosine=cosine)
 
     def over(self, collection: Collection) -> Jitter:
-        """Return the mean of the jitter over a collection about each time, which displaces the image of a TDI line."""
+        """Return the jitter averaged over the exposure about each time, which displaces the image of a TDI line."""
         return replace(self, collection=collection)
 
     def exposures(self, collection: Collection, pixel: float, tolerance: float) -> list[tuple[float, Jitter]]:
-        """Return the parts of a light collection, each with the jitter of its moment; the image is their weighted mean.
+        """Divide a light collection into moments; return the weight of each in the image, and the jitter at it.
 
         Parameters
         ----------
         collection : Collection
-            Light collection of the line.
+            Light collection (exposure) of the line.
         pixel : float
             Angle of a pixel, radians.
         tolerance : float
@@ -160,7 +160,7 @@ class Jitter:
         )
 
     def read(self, times: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
-        """Return the jitter as seen in readings at K times that are interpolated by a cubic spline.
+        """Return the jitter, as a function of time, that a cubic spline through its values at K reading times shows.
 
         Jitter faster than half of the readings' rate is aliased to a lower frequency.
         """
@@ -174,7 +174,7 @@ class Attitude:
     Attributes
     ----------
     geodetic : bool
-        Z points along the ellipsoid's normal through the satellite; else to the Earth's centre.
+        Z points along the ellipsoid's normal through the satellite; otherwise it points to the Earth's centre.
     yaw_steering : bool
         X lies along the motion of the nadir point over the rotating Earth, so that the image of that point moves
         perpendicular to a line along Y; else along the inertial velocity.
@@ -246,13 +246,13 @@ TERMS = (
     "attitude_drift",
     "attitude_walk",
 )
-"""Names of the measurement errors that can be switched."""
+"""Names of the errors of measured orbit and attitude that can be switched on and off."""
 
 _SPARE_READINGS = 8
-"""Number of readings beyond either end of the span, so that the spline's ends do not matter."""
+"""Number of readings simulated beyond either end of the time span, so that end effects of the spline are negligible."""
 
 Series = Callable[[np.ndarray], np.ndarray]
-"""Function from times (...), seconds, to vectors (..., 3)."""
+"""Function of times (...), in seconds, that returns vectors (..., 3), such as errors of position or attitude."""
 
 
 def readings(first: float, last: float, interval: float) -> np.ndarray:
@@ -262,7 +262,7 @@ def readings(first: float, last: float, interval: float) -> np.ndarray:
 
 
 def _noise(time: np.ndarray, sigma: np.ndarray, seed: np.random.SeedSequence) -> Series:
-    """Return a function of time that interpolates white noise of standard deviation sigma at each reading."""
+    """Return a function of time that interpolates white noise of standard deviation `sigma` at the readings."""
     return CubicSpline(time, sigma * np.random.default_rng(seed).standard_normal((time.size, 3)))
 
 
@@ -289,16 +289,16 @@ def _drift(time: np.ndarray, sigma: np.ndarray, seed: np.random.SeedSequence, co
 
 @dataclass(frozen=True, eq=False)
 class MeasurementErrors:
-    """Errors of the measured orbit and attitude, measured minus true; made by `_draw_errors`.
+    """Errors of the measured orbit and attitude, measured minus true, as functions of time.
 
     Attributes
     ----------
     position_terms : tuple of Series
-        Series of position errors in the orbital frame, metres.
+        Functions of time of position errors in the orbital frame, metres; the errors add.
     velocity_terms : tuple of Series
-        Series of velocity errors in the orbital frame, m/s.
+        Functions of time of velocity errors in the orbital frame, m/s.
     attitude_terms : tuple of Series
-        Series of rotation vectors in body axes, radians.
+        Functions of time of rotation vectors in body axes, radians.
     bias : (3,) ndarray
         Constant rotation vector in body axes, radians.
     thermal : (3,) ndarray
@@ -348,7 +348,7 @@ class MeasurementErrors:
 def _draw_errors(
     spec: ErrorsSpec, first: float, last: float, seed: int, terms: Sequence[str] = TERMS
 ) -> MeasurementErrors:
-    """Draw measurement errors over a span of time.
+    """Draw the errors of the measured orbit and attitude over a span of time.
 
     Parameters
     ----------
@@ -377,7 +377,7 @@ def _draw_errors(
     def drawn(
         name: str, sigma: Sequence[float], interval: float, make: Callable[..., Series] = _noise, *more: float
     ) -> tuple[Series, ...]:
-        """Return the series of an error term as a tuple, empty where the term is off."""
+        """Return the error functions of time of a term as a tuple, empty where the term is switched off."""
         if name not in terms or not any(sigma):
             return ()
         return (make(readings(first, last, interval), np.array(sigma), streams[name], *more),)
@@ -399,14 +399,30 @@ def _draw_errors(
 
 
 def _sum(series: tuple[Series, ...], seconds: np.ndarray) -> np.ndarray:
-    """Return the sum of several error series at times (...), in seconds, (..., 3)."""
+    """Return the sum of several error time series at given times.
+
+    Parameters
+    ----------
+    series : tuple of Series
+        Functions of the time that return errors about or along three axes, in the unit of their quantity: metres, m/s
+        or radians.
+    seconds : (...) ndarray
+        Times, in seconds from the orbit's epoch.
+
+    Returns
+    -------
+    (..., 3) ndarray
+        Sum of the errors in the same unit; zero without series.
+    """
     t = np.asarray(seconds, dtype=np.float64)
     return sum((term(t) for term in series), np.zeros((*t.shape, 3)))
 
 
 @dataclass(frozen=True, eq=False)
 class Trajectory:
-    """Position and attitude over the span of an orbit, seconds from its epoch; times have shape (...).
+    """Position and attitude over the span of an orbit.
+
+    Times are seconds from the orbit's epoch, of any shape (...).
 
     Every method raises ValueError for a time outside the orbit.
 
@@ -419,8 +435,9 @@ class Trajectory:
     errors : MeasurementErrors or None
         Errors of the measured orbit and attitude; None for the true trajectory.
     jitter : Series or None
-        Departure of the body from the law: rotation vectors (..., 3) about the body's own axes at times (...), seconds;
-        None without jitter. For a measured trajectory it is the jitter that the attitude readings show.
+        Rotation of the body relative to the attitude law: rotation vectors (..., 3), in radians, about body axes at
+        times (...), seconds; None without jitter. For a measured trajectory it is the jitter that the attitude readings
+        show.
     """
 
     orbit: Orbit
@@ -486,7 +503,8 @@ class Trajectory:
     def with_errors(self, spec: ErrorsSpec, seed: int, terms: Sequence[str] = TERMS) -> Trajectory:
         """Return the trajectory as the satellite measures it.
 
-        The new errors replace any that the trajectory has, and the jitter becomes the one that attitude readings show.
+        The new errors replace those of the trajectory, and the jitter is replaced by that which interpolated attitude
+        readings show.
 
         Parameters
         ----------

@@ -1,8 +1,8 @@
 """Plane ground coordinates, random fields and cubic splines on a grid, and the terrain of a patch.
 
 East and north are longitude and latitude times constant lengths, those of the ellipsoid at the patch's middle. The
-conversion to longitude, latitude and height and back is thus exact everywhere; only the lengths are not quite true away
-from the middle (at 40 degrees of latitude an east metre is 1.3e-4 wrong 1 km to the north). Heights are above the
+conversion to longitude, latitude and height and back is thus exact everywhere; only lengths have a small scale error
+away from the middle (1.3e-4 for east-west lengths 1 km to the north, at 40 degrees of latitude). Heights are above the
 ellipsoid.
 """
 
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from scenes.specs.orbit.scene import TerrainSpec
 
 _EARTH = Earth()
-"""Earth whose ellipsoid is used; its orientation is not."""
+"""Earth model, of which only the ellipsoid is used."""
 
 
 @dataclass(frozen=True)
@@ -50,11 +50,11 @@ class GroundFrame:
         return float(normal * np.cos(self.latitude)), float(meridian)
 
     def itrs(self, east: Any, north: Any, height: Any) -> np.ndarray:
-        """Return the (..., 3) points in the ITRS, in metres, of coordinates (...), in metres."""
+        """Convert east, north and height (...), in metres, to points (..., 3) in the ITRS, in metres."""
         return _EARTH.ecef(*self.geographic(east, north), height)
 
     def local(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return east, north and height, in metres, (...) each, of points (..., 3) in the ITRS; NaN stays NaN."""
+        """Convert points (..., 3) in the ITRS to east, north and height (...), all in metres; NaN stays NaN."""
         longitude, latitude, height = _EARTH.geodetic(points)
         return *self.plane(longitude, latitude), height
 
@@ -72,13 +72,15 @@ class GroundFrame:
 
 
 _CORRELATION_MARGIN = 4.0
-"""Margin of a correlated field, in correlation lengths, that makes opposite edges independent."""
+"""Margin added to the grid of a correlated random field, in correlation lengths, so that opposite edges are
+independent.
+"""
 
 
 def fractal_field(
     shape: tuple[int, int], spacing: float, exponent: float, longest: float, seed: np.random.SeedSequence
 ) -> np.ndarray:
-    """Draw a field of zero mean and unit rms whose amplitude spectrum falls like frequency^-exponent.
+    """Draw a random field of zero mean and unit RMS whose amplitude spectrum falls as frequency^-exponent.
 
     Parameters
     ----------
@@ -90,14 +92,14 @@ def fractal_field(
         Exponent of the amplitude spectrum: 4 - D for a surface of fractal dimension D, between 1 and 2; mountains have
         about 2.
     longest : float
-        Wavelength above which the spectrum stays level, metres.
+        Wavelength above which the spectrum is constant, metres.
     seed : SeedSequence
         Seed of the noise.
 
     Returns
     -------
     ndarray of float32
-        Field of the shape.
+        Random field of this shape.
     """
     spectrum = _white_spectrum(shape, seed)
     along = fft.rfftfreq(shape[1], spacing) ** 2 + longest**-2.0
@@ -126,7 +128,7 @@ def correlated_field(shape: tuple[int, int], spacing: float, length: float, seed
     Returns
     -------
     ndarray of float32
-        Field of the shape.
+        Random field of this shape.
     """
     spare = int(np.ceil(_CORRELATION_MARGIN * length / spacing))
     larger = (fft.next_fast_len(shape[0] + spare, True), fft.next_fast_len(shape[1] + spare, True))
@@ -151,7 +153,7 @@ def _white_spectrum(shape: tuple[int, int], seed: np.random.SeedSequence) -> np.
 
 
 Beyond = Literal["mirror", "grid-wrap", "nothing"]
-"""Continuation of a spline outside its grid."""
+"""Continuation of a spline outside its grid: mirrored, repeated periodically, or not defined."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -177,7 +179,7 @@ class SplineGrid:
 
     @property
     def reach(self) -> tuple[float, float, float, float]:
-        """Bounds west, east, south, north (metres) of a spline that is not continued beyond its grid."""
+        """Bounds west, east, south and north, in metres, within which a spline without continuation is defined."""
         (rows, columns), (east, north) = self.coefficients.shape, self.first
         # A position needs one B-spline before its cell and two after.
         return (
@@ -232,7 +234,10 @@ class SplineGrid:
         return np.asarray((along @ (across @ self.coefficients).T).T)
 
     def _weights(self, position: np.ndarray, count: int, derivative: int) -> csr_array:
-        """Return the matrix from coefficients along one axis to values at positions in cells, (positions, count)."""
+        """Return the sparse matrix (positions, count) from B-spline coefficients along one axis to values at positions.
+
+        Positions are in grid cells; `derivative` is the order of the derivative, 0 or 1.
+        """
         cell = np.floor(position).astype(np.intp)
         t = (position - cell)[:, None]
         if derivative:
@@ -266,12 +271,12 @@ class SplineGrid:
 
 
 _MOST_POSTS = 4096
-"""Largest number of grid points along a side of a fractal terrain, which repeats beyond."""
+"""Largest number of grid points along a side of a fractal terrain, which is repeated periodically beyond."""
 
 
 @dataclass(frozen=True, eq=False)
 class Terrain:
-    """Heights above the ellipsoid, the same function for renderer, true coordinates and elevation models.
+    """Terrain heights above the ellipsoid, a function used by renderer, true coordinates and elevation models alike.
 
     Attributes
     ----------
@@ -304,7 +309,7 @@ class Terrain:
 
     @classmethod
     def flat(cls, height: float) -> Terrain:
-        """Return level ground of a height, in metres."""
+        """Return level ground of one height above the ellipsoid, in metres."""
         return cls(SplineGrid(np.full((2, 2), float(height)), (1e3, 1e3), (0.0, 0.0), "mirror"))
 
     @classmethod
@@ -320,8 +325,8 @@ class Terrain:
     def real(cls, spec: TerrainSpec) -> Terrain:
         """Return the elevation model of the Jacksboro fault that matplotlib ships, shifted by the offset.
 
-        Its middle lies at minus the offset. Its heights, above the geoid there, are taken as heights about their mean;
-        its grid points, 3 arc seconds apart, keep their distance in metres.
+        The offset is subtracted from the model's plane coordinates. Its heights, which refer to the geoid, are used
+        relative to their mean; its grid points, 3 arc seconds apart, keep their distances in metres.
         """
         posts, spacing = _jacksboro()
         about = posts - posts.mean()
@@ -363,7 +368,7 @@ class Terrain:
 
 @cache
 def _jacksboro() -> tuple[np.ndarray, tuple[float, float]]:
-    """Return heights (rows to the north), in metres, and the distance of grid points east and north, in metres."""
+    """Return the Jacksboro elevation model: heights (rows to the north) and grid spacing (east, north), in metres."""
     # Locate the data without importing matplotlib, which is only needed for figures.
     package = find_spec("matplotlib")
     assert package is not None

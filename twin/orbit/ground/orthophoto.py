@@ -1,12 +1,11 @@
 """Simulated ground and its control data: reflectance, orthophoto of another date, reference elevation model.
 
-Orthophoto and elevation model carry the same error in plan, a constant shift and a smooth part: the ground shown at a
-position of the map lies at that position minus the error.
+Orthophoto and elevation model have a common error in plan, a constant shift and a smooth part: the true position of the
+ground shown at a position of the map is that position minus the error.
 
-The reflectance is drawn: a fractal for wild vegetation, fields in blocks of one direction each, roads. It is stored as
-numbers on a grid of cells and used as their cubic B-spline, whose spectrum falls with sinc^4 of frequency times the
-cells' side: what a camera or an orthophoto samples is defined at every position, and has nothing left near the sampling
-frequencies.
+The reflectance is random: a fractal for wild vegetation, agricultural fields in blocks of one direction each, roads. It
+is a cubic B-spline on a grid of cells, whose spectrum falls with sinc^4 of frequency times the cells' side: it is
+defined at every position, and has no content near the sampling frequencies of cameras and orthophotos.
 """
 
 from __future__ import annotations
@@ -27,25 +26,25 @@ if TYPE_CHECKING:
 
 _DARKEST, _BRIGHTEST = 0.02, 0.85
 _EXPONENT = 1.25
-"""Exponent of the fractal's amplitude spectrum.
+"""Exponent of the amplitude spectrum of the reflectance of wild vegetation, a fractal.
 
 Images of land have power spectra near frequency^-2 to frequency^-3 (Burton and Moorhead, Appl. Opt. 26, 157 (1987):
 natural scenes in general).
 """
 _WILD = 2.5
-"""Longest wavelength of wild vegetation, in units of the mean side of a field."""
+"""Longest wavelength of the reflectance of wild vegetation, in units of the mean side of an agricultural field."""
 _BLOCK = 8.0
-"""Side of a block of fields of one direction, in units of the mean side of a field."""
+"""Side of a block of agricultural fields of one direction, in units of the mean side of a field."""
 _LANE = 0.97
-"""Share of the side of an agricultural field between the lanes that separate fields."""
+"""Share of an agricultural field's side that is cultivated; the rest are lanes between the fields."""
 _ROAD_WIDTH = 8.0
 """Width of a road, in metres."""
 _ROAD_BRIGHTNESS = 1.8
-"""Reflectance of a road relative to the mean."""
+"""Reflectance of a road, relative to the mean reflectance of the ground."""
 _SHIFT_BITS = 4
 """Number of fractional bits of polygon coordinates in OpenCV's drawing functions."""
 _ROWS = 512
-"""Number of rows of the ground's grid processed at a time, to bound memory."""
+"""Number of rows of the ground's grid processed at a time, to limit memory."""
 _SPARE = 4
 """Number of cells by which the drawn ground extends beyond the requested extent."""
 
@@ -65,13 +64,13 @@ class Extent:
         return max(self.east - self.west, self.north - self.south)
 
     def grown(self, by: float) -> Extent:
-        """Return the extent enlarged by a margin on every side, in metres."""
+        """Return the extent enlarged on every side by `by` metres."""
         return Extent(self.west - by, self.east + by, self.south - by, self.north + by)
 
     def axes(self, spacing: float, spare: int = 0) -> tuple[np.ndarray, np.ndarray]:
-        """Return east of the columns and north of the rows of cells that cover it, in metres.
+        """Return the east coordinates of columns and north coordinates of rows of a grid over the extent, in metres.
 
-        They are whole multiples of the spacing; `spare` is the number of additional cells on every side.
+        They are whole multiples of `spacing`, in metres; `spare` is the number of additional cells on every side.
         """
         (west, south), (east, north) = (
             [int(f(v / spacing)) for v in ends]
@@ -93,7 +92,7 @@ def around(extents: Sequence[Extent]) -> Extent:
 
 
 def reflectance(extent: Extent, spec: TextureSpec, seed: np.random.SeedSequence, changed: float = 0.0) -> SplineGrid:
-    """Draw the reflectance over an extent.
+    """Draw a random map of reflectance over an extent of ground.
 
     Parameters
     ----------
@@ -104,7 +103,8 @@ def reflectance(extent: Extent, spec: TextureSpec, seed: np.random.SeedSequence,
     seed : SeedSequence
         Seed of the ground; the same seed and extent give the same ground.
     changed : float
-        Share of the fields that look different from those at 0; which fields, and how, depends on the same seed.
+        Share of the agricultural fields, 0 to 1, whose reflectance differs from that for `changed` = 0; which fields,
+        and how, depends on the same seed.
     """
     wild, plots, mask, ways = (stream(seed, k) for k in range(4))
     east, north = extent.axes(spec.spacing, _SPARE)
@@ -125,10 +125,10 @@ def reflectance(extent: Extent, spec: TextureSpec, seed: np.random.SeedSequence,
 
 
 def apparent(ground: SplineGrid, terrain: Terrain, light: LightSpec) -> SplineGrid:
-    """Return the apparent reflectance: that of level ground without air that looks equally bright from above.
+    """Return the apparent reflectance: that of level ground without atmosphere with the same radiance upward.
 
-    Lambert's law for the Sun on the slopes, uniform light from the sky, a transmission and a constant path radiance.
-    Slopes throw no shadow on others.
+    The model has Lambert's law for the Sun on the slopes, uniform light from the sky, an atmospheric transmission and a
+    constant path radiance. Cast shadows are not modelled.
 
     Parameters
     ----------
@@ -142,8 +142,8 @@ def apparent(ground: SplineGrid, terrain: Terrain, light: LightSpec) -> SplineGr
     Returns
     -------
     SplineGrid
-        Apparent reflectance in the ground's cells. Level ground in a high sun of 90 degrees has its reflectance times
-        the transmission, plus the path's share.
+        Apparent reflectance in the ground's cells. For level ground and the Sun at the zenith it is the reflectance
+        times the transmission, plus the contribution of path radiance.
     """
     rows, columns = ground.coefficients.shape
     east = ground.first[0] + ground.spacing[0] * np.arange(columns)
@@ -167,7 +167,7 @@ def _fields(
     seed: np.random.SeedSequence,
     changed: float,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the fields' brightness, of zero mean and unit rms, and the mask of ground that fields cover."""
+    """Return the brightness of agricultural fields (zero mean, unit RMS) and the mask of ground that they cover."""
     random = np.random.default_rng(seed)
     fields, covered = np.zeros(shape, np.float32), np.zeros(shape, np.uint8)
     block = _BLOCK * spec.parcel_size
@@ -189,9 +189,9 @@ def _fields(
 
 
 def _split(half: float, size: float, random: np.random.Generator) -> Iterator[tuple[float, float, float, float]]:
-    """Yield rectangles of mean area `size`^2 that fill a square of half side `half` about the origin.
+    """Divide a square about the origin into random rectangles of mean area `size`^2, agricultural fields.
 
-    Each is west, east, south and north, in metres.
+    The square has the half side `half`; each rectangle is given as west, east, south and north, in metres.
     """
     waiting = [(-half, half, -half, half)]
     while waiting:
@@ -212,7 +212,7 @@ def _split(half: float, size: float, random: np.random.Generator) -> Iterator[tu
 def _draw_roads(
     level: np.ndarray, extent: Extent, spec: TextureSpec, first: tuple[float, float], seed: np.random.SeedSequence
 ) -> None:
-    """Draw winding roads across the whole ground in both directions, one per `roads` metres (key of the texture)."""
+    """Draw winding roads in both directions into a map, at mean distances given by the texture's key `roads`."""
     random = np.random.default_rng(seed)
     value = float(min(_ROAD_BRIGHTNESS * spec.mean, _BRIGHTEST))
     step = 0.1 * spec.roads
@@ -236,11 +236,11 @@ def _draw_roads(
 SCALE = 10_000.0
 """Grey value of an orthophoto for an apparent reflectance of 1."""
 _PER_LENGTH = 8.0
-"""Number of grid cells, per correlation length, of the maps' smooth error in plan."""
+"""Number of grid cells per correlation length for the smooth error in plan of the maps."""
 _ROWS_AT_ONCE = 256
-"""Number of rows of a map sampled at a time, to bound memory."""
+"""Number of rows of a map sampled at a time, to limit memory."""
 _MARGIN = 50.0
-"""Margin about the true ground of the grid of the maps' smooth error in plan, in metres."""
+"""Margin, beyond the true ground, of the grid on which the smooth error in plan of the maps is drawn, in metres."""
 
 
 class Map(Protocol):
@@ -308,7 +308,7 @@ class Raster:
 
     @property
     def valid(self) -> None:
-        """None: every value is valid."""
+        """Mask of valid values, always None: every value is valid."""
 
     def east_north(self, row: np.ndarray, column: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return east and north, in metres, at real-valued rows and columns, which are broadcast together."""
@@ -321,7 +321,7 @@ class Raster:
 
 @dataclass(frozen=True, eq=False)
 class Control(Maps[Raster]):
-    """Maps of a simulated patch, with their errors.
+    """Orthophoto and elevation model of a simulated patch of ground, with their true errors in plan.
 
     Attributes
     ----------
@@ -374,7 +374,7 @@ def make_control(
     full = apparent(reflectance(extent, texture, ground, spec.changed), terrain, spec.light)
 
     def sampled(ground: Callable[..., np.ndarray], spacing: float) -> Raster:
-        """Sample the ground at map positions displaced by the error in plan, rows from the north."""
+        """Sample the ground at the true positions of a map's grid points, rows from the north."""
         east, north = inside.axes(spacing)
         values = np.empty((len(north), len(east)), np.float32)
         for first in range(0, len(north), _ROWS_AT_ONCE):

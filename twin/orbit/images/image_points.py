@@ -5,10 +5,10 @@ of the nadir line's frame. Their templates are brought into each line's geometry
 matches that do not follow one smooth displacement per patch and line are rejected. The input is frames with the
 measured sensors, and a map with heights: a simulated patch, or a user's images with orthophoto and elevation model.
 
-A template's samples are the pixels about the predicted position of its point, which is not a whole pixel. Each sample
-is followed by the measured sensor to the reference heights: over so few pixels the mapping to the ground is affine in
-row and column and linear in height, to a millimetre. Errors of the measured sensor move the whole template and are left
-to the search.
+A template's samples are the pixels about the predicted position of its point, which is not a whole pixel. The sensor as
+the user knows it projects each sample to the reference heights: over so few pixels the mapping to the ground is affine
+in row and column and linear in height, to a millimetre. Errors of this sensor displace the whole template and are found
+by the search.
 """
 
 from __future__ import annotations
@@ -36,16 +36,16 @@ if TYPE_CHECKING:
     from scenes.specs.orbit.scene import ImagePointsSpec
 
 UNMODELLED_SIGMA = 0.1
-"""Standard deviation, in pixels, added to the matching's own for errors that no fit shows.
+"""Standard deviation, in pixels, added to that of a match for errors that its fit cannot show.
 
-Such errors are another season's light (RMS of matches 0.11 px where 0.06 is predicted) and the attitude between its
-readings. A tie point has this sigma alone in the frame in which it was chosen.
+Such errors are due to illumination in another season (RMS error of matches 0.11 px where 0.06 px is predicted) and to
+attitude changes between readings. A tie point has only this sigma in the frame in which it was chosen.
 """
 
 
 @dataclass(frozen=True, eq=False)
 class LineFrame:
-    """Image of a line with the sensor by which the user knows it.
+    """Image of a line camera with its sensor model as the user knows it.
 
     Attributes
     ----------
@@ -56,7 +56,7 @@ class LineFrame:
     measured : Sensor
         The line as the user knows it, on the measured trajectory.
     sample : tuple of float
-        Ground distance of two pixels along the line, and of two lines, in the window's middle, metres.
+        Ground distance of neighbouring pixels, and of neighbouring lines, in the window's middle, metres.
     """
 
     frame: np.ndarray
@@ -89,17 +89,17 @@ class ImagedGround:
 
 
 SOFTENING = 0.4
-"""Rms of the Gaussian low pass of an orthophoto, relative to the pixel distance of the image.
+"""RMS radius of the Gaussian low-pass filter of an orthophoto, in units of the pixel distance of the image.
 
-It stands for what pixel, lens and motion of the line add to an orthophoto that is sharp itself; the matching solves for
-the rest.
+It models the blur of pixel, lens and motion of the line, which a sharp orthophoto does not have; the matching estimates
+the remaining blur.
 """
 _STEP = 50.0
-"""Height interval over which the mapping to the ground is taken as linear, in metres."""
+"""Height interval over which the mapping from image to ground is treated as linear, in metres."""
 _FOLLOWED = 8
-"""Number of iterations in which a look's height above the ground is found.
+"""Number of iterations that intersect a line of sight with the terrain.
 
-Each reduces the error by a factor of 0.2 or less: the terrain's slope times the tangent of the look's angle from the
+Each multiplies the error by 0.2 or less, the terrain's slope times the tangent of the line of sight's angle from the
 vertical.
 """
 
@@ -174,8 +174,8 @@ def _ground_of_samples(
     heights : ReferenceHeights
         Heights of the ground.
     points : (n, 3) ndarray
-        Ground points of the templates' middles by the measured sensor, ITRS, metres. Their height is kept, and
-        reference heights are counted relative to those at the points.
+        Ground points of the templates' middles according to the measured sensor, ITRS, metres. Their height is used,
+        and reference heights enter only as differences from those at the points.
     place : (n, 2) ndarray
         Rows and columns in the frame.
     side : int
@@ -209,9 +209,9 @@ def _templates_of_map(photo: Map, samples: tuple[np.ndarray, np.ndarray, np.ndar
     Parameters
     ----------
     photo : Map
-        Orthophoto from which they are sampled.
+        Orthophoto from which the templates are sampled.
     samples : tuple of ndarray
-        Ground of the templates' pixels from `_ground_of_samples`.
+        East, north and height of the ground under the templates' pixels, from `_ground_of_samples`.
     sample : float
         Ground distance of the image's pixels, metres.
     """
@@ -231,11 +231,11 @@ def _templates_of_image(
     Parameters
     ----------
     source : LineFrame
-        Image from which they are sampled.
+        Image from which the templates are sampled.
     frame : GroundFrame
         Coordinates of the ground.
     samples : tuple of ndarray
-        Ground of the templates' pixels from `_ground_of_samples`.
+        East, north and height of the ground under the templates' pixels, from `_ground_of_samples`.
     points : (n, 3) ndarray
         Ground points of the templates' middles, ITRS, metres.
     place : (n, 2) ndarray
@@ -253,20 +253,22 @@ def _templates_of_image(
 
 
 CONSENSUS = 100
-"""Status of a match that its neighbours contradict; others are codes of `analysis.matching.correlation.Reason`."""
+"""Status of a match whose displacement contradicts those of its neighbours; other codes are those of
+`analysis.matching.correlation.Reason`.
+"""
 SOURCE = 101
-"""Status of a tie point in the frame in which it was chosen, where its position is its definition."""
+"""Status of a tie point in the frame in which it was chosen, where its position is exact by definition."""
 _MASK = 16
 """Step, in pixels of the orthophoto, of the grid on which it is tested whether every line sees the ground."""
 _GROUND_TURNS = 12
-"""Number of iterations in which the point where a look meets the ground is found."""
+"""Number of iterations that intersect a line of sight with the ground."""
 _RISE = 10.0
-"""Height difference over which the displacement due to height is taken as linear, in metres."""
+"""Height difference over which the image displacement due to height is treated as linear, in metres."""
 Kind = Literal["map", "tie"]
 
 
 POINTS_REMEDY = "a larger patch, a smaller reach or template, or more points"
-"""Remedy that messages of a PointsError give to the user."""
+"""Advice to the user at the end of messages of a PointsError."""
 
 
 class PointsError(PhysicalError, ValueError):
@@ -280,21 +282,21 @@ class MatchedLine:
     Attributes
     ----------
     predicted : (n, 2) ndarray for n points
-        Row and column in the frame of the points by the measured sensor.
+        Row and column of the points in the frame, predicted by the measured sensor.
     place : (n, 2) ndarray
-        Row and column measured; NaN where matching gave none.
+        Measured row and column; NaN where matching failed.
     covariance : (n, 2, 2) ndarray
         Covariance of the measured positions, px^2.
     correlation : (n,) ndarray
-        Correlation of image and fitted template.
+        Correlation coefficient of image and fitted template.
     status : (n,) ndarray of int
-        0 for accepted, `CONSENSUS`, `SOURCE`, or the reason of a failed match.
+        0 for an accepted match, `CONSENSUS`, `SOURCE`, or the reason of a failed match.
     first : tuple of int
         Line and pixel of the frame's first pixel in the whole image.
     scatter : float
-        Scatter of the displacements about the smooth one beyond their covariances, px.
+        Scatter of the displacements about the smooth displacement field in excess of their covariances, px.
     text : str
-        Result of the consensus in words.
+        Result of the comparison of matches with their neighbours, in words.
     displacement_field : DisplacementField or None
         Smooth displacement from predicted to measured; None in the frame in which tie points were chosen.
     """
@@ -311,12 +313,12 @@ class MatchedLine:
 
     @property
     def accepted(self) -> np.ndarray:
-        """Mask of those of n points that are matched and not contradicted, or chosen in this frame, (n,) bool."""
+        """Mask (n,) of the n points that are matched and consistent with neighbours, or chosen in this frame."""
         return np.asarray((self.status == 0) | (self.status == SOURCE))
 
     @property
     def matched(self) -> np.ndarray:
-        """Mask of those of n points that matching accepted, before the comparison with neighbours, (n,) bool."""
+        """Mask of the n points that matching accepted, before the comparison with neighbours, (n,) bool."""
         return np.asarray((self.status == 0) | (self.status == CONSENSUS))
 
     @property
@@ -335,14 +337,14 @@ class MatchedLine:
         return np.asarray(np.median(np.sqrt(np.diagonal(self.covariance[self.accepted], axis1=1, axis2=2)), axis=0))
 
     def measured(self, rows: np.ndarray, point: np.ndarray) -> ImagePoints:
-        """Return the image points that a mask or index selects, with `UNMODELLED_SIGMA` in their covariances.
+        """Return selected image points, with `UNMODELLED_SIGMA` included in their covariances.
 
         Parameters
         ----------
         rows : ndarray
             Mask or index of the points.
         point : ndarray of int
-            Index of the ground point of each.
+            Index of the ground point of each selected point.
         """
         image, spread = self.image[rows], self.covariance[rows] + UNMODELLED_SIGMA**2 * np.eye(2)
         return ImagePoints.of(point, image[:, 0], image[:, 1], spread)
@@ -369,8 +371,8 @@ class MatchedPoints:
     kind : Kind
         "map" for points of the orthophoto, "tie" for tie points.
     east, north, height : (n,) ndarray
-        Coordinates in the map, metres; for tie points, where the nadir line's measured sensor meets the reference
-        heights.
+        Coordinates in the map, metres; for tie points, the intersection of the nadir line's measured line of sight with
+        the reference heights.
     ground : (n, 3) ndarray for n points
         The same points in the ITRS, metres.
     check : (n,) ndarray of bool
@@ -412,7 +414,7 @@ class PatchPoints:
 
     @property
     def sorts(self) -> Mapping[str, MatchedPoints]:
-        """Measured points by kind: ``control`` (with the check points) and ``tie``, where present."""
+        """Measured points by kind, ``control`` (which includes the check points) and ``tie``, as far as present."""
         both = {"control": self.control, "tie": self.ties}
         return {name: points for name, points in both.items() if points is not None}
 
@@ -423,7 +425,7 @@ def measure_points(patch: ImagedGround, spec: ImagePointsSpec) -> PatchPoints:
     Raises
     ------
     PointsError
-        The images are too small, nothing in them is distinct, or there are too few matches.
+        The images are too small or have no distinct points, or there are too few matches.
     """
     if spec.tie and len(patch.images) < 2:
         raise PointsError("tie points need two lines")
@@ -439,13 +441,13 @@ def status_text(code: int) -> str:
 
 
 def map_points(patch: ImagedGround, spec: ImagePointsSpec) -> MatchedPoints:
-    """Measure control and check points.
+    """Measure control and check points, distinct points of the orthophoto, in the images of a patch.
 
     Raises
     ------
     PointsError
-        A frame is too small for template and search range, nothing distinct is seen by every line, or there are too few
-        matches.
+        A frame is too small for template and search range, there are no distinct points that every line sees, or there
+        are too few matches.
     """
     border = spec.template // 2 + spec.reach
     _require_room(patch, spec)
@@ -470,7 +472,7 @@ def map_points(patch: ImagedGround, spec: ImagePointsSpec) -> MatchedPoints:
 def tie_points(
     patch: ImagedGround, spec: ImagePointsSpec, control: MatchedPoints | None = None, source: str = "nadir"
 ) -> MatchedPoints:
-    """Measure points of one line's frame in the other lines.
+    """Measure tie points, distinct points of one line's image, in the images of the other lines.
 
     Parameters
     ----------
@@ -479,16 +481,16 @@ def tie_points(
     spec : ImagePointsSpec
         Number of points and options of the matching.
     control : MatchedPoints or None
-        Control points of the patch; their displacement is taken out of the prediction. Without them the reference
-        heights are read where the measured sensor looks, some 100 m off.
+        Control points of the patch, whose displacements correct the prediction. Without them, the reference heights are
+        taken at the ground position according to the measured sensor, which is some 100 m wrong.
     source : str
         Name of the line in which the points are chosen.
 
     Raises
     ------
     PointsError
-        A frame is too small for template and search range, nothing distinct is seen by every line, or there are too few
-        matches.
+        A frame is too small for template and search range, there are no distinct points that every line sees, or there
+        are too few matches.
     """
     border = spec.template // 2 + spec.reach
     _require_room(patch, spec)
@@ -530,7 +532,7 @@ def tie_points(
 
 
 def _require_room(patch: ImagedGround, spec: ImagePointsSpec) -> None:
-    """Raise PointsError if a frame is too small for template and search range."""
+    """Raise PointsError if an image is too small for template and search range."""
     least = 2 * (spec.template // 2 + spec.reach) + 1
     for name, image in patch.images.items():
         if min(image.frame.shape) <= least:
@@ -544,7 +546,7 @@ def _require_room(patch: ImagedGround, spec: ImagePointsSpec) -> None:
 def _distinct_map(
     patch: ImagedGround, heights: ReferenceHeights, count: int, border: int, spec: ImagePointsSpec
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return east and north of distinct points of the orthophoto that every line sees within its border."""
+    """Return east and north, in metres, of distinct points of the orthophoto that lie inside every line's image."""
     photo = patch.control.orthophoto
     sides = [np.arange(0, n, _MASK) for n in photo.values.shape]
     row, column = np.meshgrid(*sides, indexing="ij")
@@ -576,10 +578,10 @@ def _distinct_map(
 def _ground_of_looks(
     patch: ImagedGround, image: LineFrame, heights: ReferenceHeights, place: np.ndarray, known: MatchedLine | None
 ) -> np.ndarray:
-    """Return where the measured sensor's looks of n points meet the reference heights, ITRS, (n, 3), in metres.
+    """Intersect the measured sensor's lines of sight of n points with the reference heights, (n, 3), ITRS, in m.
 
-    They are NaN beyond the reference heights. `known` are matches from which the displacement of the measured sensor is
-    taken.
+    Points outside the reference elevation model are NaN. `known` are matches whose displacements correct the measured
+    sensor; None for no correction.
     """
     height = np.full(len(place), heights.mean)
     at = place
@@ -594,7 +596,7 @@ def _ground_of_looks(
 
 
 def _rise(patch: ImagedGround, image: LineFrame, ground: np.ndarray, at: np.ndarray) -> np.ndarray:
-    """Return the image displacement of n points for a metre of height, (n, 2), in lines and pixels."""
+    """Return the image displacement of n points per metre of height, (n, 2), in lines/m and pixels/m."""
     east, north, height = patch.frame.local(ground)
     return (predicted(image, patch.frame.itrs(east, north, height + _RISE)) - at) / _RISE
 
@@ -645,7 +647,7 @@ def _matched(
 
 
 def _degree(count: int) -> int | None:
-    """Return the degree of the smooth displacement for a number of matches, at least four per term.
+    """Return the polynomial degree of the smooth displacement field that has at least four matches per term.
 
     It is None for too few matches.
     """

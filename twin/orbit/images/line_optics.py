@@ -1,18 +1,18 @@
 """Image formation of a line: transfer function of optics and detector, motion of the image, and jitter.
 
 Frequencies are in cycles per pixel along the line and in cycles per line along the track. While the image of a point
-crosses the line it moves by `advance` pixels from one line to the next, less than one where the lens looks obliquely,
-and by `drift` pixels along it. With the pixel pitch p and the focal plane's transfer function T(fx, fy) (cycles/m along
-the line and along the track), an image sampled at lines and pixels thus has the transfer function H of the frequencies
-`pixel` (cycles/pixel) and `line` (cycles/line)
+crosses the line, it moves per line time by `advance` pixels across the line, less than one for an oblique line of
+sight, and by `drift` pixels along the line. With the pixel pitch p and the focal plane's transfer function T(fx, fy)
+(cycles/m along the line and along the track), an image sampled at lines and pixels thus has the transfer function H of
+the frequencies `pixel` (cycles/pixel) and `line` (cycles/line)
 
     H(pixel, line) = T(pixel/p, -(line + drift pixel)/(advance p)) x smear(line).
 
-The charge of a pixel follows the mean motion of the image. A pixel thus sees, all the while that its light is
-collected, the position of its line, moved by the jitter of each moment. The mean position is that of the line's sensor
-with the jitter averaged over the collection; the image itself is the mean of images at the nodes of a Gaussian rule. So
-every line is displaced and blurred by its own jitter, from slow oscillations to those that are faster than the
-collection.
+The charge of a pixel follows the mean motion of the image (TDI). During the whole exposure, a pixel thus sees the
+ground position of its line, displaced by the jitter of each moment. The mean position is that of the line's sensor with
+the jitter averaged over the exposure; the image itself is the mean of images at the nodes of a Gaussian quadrature over
+the exposure. Every line is thus displaced and blurred by its own jitter, from slow oscillations to those that are
+faster than the exposure.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ if TYPE_CHECKING:
 def optics_of(
     camera: ThreeLineCameraSpec, lines: tuple[str, ...], line_time: float, detectors: Mapping[str, DetectorSpec]
 ) -> dict[str, LineOptics]:
-    """Return lens and CCD of each line; lines of the same design share them.
+    """Return the lens and CCD of each line; lines of the same design share the same object.
 
     Raises
     ------
@@ -73,7 +73,7 @@ SUN_RADIUS = 6.957e8
 """Nominal radius of the Sun, in metres (IAU 2015 Resolution B3)."""
 
 _TAPER = 0.75
-"""Share of the margin from which the point spread function is faded out to zero at the margin's end."""
+"""Fraction of the margin, from the centre, at which the point spread function starts to be tapered to zero."""
 
 
 @dataclass(frozen=True)
@@ -93,10 +93,10 @@ class ImageMotion:
 
     @classmethod
     def of(cls, sensor: Sensor, line: float, pixel: float, height: float) -> ImageMotion:
-        """Return the motion at a position of an image, for ground of a height in metres.
+        """Return the image motion at a line and pixel of an image, for ground of a height in metres.
 
-        It is the change of direction of one ground point from before to after its line. Effects on the light shift both
-        alike and change the motion by less than 1e-5 of it.
+        It is computed from the directions of one ground point before and after the exposure of its line. Effects on the
+        light (light time, aberration, refraction) shift both equally and change the motion by less than 1e-5 of it.
         """
         camera, step = sensor.camera, min(1.0, 0.5 * sensor.lines - 0.5)
         middle = float(np.clip(line, step - 0.5, sensor.lines - 0.5 - step))
@@ -123,7 +123,7 @@ class LineOptics:
     ccd : LineCcd
         Line CCD.
     pupil : PupilFunction
-        Pupil of the lens, the same all over the line.
+        Pupil of the lens, the same for all pixels.
     f_number : float
         F-number of the lens.
     transmission : float
@@ -185,10 +185,21 @@ class LineOptics:
         return band * solid_angle * self.transmission * pitch**2 * seconds
 
     def transfer(self, pixel: np.ndarray, line: np.ndarray, motion: ImageMotion) -> np.ndarray:
-        """Return the transfer function at frequencies along the line, cycles/pixel, and along the track, cycles/line.
+        """Return the optical transfer function at frequencies along the line and along the track.
 
-        The shapes broadcast. The function is real, since the pupil is even, unless the pupil is obstructed; a point is
-        imaged at the centroid of its image.
+        Parameters
+        ----------
+        pixel : ndarray
+            Frequencies along the line, in cycles per pixel.
+        line : ndarray
+            Frequencies along the track, in cycles per line, broadcast with `pixel`.
+        motion : ImageMotion
+            Motion of the image over the line.
+
+        Notes
+        -----
+        The function is real for an unobstructed pupil, because the pupil is even; it refers to the centroid of the
+        image of a point.
         """
         out: np.ndarray = np.ones(np.broadcast_shapes(np.shape(pixel), np.shape(line)))
         for factor in self.factors(pixel, line, motion).values():
@@ -198,9 +209,10 @@ class LineOptics:
     def factors(self, pixel: np.ndarray, line: np.ndarray, motion: ImageMotion) -> dict[str, np.ndarray]:
         """Return the factors of the transfer function, by name, at frequencies in cycles per pixel and per line.
 
-        They are ``lens``, ``pixel``, ``diffusion``, ``step`` (the image moves on while the charge rests) and ``stages``
-        (image and charge drift apart over the TDI stages, due to the error of the charge's rate and because the image
-        does not advance by a pixel in a line's time).
+        They are ``lens``, ``pixel`` (aperture), ``diffusion`` (of charge), ``step`` (smear by the image motion between
+        two transfers of the charge) and ``stages`` (smear by the mismatch of image and charge motion over the TDI
+        stages, due to the error of the charge's rate and because the image does not advance by exactly a pixel per line
+        time).
         """
         band = self.ccd.band
         fx = pixel / band.pitch
@@ -217,10 +229,11 @@ class LineOptics:
         }
 
     def kernel(self, oversampling: int, margin: int, motion: ImageMotion) -> np.ndarray:
-        """Return the point spread function on `oversampling` samples per line and pixel, float64, of unit sum.
+        """Return the point spread function with `oversampling` samples per line and per pixel, of unit sum.
 
-        It is zero from `margin` pixels and lines on, faded out before: so an image does not depend on how it is cut
-        into parts. The diffraction pattern farther out (0.3% at F/6 and 24 pixels) is omitted.
+        It is tapered to zero at `margin` pixels and lines from its centre, so that an image does not depend on how its
+        computation is divided into parts. The energy of the diffraction pattern farther out (0.3 % at F/6 and 24
+        pixels) is neglected.
 
         Returns
         -------
@@ -253,7 +266,7 @@ class LineOptics:
 
 
 def _shadow(outlines: tuple[tuple[tuple[float, float], ...], ...], harmonics: np.ndarray) -> PupilShadow:
-    """Return the shadow of obstructing outlines, given as polygons in units of the pupil's radius, on one pupil."""
+    """Return the obstruction of a pupil by outlines, given as polygons in units of the pupil's radius."""
     shapes = [np.array(outline, float)[None] for outline in outlines]
     pieces, _ = separate([s if area(s)[0] > 0.0 else s[:, ::-1] for s in shapes])
     return PupilShadow.within(pieces, harmonics[:, None])
@@ -275,14 +288,14 @@ def _eikonal(terms: dict[int, float]) -> np.ndarray | None:
 
 
 def _mean_of_steps(cycles: np.ndarray, count: int) -> np.ndarray:
-    """Return the mean of exp(2 pi i k cycles) over `count` equally spaced values of k, centred on 0."""
+    """Return the mean of exp(2 pi i k cycles) over `count` values of k in unit steps, centred on 0."""
     near = np.sinc(cycles)
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.where(np.abs(near) < 1e-9, 1.0, np.sinc(count * cycles) / near)
 
 
 JITTER_TOLERANCE = 1e-3
-"""Tolerance of position and smear of an image averaged over moments of the jitter, in pixels."""
+"""Tolerance of the position and smear of an image that is averaged over moments of the jitter, in pixels."""
 
 
 def _jitter(sensor: Sensor) -> Jitter | None:
@@ -298,12 +311,12 @@ def _with(sensor: Sensor, jitter: Jitter | None) -> Sensor:
 
 
 def _collection(sensor: Sensor, optics: LineOptics) -> Collection:
-    """Return the light collection of a TDI line: when and how long its stages collect light."""
+    """Return the light collection of a TDI line: times and durations for which its stages collect light."""
     return Collection.of(optics.ccd.band.tdi, sensor.line_time)
 
 
 def with_mean_jitter(sensor: Sensor, optics: LineOptics) -> Sensor:
-    """Return the sensor of a line's image, with jitter averaged over the collection of light."""
+    """Return the sensor with its jitter averaged over the exposure, which gives the mean positions of an image."""
     jitter = _jitter(sensor)
     return sensor if jitter is None else _with(sensor, jitter.over(_collection(sensor, optics)))
 
@@ -314,12 +327,12 @@ def without_jitter(sensor: Sensor) -> Sensor:
 
 
 def exposures(sensor: Sensor, optics: LineOptics) -> list[tuple[float, Sensor]]:
-    """Return the moments of a pixel's light collection: the sensor at each, with its share of the light (sum 1).
+    """Return the moments of a pixel's exposure: the share of the light (sum 1) and the sensor at each.
 
     Raises
     ------
     ValueError
-        The jitter is too fast and too large.
+        The jitter is so fast and large that too many moments would be necessary.
     """
     jitter = _jitter(sensor)
     if jitter is None:

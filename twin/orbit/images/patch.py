@@ -1,9 +1,10 @@
 """Images of one patch of ground by the lines of a camera, with control data, and comparison with the truth.
 
-    lines = imaged_lines(sensors, measured, optics, seed) patch = fly_patch(lines, place, (600, 600), ground, control,
-    seed) patch.images["nadir"].frame          # uint16, grey values of the detector
+    lines = imaged_lines(sensors, measured, optics, seed)
+    patch = fly_patch(lines, place, (600, 600), ground, control, seed)
+    patch.images["nadir"].frame                         # uint16, grey values of the detector
     patch.images["nadir"].image_point(row, column)      # line and pixel of the whole image
-    patch.images["nadir"].measured       # Sensor: the laboratory's camera on the measured trajectory
+    patch.images["nadir"].measured                      # Sensor: the laboratory's camera on the measured trajectory
     patch.control.orthophoto, patch.control.dem
 
 An analysis may use `frame`, `window`, `measured` and the control's rasters. `sensor`, `terrain`, the control's errors
@@ -38,9 +39,9 @@ if TYPE_CHECKING:
     from scenes.yaml.errors import KeyPath
 
 LARGEST_GROUND = 40_000.0
-"""Largest side of the ground of one patch, in metres; against input that asks for more than the memory holds."""
+"""Largest accepted side of the ground of one patch, in metres, so that no input exceeds the memory."""
 _PIXEL, _SAMPLE = 150.0, 47.0
-"""Memory per pixel of the image of a line, and per sample of the ground's texture, in bytes."""
+"""Memory per pixel of a line's image, and per sample of the ground's texture, in bytes."""
 
 
 class PatchError(PhysicalError, ValueError):
@@ -51,7 +52,7 @@ class PatchError(PhysicalError, ValueError):
     part
         Part of the input that must change: ``span`` of the pass, ``place``, ``size`` or ``terrain``.
     line
-        Name of the line that cannot image the patch; empty where it is not one line's fault.
+        Name of the line that cannot image the patch; empty where the cause is not a single line.
     """
 
     def __init__(self, problem: str, part: str, line: str = "") -> None:
@@ -61,7 +62,7 @@ class PatchError(PhysicalError, ValueError):
 
 @dataclass(frozen=True, eq=False)
 class ImagedLine:
-    """Line that records images.
+    """Line camera that records images, with its true and its known geometry.
 
     Attributes
     ----------
@@ -72,7 +73,7 @@ class ImagedLine:
     optics : LineOptics
         Lens and CCD.
     pattern : FixedPattern
-        Fixed pattern of its pixels.
+        Fixed-pattern noise of its pixels.
     """
 
     sensor: Sensor
@@ -92,7 +93,8 @@ class LineImage(LineFrame):
     motion : ImageMotion
         Motion of the image over the line, in the window's middle.
     nyquist : tuple of float
-        Modulation transfer at half a cycle per pixel, and per line.
+        Modulation transfer at the Nyquist frequencies: half a cycle per pixel along the line, and half a cycle per line
+        along the track.
     saturated : int
         Number of saturated pixels.
     error : float
@@ -151,7 +153,7 @@ def fly_patch(
 ) -> Patch:
     """Image a patch of ground with every line.
 
-    Each line's window of the same size has the patch's middle in its middle, to half a pixel.
+    The windows of all lines have the same size and are centred on the patch's middle to half a pixel.
 
     Parameters
     ----------
@@ -170,7 +172,7 @@ def fly_patch(
     oversampling : int
         Number of ground samples along each side of a pixel.
     advance : callable
-        Callback that receives the number of lines whose images are made.
+        Callback that receives the number of lines whose images are finished.
 
     Raises
     ------
@@ -208,7 +210,7 @@ def fly_patch(
 
 
 class _Size:
-    """Size of a patch, reported in errors as the input whose file is not known here."""
+    """Source of error messages about the size of a patch, for callers that know no input file."""
 
     def error(self, problem: str, key: KeyPath, *, found: object, allowed: str) -> PatchError:
         return PatchError(f"{problem}; {found} lines or pixels, allowed: {allowed}", "size")
@@ -232,7 +234,7 @@ def imaged_lines(
     optics: Mapping[str, LineOptics],
     seed: np.random.SeedSequence,
 ) -> dict[str, ImagedLine]:
-    """Return lines that record images.
+    """Combine sensors and optics to line cameras that record images, by name.
 
     Parameters
     ----------
@@ -243,7 +245,7 @@ def imaged_lines(
     optics : mapping of str to LineOptics
         Lens and CCD.
     seed : SeedSequence
-        Seed of the fixed pattern, which stays the same in all images of the line.
+        Seed of the fixed-pattern noise, which is the same in all images of a line.
     """
     return {
         name: ImagedLine(
@@ -337,9 +339,12 @@ def _recorded(
 
 
 WRONG_PIXELS, WRONG_SIGMAS, WRONG_FLOOR = 3.0, 5.0, 1.0
-"""Limits of the error of a right match: 3 pixels, and 5 of its sigmas plus 1 pixel."""
+"""Limits of the error of a match, above which it counts as wrong.
+
+They are a limit in pixels, and another in sigmas of the match, to which the third number, in pixels, is added.
+"""
 WRONG = f"more than {WRONG_PIXELS:g} px off, or more than {WRONG_SIGMAS:g} sigmas and {WRONG_FLOOR:g} px"
-"""Definition of a wrong match, as a text for reports."""
+"""Text for reports that defines a wrong match."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -349,11 +354,12 @@ class LineComparison:
     Attributes
     ----------
     found, matched, accepted : int
-        Number of measured positions, before any is rejected, after matching and after consensus.
+        Number of positions that were measured, that matching accepted, and that also agree with their neighbours
+        (consensus).
     wrong_found, wrong_matched, wrong_accepted : int
-        Number of wrong ones among these.
+        Number of wrong positions (see `WRONG`) among each of these.
     right_rejected_by_consensus : int
-        Number of right matches that consensus has rejected.
+        Number of right positions that were rejected because they disagree with their neighbours.
     error : (n, 2) ndarray for n points
         Measured minus true, lines and pixels; NaN without a measurement.
     wrong : (n,) ndarray of bool
@@ -391,8 +397,8 @@ class LineComparison:
 def true_ground(patch: Patch, points: MatchedPoints) -> np.ndarray:
     """Return the true ground points that the measured points show, ITRS, (n, 3) for n points, in metres.
 
-    The ground shown at a position of a map lies at that position minus its error; a tie point is what its source's
-    pixel truly sees.
+    The ground shown at a position of a map lies at that position minus the map's error in plan; a tie point is the
+    ground that the pixel of the frame in which it was chosen truly sees.
     """
     if points.kind == "map":
         east, north = patch.control.error(points.east, points.north)

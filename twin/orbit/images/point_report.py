@@ -23,9 +23,9 @@ from twin.orbit.images.simulate_run import COMPARED, MATCHED
 
 
 def pixel_axes(axes: Axes) -> None:
-    """Name the axes of a shown image, and label them sparsely with whole numbers of pixels and lines.
+    """Label the axes of an image in a figure with a few whole numbers of pixels and lines.
 
-    Limits must be set before.
+    The limits of the axes must be set before.
     """
     axes.set(xlabel="pixel", ylabel="line")
     axes.ticklabel_format(useOffset=False)
@@ -57,12 +57,12 @@ HEADS = (
     "accepted",
     "status",
 )
-"""Column heads of the listing of points."""
+"""Column headings of the listing of measured points."""
 
 
 @dataclass(frozen=True, eq=False)
 class PointListing(Data):
-    """Listing of measured points, a row for each point and line under `HEADS`, saved as CSV and named in the report."""
+    """CSV file of measured points, one row per point and line with the columns of `HEADS`, linked in the report."""
 
     kind: ClassVar[str] = "csv"
 
@@ -95,7 +95,7 @@ T = TypeVar("T")
 _DPI = 110
 """Resolution of the figures, in dots per inch."""
 SORTS = {"control": "orthophoto", "tie": "tie"}
-"""Names of the kinds of points for readers."""
+"""Names in reports of the kinds of points, by key."""
 
 
 def how_measured(spec: ImagePointsSpec, known: str) -> str:
@@ -106,7 +106,7 @@ def how_measured(spec: ImagePointsSpec, known: str) -> str:
     spec : ImagePointsSpec
         Options of the measurement.
     known : str
-        Sensor that brings the points into each line's geometry.
+        Description of the sensor that predicts the points' positions in each line's image.
     """
     return (
         "Distinct points of the orthophoto, with heights of the elevation model, and distinct points of one line's "
@@ -123,7 +123,7 @@ def points_section(patch: Patch, points: PatchPoints, spec: ImagePointsSpec) -> 
 
 
 def point_artefacts(patch: ImagedGround, points: PatchPoints, *tables: Table) -> tuple[Artefact, ...]:
-    """Return tables, figures, reasons of losses, and the listing of points measured in images of ground."""
+    """Return the report's parts on measured points: tables, figures, reasons of rejections, and listing."""
     figures = [
         PngFigure(
             f"points-{sort}",
@@ -140,7 +140,7 @@ def point_artefacts(patch: ImagedGround, points: PatchPoints, *tables: Table) ->
 
 
 def flat(points: PatchPoints, below: Callable[[MatchedPoints], Mapping[str, T]]) -> dict[str, T]:
-    """Return results of points by kind and line under one name for both, such as "tie, forward"."""
+    """Return results by kind of point and line in one mapping, with names such as "tie, forward"."""
     groups = ((sort, below(group)) for sort, group in points.sorts.items())
     return {f"{SORTS[sort]}, {name}": line for sort, lines in groups for name, line in lines.items()}
 
@@ -229,6 +229,6 @@ def _panel(axes: Axes, name: str, image: LineFrame, points: MatchedPoints) -> No
 
 
 def _round(value: float) -> float:
-    """Return the largest number of the form 1, 2 or 5 times a power of ten that is not above the value."""
+    """Round a value down to 1, 2 or 5 times a power of ten."""
     power = 10.0 ** np.floor(np.log10(value))
     return float(power * max(k for k in (1.0, 2.0, 5.0) if k * power <= value * (1.0 + 1e-9)))

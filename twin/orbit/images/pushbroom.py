@@ -1,12 +1,12 @@
-"""Pushbroom images: the ground point that every pixel sees, and its light.
+"""Rendering of pushbroom images: ground points that pixels see, and the expected photons of each pixel.
 
-The rigorous sensor is evaluated at Chebyshev nodes over lines, pixels and heights; between them east and north are
-analytic, and as many nodes are taken as keep the interpolation below a tolerance that is measured. The intersection
-with the terrain follows from the look's east and north over height, by secant steps between bounds.
+The rigorous sensor is evaluated at Chebyshev nodes over lines, pixels and heights. Between them, east and north are
+Chebyshev series, with as many nodes as keep the measured interpolation error below a tolerance. The intersection of a
+line of sight with the terrain follows from its east and north over height, by bracketed secant steps.
 
-Every sample of the ground, several for each pixel, is located by the rigorous sensor on the terrain; the transfer
-function of lens, pixels and motion takes the samples to the pixels; the detector's model makes frames of them. All of
-it runs in strips of lines, and the result does not depend on how it is cut.
+Every sample of the ground, several for each pixel, is located by the rigorous sensor on the terrain; the samples are
+convolved with the point spread function of lens, pixels and motion; the detector's model converts the photons to
+frames. The computation is divided into strips of lines, and the result does not depend on this division.
 """
 
 from __future__ import annotations
@@ -27,27 +27,29 @@ from twin.orbit.ground.orthophoto import Extent
 from twin.orbit.images.line_optics import ImageMotion, LineOptics, exposures, without_jitter
 
 TOLERANCE = 2e-4
-"""Largest interpolation error of the look's position at given heights, in metres."""
+"""Largest interpolation error of a line of sight's position at a given height, in metres."""
 _COUNTS = (4, 6, 8, 12, 16, 24, 32, 48)
-"""Numbers of nodes along lines and pixels that are tried in turn."""
+"""Numbers of Chebyshev nodes along lines and along pixels that are tried in turn until the interpolation is accurate.
+"""
 _JITTERING = (96, 192, 384, 768, 1536)
-"""Numbers of nodes along the lines where the attitude is rougher than the looks of a line are."""
+"""Numbers of nodes along the image lines that are tried where the attitude varies faster than `_COUNTS` can resolve."""
 _HEIGHTS = 4
-"""Number of nodes over height: the look bends over the ellipsoid's curvature by 3 cm in 500 m of height, and no more.
+"""Number of nodes over height: a line of sight, in plane coordinates over height, is curved by 3 cm in 500 m at most,
+due to the ellipsoid's curvature.
 """
 _MET = 1e-4
-"""Tolerance, in metres, of the height difference between look and terrain at their intersection."""
+"""Tolerance of the height difference between a line of sight and the terrain at their intersection, in metres."""
 _MOST_STEPS = 40
-"""Largest number of secant steps in which the point where a look meets the terrain is found."""
+"""Largest number of secant steps for the intersection of a line of sight with the terrain."""
 
 
 class SteepTerrainError(PhysicalError, ValueError):
-    """Error of terrain that is steeper than a look, so that a part of it is hidden."""
+    """Error raised for terrain that is steeper than a line of sight, so that a part of it is hidden."""
 
 
 @dataclass(frozen=True, eq=False)
 class LookMap:
-    """Interpolated looks of a part of an image; made by `prepare`.
+    """Interpolated lines of sight of a part of an image; made by `prepare`.
 
     Attributes
     ----------
@@ -80,7 +82,7 @@ class LookMap:
         pixels: tuple[float, float],
         tolerance: float = TOLERANCE,
     ) -> LookMap:
-        """Interpolate the looks of the part of an image between given lines and pixels, both inclusive.
+        """Interpolate the lines of sight of the part of an image between given lines and pixels, both inclusive.
 
         Raises
         ------
@@ -113,7 +115,7 @@ class LookMap:
         Raises
         ------
         SteepTerrainError
-            The terrain is as steep as the look somewhere.
+            The terrain is somewhere as steep as the line of sight.
         """
         with one_blas_thread():
             along = self._basis(0, lines, self.east.shape[1])
@@ -129,7 +131,7 @@ class LookMap:
         return self._met(east, north)
 
     def _met(self, east: list[np.ndarray], north: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return where looks, polynomials in the scaled height x, meet the terrain: east, north, height in m."""
+        """Intersect lines of sight, polynomials in the scaled height, with the terrain: east, north, height in m."""
         low, high = self.span[2]
         middle, half = 0.5 * (low + high), 0.5 * (high - low)
 
@@ -162,7 +164,7 @@ class LookMap:
         )
 
     def run(self) -> tuple[float, float]:
-        """Return how far the middle look moves east and north per metre of height, in m/m."""
+        """Return the displacement east and north of the middle line of sight per metre of height, in m/m."""
         low, high = self.span[2]
         ends = np.full(2, self.span[0].mean()), np.full(2, self.span[1].mean()), np.array([low, high])
         east, north = self._at(*ends)
@@ -198,7 +200,7 @@ def _coefficients(values: np.ndarray) -> np.ndarray:
 def _local(
     sensor: Sensor, frame: GroundFrame, line: np.ndarray, pixel: np.ndarray, height: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return east and north of looks at given heights, computed by the rigorous sensor, in metres."""
+    """Return east and north of lines of sight at given heights, computed by the rigorous sensor, in metres."""
     points = sensor.ground(line, pixel, height)
     if not np.all(np.isfinite(points)):
         raise UnphysicalError("a line of sight misses the Earth")
@@ -216,15 +218,16 @@ def _horner(terms: list[np.ndarray], x: np.ndarray) -> np.ndarray:
 
 
 MARGIN = 24
-"""Margin about a window that its image needs, in pixels and lines; the point spread function ends there."""
+"""Margin of ground about a window that its image depends on, in pixels and lines; the point spread function ends there.
+"""
 LARGEST_ERROR = 0.002
-"""Largest error of interpolated positions relative to the rigorous sensor on the terrain, in pixels."""
+"""Largest accepted error of interpolated positions, relative to the rigorous sensor on the terrain, in pixels."""
 _NEAR = 2
 """Number of samples beyond the computed ones that cubic interpolation needs on each side."""
 BORDER = MARGIN + _NEAR + 1
-"""Smallest number of lines and pixels between a window and the ends of an image."""
+"""Smallest number of lines and pixels between a window and the edges of an image."""
 _SAMPLES_AT_ONCE = 4_000_000
-"""Largest number of ground samples processed at a time, to bound memory."""
+"""Largest number of ground samples processed at a time, to limit memory."""
 _CHECKS = 400
 """Number of samples at which the interpolation of positions is compared with the rigorous sensor."""
 
@@ -283,7 +286,7 @@ class Window:
         )
 
     def sample(self, sensor: Sensor, height: float) -> tuple[float, float]:
-        """Return the ground distance of two pixels, and of two lines, at the window's middle, in metres."""
+        """Return the ground distance of neighbouring pixels and of neighbouring lines at the window's middle, in m."""
         line, pixel = self.middle
         steps = np.array([-0.5, 0.5, 0.0, 0.0])
         points = sensor.ground(line + steps, pixel + np.roll(steps, 2), height)
@@ -301,9 +304,9 @@ class RenderedPatch:
     window : Window
         Window of the image.
     motion : ImageMotion
-        Motion of the image in its middle.
+        Motion of the image over the line, in the window's middle.
     error : float
-        Largest measured difference of an interpolated position from the rigorous one on the terrain, pixels.
+        Largest difference, at check samples, of an interpolated position from the rigorous one on the terrain, pixels.
     """
 
     photons: np.ndarray
@@ -313,12 +316,12 @@ class RenderedPatch:
 
 
 def look_map(sensor: Sensor, frame: GroundFrame, terrain: Terrain, window: Window) -> LookMap:
-    """Return the looks that an image of a window needs.
+    """Return the interpolated lines of sight that the image of a window requires.
 
     Raises
     ------
     ValueError
-        The window, with its margin, is not all inside the image.
+        The window with its margin lies partly outside the image.
     """
     if not window.fits(sensor):
         raise UnphysicalError(
@@ -333,9 +336,9 @@ def look_map(sensor: Sensor, frame: GroundFrame, terrain: Terrain, window: Windo
 
 
 def extent_of(looks: LookMap, step: int = 16) -> Extent:
-    """Return the extent of the ground that looks see, a little enlarged.
+    """Return the extent of the ground that lines of sight see, slightly enlarged.
 
-    Raises SteepTerrainError where the terrain is as steep as a look.
+    Raises SteepTerrainError where the terrain is as steep as a line of sight.
     """
     (first, last), (left, right), _ = looks.span
     lines, pixels = (np.linspace(a, b, int((b - a) / step) + 2) for a, b in ((first, last), (left, right)))
@@ -347,12 +350,12 @@ def extent_of(looks: LookMap, step: int = 16) -> Extent:
 
 
 def require_open(looks: LookMap, extent: Extent) -> None:
-    """Raise SteepTerrainError if terrain hides a part of itself from the looks.
+    """Raise SteepTerrainError if terrain hides a part of itself from the lines of sight.
 
     Raises
     ------
     SteepTerrainError
-        A slope that faces away is as steep as the look.
+        A slope that faces away from the camera is as steep as the line of sight.
     """
     to_east, to_north = looks.run()
     spacing = min(looks.terrain.surface.spacing)
@@ -378,7 +381,7 @@ def render_patch(
     oversampling: int = 3,
     looks: LookMap | None = None,
 ) -> RenderedPatch:
-    """Render the expected photons of a window of an image.
+    """Render the expected number of photons in each pixel of a window of an image.
 
     Parameters
     ----------
@@ -463,8 +466,8 @@ def _expected(
 def _samples(looks: LookMap, window: Window, oversampling: int, fine: int) -> tuple[np.ndarray, np.ndarray]:
     """Return east and north, in metres, of all ground samples of a window with its margin.
 
-    For each pixel `fine` positions along each side are computed on the terrain, the others are interpolated with
-    cubics.
+    For each pixel, `fine` positions along each side are computed on the terrain, and all `oversampling` positions are
+    interpolated between them by cubics.
     """
     reach = MARGIN + _NEAR
     lines = np.arange((window.lines + 2 * reach - 1) * fine + 1) / fine + (window.first_line - reach)
@@ -479,7 +482,7 @@ def _samples(looks: LookMap, window: Window, oversampling: int, fine: int) -> tu
 
 
 def _spread(values: np.ndarray, factor: int, axis: int) -> np.ndarray:
-    """Interpolate by cubics (Lagrange) to `factor` samples per step along an axis, without the outer steps."""
+    """Interpolate by Lagrange cubics to `factor` samples per step along an axis, without the outermost steps."""
     v = np.moveaxis(values, axis, 0)
     count = len(v) - 3
     out = np.empty((factor * count + 1, *v.shape[1:]))
@@ -500,7 +503,7 @@ def _spread(values: np.ndarray, factor: int, axis: int) -> np.ndarray:
 
 
 def _filtered(values: np.ndarray, kernel: np.ndarray, oversampling: int, window: Window) -> np.ndarray:
-    """Return samples, with a margin, convolved with the point spread function, at the pixels."""
+    """Convolve ground samples with the point spread function, and return the values at the pixels."""
     # Wrap-around of the transform falls into the margin alone.
     shape = [fft.next_fast_len(n, True) for n in values.shape]
     spectrum = fft.rfft2(values.astype(np.float32, copy=False), s=shape)
@@ -513,7 +516,7 @@ def _filtered(values: np.ndarray, kernel: np.ndarray, oversampling: int, window:
 
 
 def _interpolation_error(sensor: Sensor, looks: LookMap, window: Window, oversampling: int, fine: int) -> float:
-    """Return the largest position error of `_samples` on blocks of the window, in pixels.
+    """Return the largest position error of the samples of `_samples`, checked in parts of the window, in pixels.
 
     The points on the terrain are imaged by the rigorous sensor and compared with the samples' image coordinates.
     """

@@ -82,7 +82,7 @@ def _control_png(run: Simulation) -> bytes:
 
 
 def _modulus(values: np.ndarray) -> np.ndarray:
-    """Return the modulus of complex values; real ones keep their sign."""
+    """Return the modulus of complex values, and real values unchanged with their sign."""
     return np.abs(values) if np.iscomplexobj(values) else values
 
 
@@ -246,7 +246,7 @@ def simulation_report(run: Simulation) -> Report:
 
 
 def map_facts(raster: Raster, note: str, heights: bool = False) -> FrameFacts:
-    """Return the text tags that the GeoTIFF of a map carries."""
+    """Return the text tags that are written into the GeoTIFF of a map."""
     longitude, latitude, *steps = list(GEOREFERENCE(raster).values())[3:]
     return FrameFacts(note=note, georeference=MapGeoreference(longitude, latitude, steps[0], steps[1], heights))
 
@@ -259,7 +259,7 @@ def _summary(run: Simulation) -> Table:
 
 
 def changes_text(perturb: Mapping[str, InteriorChangeSpec]) -> str:
-    """Return the changes of a camera's lines since the laboratory in words."""
+    """Return a text on the changes of a camera's lines since the laboratory's measurement."""
     changes = (
         f"{name} f {format_quantity(c.principal_distance, LENGTH)}, "
         f"x {format_quantity(c.principal_point[0], LENGTH)}, y {format_quantity(c.principal_point[1], LENGTH)}"

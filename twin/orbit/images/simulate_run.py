@@ -1,9 +1,9 @@
 """Simulated pass over a patch of ground: run, results and export.
 
-The run makes orbit, the true and the laboratory's camera, images and measured points from a test's file. simulate.json
-has what the user of the images may know. The camera, the orbit with the attitude, and the georeference are separate
-artefacts for other software; the true camera and trajectory are in truth.json alone. The export writes the simulated
-measurements as a folder of tables with a test file that reads them back.
+The run generates the orbit, the true and the laboratory's camera, images and measured points from a test's file.
+simulate.json has the quantities that the user of the images may know. The camera, the orbit with the attitude, and the
+georeference are separate artefacts for other software; the true camera and trajectory are only in truth.json. The
+export writes the simulated measurements as a folder of tables with a test file that reads them back.
 """
 
 from __future__ import annotations
@@ -73,7 +73,7 @@ _REMEDIES: Mapping[str, tuple[KeyPath, str]] = FrozenMap(
         "terrain": (("ground", "terrain"), "less relief, a larger exponent or larger posts"),
     }
 )
-"""Key of the input to change, and advice, by the part of a PatchError."""
+"""Key of the input file to change, and advice to the user, by the `part` of a PatchError."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -143,7 +143,7 @@ class Simulation(SimulatedFlight):
 
 
 def fly_simulation(setup: SimulateSetup, seed: int) -> SimulatedFlight:
-    """Return orbit and cameras of a pass: for the same seed, those that `run_simulation` uses.
+    """Simulate the orbit and the sensors of a pass, without images; for the same seed as in `run_simulation`.
 
     Raises
     ------
@@ -232,7 +232,7 @@ _LOOK = (
     "y = (pixel - (pixels - 1)/2) pitch, r^2 = x0^2 + (y - y0)^2, d = k1 r^2 + k2 r^4; the look in camera axes "
     "is along (x0 (1 + d), -(y - y0)(1 + d), f); pixel 0 is the middle of the first"
 )
-"""Formula of a pixel's look, for readers of camera.json."""
+"""Formula of a pixel's line of sight, for readers of camera.json."""
 
 
 def _line_time(image: LineImage, row: int) -> float:
@@ -267,7 +267,7 @@ LINE: Record[LineImage] = Record(
 
 
 def _per_pixel(raster: Raster) -> Array:
-    """Return radians of longitude per column and of latitude per row of a map whose rows go to the south."""
+    """Return the grid spacing of a map: radians of longitude per column and of latitude per row (negative)."""
     return raster.spacing / np.array(raster.frame.scale) * np.array([1.0, -1.0])
 
 
@@ -323,7 +323,7 @@ SIMULATE: Record[Simulation] = Record(
 
 
 def camera_data(camera: ThreeLineCameraSpec) -> dict[str, Any]:
-    """Return interior orientation and mounting of every line, with the formula of a look."""
+    """Return the interior orientation and mounting of every line, with the formula of a pixel's line of sight."""
     lines = {
         name: {
             "pixels": camera.pixels_of(name),
@@ -344,7 +344,7 @@ def trajectory_data(run: Simulation, path: Trajectory) -> dict[str, Any]:
     """Return orbit and attitude at the times of the pass's readings, for a JSON file.
 
     Between the readings the errors of a measured trajectory are the cubic spline that `twin.orbit.flight.trajectory`
-    describes. Quaternions are (x, y, z, w); neighbours lie on one side, so that they can be interpolated.
+    describes. Quaternions are (x, y, z, w), with continuous signs so that they can be interpolated.
     """
     errors = run.spec.errors
     fixes, looks = (
@@ -367,13 +367,13 @@ def trajectory_data(run: Simulation, path: Trajectory) -> dict[str, Any]:
 
 
 def georeference_data(run: Simulation) -> dict[str, Any]:
-    """Return the georeference of orthophoto and elevation model."""
+    """Return the georeference of orthophoto and elevation model, as plain data for a JSON file."""
     control = run.patch.control
     return {"orthophoto": GEOREFERENCE(control.orthophoto), "dem": GEOREFERENCE(control.dem)}
 
 
 def _errors(judgement: LineComparison) -> list[list[float | None]]:
-    """Return the errors of every point, None where the point was not measured."""
+    """Return the image errors of every point (line, pixel), measured minus true; None where not measured."""
     return [[float(v) if np.isfinite(v) else None for v in row] for row in judgement.error]
 
 
@@ -447,7 +447,7 @@ TRUTH: Record[Simulation] = Record(
 
 
 _EXACT = 1e-3
-"""Sigma of control points that have no errors, in metres."""
+"""Sigma written for control points that are simulated without errors, in metres."""
 
 
 def simulation_exported(run: Simulation) -> dict[str, str]:

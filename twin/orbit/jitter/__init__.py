@@ -1,1 +1,1 @@
-"""Search for jitter of the attitude in points that the lines of a camera see one after the other."""
+"""Search for attitude jitter in image points that the lines of a camera see one after the other."""

@@ -17,15 +17,17 @@ from twin.framework.report import Report, Section, answer
 from twin.orbit.jitter.jitter_run import MULTIPLE, JitterRun, Oscillation, PassJitter, blind_multiples, transfers
 
 _MOST, _SIGMAS = 4000, 5.0
-"""Largest number of points drawn of a disparity, and half range of its axis in robust standard deviations."""
+"""Largest number of points drawn in a figure of disparities, and half range of its vertical axis in robust standard
+deviations.
+"""
 _COURSE, _ROWS = 0.02, 5000
-"""Least time between rows of the attitude table, in seconds, and largest number of its rows."""
+"""Smallest time between rows of the table of attitude over time, in seconds, and largest number of its rows."""
 _MOST_WRONG = 0.3
-"""Share of observations rejected as gross errors above which there is a warning."""
+"""Share of rejected observations (gross errors) above which there is a warning."""
 _NAMED = 8
-"""Largest number of alias frequencies of an oscillation that are listed."""
+"""Largest number of alias frequencies of an oscillation that the report lists."""
 _FIT = 1.3
-"""Ratio of the scatter of the residuals to the sigmas of the points above which there is a warning."""
+"""Scatter of the residuals, divided by the sigmas of the points, above which there is a warning."""
 
 
 def jitter_report(run: JitterRun) -> Report:
@@ -74,7 +76,7 @@ def _verdict(run: JitterRun) -> tuple[str, tuple[str, ...]]:
 
 
 def _doubts(line: Oscillation) -> list[str]:
-    """Return the reasons why the true frequency of an oscillation may differ from the detected one."""
+    """Return reasons, such as aliasing, why an oscillation's true frequency may differ from the detected one."""
     frequency, doubts = f"{line.frequency[0]:.4g} Hz", []
     if not line.in_search:
         doubts.append(f"{frequency} lies beyond the search range, in which it appears as a slower oscillation")
@@ -199,7 +201,7 @@ def _course(jitter: PassJitter, suffix: str, head: str) -> Section:
     figure = SvgFigure(
         f"course{suffix}",
         "Attitude over time",
-        "Fast part of the attitude, without its mean and without blind frequencies.",
+        "Fast part of the attitude, without its mean and without the frequencies that the lines cannot observe.",
         svg.drawn("jitter-course", _course_figure, jitter),
     )
     return Section(f"Attitude over time{head}", (), (figure, full))
@@ -234,7 +236,7 @@ def _disparity_figure(jitter: PassJitter) -> Figure:
 
 
 def _spectrum_figure(jitter: PassJitter) -> Figure:
-    """Draw the amplitude over frequency, before and after the detected oscillations are removed."""
+    """Draw the amplitude spectrum of the attitude before and after the detected oscillations are removed."""
     result = jitter.result
     figure, panels = _panels(jitter, 2.0, 2.0, "frequency [Hz]; shaded: blind")
     for k, axes in enumerate(panels):

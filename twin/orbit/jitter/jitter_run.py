@@ -34,9 +34,9 @@ if TYPE_CHECKING:
 
 TEST_FILE = "jitter.yaml"
 _WRONG = 20.0
-"""Largest error that a simulated wrong match gets, in pixels."""
+"""Largest error of a simulated wrong match, in pixels."""
 _SPARE = 1.3
-"""Number of candidates drawn per point, because some lie beyond an edge of a line."""
+"""Number of candidates drawn per required point, because some lie beyond the ends of a line."""
 _REMEDY = "points that several lines see, spread over the strip; a larger `height_sigma` or another `height`"
 
 
@@ -49,7 +49,7 @@ class PassJitter:
     setup : AnyJitter
         Resolved test file and camera.
     sights : Sights
-        Sightings of the same points by several lines.
+        Observations of the same ground points by several lines, which see them one after the other.
     result : JitterSearch
         Detected oscillations and spectra.
     course : Course or None
@@ -121,14 +121,14 @@ class Oscillation:
 
     @property
     def pixels(self) -> np.ndarray:
-        """Amplitudes about the A searched axes, (A,), in units of the angle of a pixel."""
+        """Amplitudes about the A searched axes, (A,), in pixels (units of the angle that a pixel subtends)."""
         return np.asarray(self.amplitude[0] / self.jitter.sights.pixel)
 
     @property
     def truth(self) -> tuple[float, np.ndarray] | None:
         """Frequency (Hz) and amplitudes about the A searched axes (A,) (rad) of the nearest true oscillation.
 
-        None if none lies within a resolution element, or for measurements.
+        None if no true oscillation lies within a resolution element of the spectrum, or for real measurements.
         """
         test, true_jitter = self.jitter.setup.test, self.jitter.truth
         if true_jitter is None or not isinstance(test, OrbitJitterSpec) or test.attitude.jitter is None:
@@ -185,7 +185,9 @@ class JitterRun:
 
 @one_blas_thread()
 def run_jitter(setup: AnyJitter, backend: Backend | None, seed: int, advance: Advance = silent) -> JitterRun:
-    """Simulate or read the passes, and search them for jitter. Nothing is ray-traced: the backend is not used.
+    """Simulate or read the passes, and search them for jitter.
+
+    Nothing is ray-traced: the backend is not used.
 
     Raises
     ------
@@ -318,10 +320,10 @@ class BlindMultiple:
     frequency : float
         Frequency k / dt, in hertz.
     response : float
-        Response of all lines together to an oscillation of this frequency, for the worst axis, divided by the axis's
-        largest response over the searched frequencies.
+        Sensitivity of the observations of all lines together to an oscillation of this frequency, relative to the
+        largest over the searched frequencies, 0 to 1, for the body axis with the lowest value.
     blind : bool
-        True if all lines together are blind at this frequency.
+        True if all lines together cannot observe this frequency.
     """
 
     first: str
@@ -352,8 +354,8 @@ def blind_multiples(jitter: PassJitter) -> list[BlindMultiple]:
 def transfers(jitter: PassJitter) -> dict[str, dict[str, float]]:
     """Return the MTF at the Nyquist frequency due to all detected oscillations, by line and direction.
 
-    It is the root mean square over the phases, along the line (due to roll) and along the track (due to pitch), for
-    lines whose file describes how they collect light.
+    It is the root mean square over the phases of the oscillations, along the line (due to roll) and along the track
+    (due to pitch), for lines whose file specifies their exposure (TDI stages).
     """
     directions, by_line = {"roll": "along_line", "pitch": "along_track"}, {}
     swings = [(line.frequency[0], jitter.by_axis(line.pixels)) for line in jitter.oscillations]

@@ -1,14 +1,13 @@
 """Observations of the attitude of a pass from its image points, and a model of the pass without fast motions.
 
-Lines see the same ground point one after the other. Its position, which is not known or not well, is eliminated, with
-its prior as a covariance. The remaining disagreement of the lines observes the attitude at the moments of their
-sightings, at any angle between the lines: across the track always, along it as far as the height is known better than
-the angles of the lines determine it.
+Lines see the same ground point one after the other. Its unknown position is eliminated, with its prior covariance. The
+remaining disagreement of the lines observes the differences of the attitude between the moments at which they see the
+point, whatever the angles between the lines: across the track always, along it only as far as the height is known
+better than the parallax of the lines determines it.
 
-`SteadyPlatform` describes a pass without fast motions, by polynomials through the readings of orbit and attitude.
-Readings interpolated by a spline carry their noise into the attitude between them, with the period of the readings, and
-image points that are compared with such an attitude would show that period whatever the satellite did. Polynomials have
-no period.
+`SteadyPlatform` describes a pass without fast motions, by polynomials through the readings of orbit and attitude. A
+spline through the readings has errors with the period of the readings, and image points that are compared with such an
+attitude would show that period even without jitter. Polynomials have no period.
 """
 
 from __future__ import annotations
@@ -35,16 +34,18 @@ from twin.orbit.flight.trajectory import Attitude
 from twin.orbit.measured.pass_measurements import PassMeasurements
 
 _ORBIT, _PER = 6, 60.0
-"""Degree of the polynomial of the orbit, and seconds per further degree: accurate to 0.1 mm."""
+"""Smallest degree of the polynomial of the orbit, and time span in seconds for which one more degree is added: the
+polynomial is accurate to 0.1 mm.
+"""
 _ATTITUDE = 4
-"""Degree of the polynomial of the body's attitude relative to the orbital frame: the attitude changes slowly, and each
-line's trend takes up the remainder.
+"""Degree of the polynomial of the body's attitude relative to the orbital frame: without jitter the attitude changes
+slowly, and the trend that is fitted to each line absorbs the remainder.
 """
 
 
 @dataclass(frozen=True, eq=False)
 class SteadyPlatform:
-    """Position and attitude as polynomials of time in seconds; times have shape (...).
+    """Position and attitude without fast motions, as polynomials of time; times (...) are in seconds.
 
     Attributes
     ----------
@@ -53,9 +54,9 @@ class SteadyPlatform:
     position_series : (K, 3) ndarray
         K Chebyshev coefficients of the position, ITRS, in metres.
     rotation_series : (K, 3) ndarray
-        K Chebyshev coefficients of rotation vectors from `middle`, in radians.
+        K Chebyshev coefficients of rotation vectors of the body relative to `middle`, in radians.
     middle : (3, 3) ndarray
-        Mean rotation of the body against the orbital frame.
+        Mean rotation matrix of the body relative to the orbital frame.
     law : Attitude
         Definition of the orbital axes.
     """
@@ -68,7 +69,7 @@ class SteadyPlatform:
 
     @classmethod
     def of(cls, path: TabulatedTrajectory, first: float, last: float) -> SteadyPlatform:
-        """Fit the readings between two times, in seconds, and in an equally long span on each side.
+        """Fit polynomials to the readings between two times, in seconds, and in an equally long span on each side.
 
         Raises
         ------
@@ -121,7 +122,7 @@ class SteadyPlatform:
 
 
 def _inside(time: np.ndarray, first: float, last: float, path: TabulatedTrajectory) -> np.ndarray:
-    """Return the times of readings between two times; where there are few, evenly spaced moments between them."""
+    """Return the times of readings between two times or, where there are few, evenly spaced times."""
     moments = time[in_span(time, first, last)]
     if len(moments) < 2 * _ORBIT:
         moments = np.linspace(first, last, 4 * _ORBIT)
@@ -134,17 +135,19 @@ def _chebyshev_fit(time: np.ndarray, values: np.ndarray, span: tuple[float, floa
 
 
 _SPARE = 200
-"""Number of lines before and after the points' lines in which they are searched."""
+"""Number of image lines before and after the measured ones within which expected positions are searched."""
 _TURN = 1e-5
 """Step of the difference quotients with respect to rotation, in radians."""
 _STEP = 10.0
 """Step of the difference quotients with respect to position, in metres."""
 _EXACT = 1e-3
-"""Standard deviation, in metres, added to that of ground points, some of which are given as exact."""
+"""Standard deviation, in metres, added to that of ground points, because some are given as error-free."""
 _LEAST_POINTS = 15
-"""Smallest number of points that two lines or more must see."""
+"""Smallest number of points that must be seen by at least two lines."""
 _NOISE, _ROUNDS = 4.0, 4
-"""Limit, in sigmas, within which a measured line's residual counts as noise, and rounds of rejecting the others."""
+"""Limit, in sigmas, up to which the residual of a measured line number counts as noise, and number of rounds of
+rejecting larger ones.
+"""
 _FAR = 200.0
 """Largest difference between measured and expected image positions, in pixels."""
 
@@ -155,7 +158,7 @@ class SightsError(PhysicalError, ValueError):
 
 @dataclass(frozen=True, eq=False)
 class Sights:
-    """Sightings of the same points by several lines.
+    """Observations of the same ground points by several lines, which see them one after the other.
 
     Attributes
     ----------
@@ -164,16 +167,16 @@ class Sights:
     lines : tuple of str
         Lines that are used, in the order in which they see a point.
     gaps : Mapping[tuple[str, str], tuple[float, float, float]]
-        (first line, second line) -> seconds between their sightings of the same points: 5 % quantile, median, 95 %
-        quantile.
+        (first line, second line) -> time between their observations of the same points, in seconds: 5 % quantile,
+        median, 95 % quantile.
     pixel : float
-        Angle of a pixel along the line, in radians.
+        Angle that a pixel subtends along the line, in radians.
     points : int
-        Number of points that two lines or more see.
+        Number of points that at least two lines see.
     pairs : Mapping[tuple[str, str], tuple[ndarray, ndarray]]
-        (first line, second line) -> times (n,) of the first sighting of n points, and disparities (n, 2) of the second
-        line against the first, across (pixels to the right) and along (lines later), minus what ground and interior
-        orientation explain; for figures.
+        (first line, second line) -> times (n,), in seconds, at which the first line sees n points, and disparities (n,
+        2) of the second line relative to the first, across (pixels to the right) and along the track (lines later),
+        after removal of the smooth part that ground and interior orientation explain; for figures.
     """
 
     observations: Observations
@@ -186,7 +189,7 @@ class Sights:
 
 @dataclass(frozen=True, eq=False)
 class _Line:
-    """Sightings by one line: points, image positions, covariances, times, and sensors rotated about each axis."""
+    """Observations by one line: points, image positions, covariances, times, and sensors rotated about each axis."""
 
     sensor: Sensor
     point: np.ndarray
@@ -203,7 +206,7 @@ def sights_of(
     search: JitterSearchSpec,
     effects: LightEffects,
 ) -> Sights:
-    """Return the sightings of a pass.
+    """Return the observations of the attitude of a pass from its image points.
 
     Parameters
     ----------
@@ -271,7 +274,7 @@ def _lines(
 
 
 def _trimmed_times(times: LineTimes, line: np.ndarray) -> tuple[float, LineTimes]:
-    """Return the number of the first line near the points, and the times of the lines near them, counted from it."""
+    """Cut a table of line times to the lines near the points; return the first line's number and the table."""
     first = max(float(np.floor(line.min())) - _SPARE, float(times.line[0]))
     last = min(float(np.ceil(line.max())) + _SPARE, float(times.line[-1]))
     inner = times.line[(times.line > first) & (times.line < last)]
@@ -280,7 +283,7 @@ def _trimmed_times(times: LineTimes, line: np.ndarray) -> tuple[float, LineTimes
 
 
 def _moment(line: _Line, lines: Mapping[str, _Line]) -> float:
-    """Return the mean time of a line's sightings relative to those of all lines of the same points, in seconds."""
+    """Return the mean time at which a line sees its points, relative to the mean over all lines, in seconds."""
     difference = []
     for other in lines.values():
         _, mine, theirs = np.intersect1d(line.point, other.point, return_indices=True)
@@ -299,7 +302,8 @@ class _Prior:
     ground : (n, 3) ndarray
         Prior positions, ITRS, in metres.
     root : (n, 3, 3) ndarray
-        Whitening matrices of differences in position; of tie points only the first row, for the height.
+        Whitening matrices of differences in position (inverse roots of covariances); for tie points only the first row
+        is not zero, for the height.
     """
 
     tie: np.ndarray
@@ -312,10 +316,10 @@ class _Prior:
         return np.asarray(self.root.swapaxes(1, 2) @ self.root)
 
     def of(self, rows: np.ndarray, ground: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the prior's observations of some points, either all tie points or none of them.
+        """Return the priors of some points as whitened observations; all or none of them must be tie points.
 
-        They are the derivatives (n, k, 3) of k whitened residuals of n points with respect to a step from positions (n,
-        3), in metres, and the residuals (n, k) of the prior's positions.
+        These are the derivatives (n, k, 3) of k whitened residuals of n points with respect to displacements from the
+        positions `ground` (n, 3), in 1/m, and the residuals (n, k) of the prior positions.
         """
         root = self.root[rows][:, :1] if self.tie[rows[0]] else self.root[rows]
         return root, (root @ (self.ground[rows] - ground)[..., None])[..., 0]
@@ -343,7 +347,7 @@ def _prior_of(
 
 
 def _improved_positions(lines: Mapping[str, _Line], shared: np.ndarray, prior: _Prior) -> np.ndarray:
-    """Return the positions at which derivatives are taken, close enough for linearisation."""
+    """Return ground positions (n, 3) of n points that are accurate enough for linearisation, ITRS, in metres."""
     normal, right = prior.normal, np.zeros((len(shared), 3))
     for line in lines.values():
         which = np.searchsorted(shared, line.point)
@@ -359,9 +363,9 @@ def _improved_positions(lines: Mapping[str, _Line], shared: np.ndarray, prior: _
 
 
 def _residual_and_slope(line: _Line, ground: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return measured minus expected line and pixel, and their derivatives with respect to the ground position.
+    """Return measured minus expected line and pixel, and derivatives with respect to the ground position.
 
-    For n points they are (n, 2), in lines and pixels, and (n, 2, 3), per metre.
+    For n points these are (n, 2), in lines and pixels, and (n, 2, 3), in lines/m and pixels/m.
     """
     expected = np.stack(line.sensor.image(ground), axis=-1)
     by = [(np.stack(line.sensor.image(ground + _STEP * axis), axis=-1) - expected) / _STEP for axis in np.eye(3)]
@@ -443,19 +447,20 @@ def _whitened_observations(
 
 
 def _moments(line: _Line, off: np.ndarray, basis: np.ndarray) -> np.ndarray:
-    """Return the times at which n points cross a line, (n,), in seconds, without the noise of measured lines.
+    """Return the times at which n points cross a line, (n,), in seconds, without the noise of measured line numbers.
 
     A measured line number contains the same noise as the observation, so that a time that follows from it is correlated
-    with the observation; where points lie on rows, all of the scatter of their times is this noise.
+    with the observation; where points lie on straight rows, the whole scatter of their times is this noise.
 
     Parameters
     ----------
     line : _Line
         Sightings with the measured positions.
     off : (n,) ndarray
-        Measured minus expected lines, whose part that is not smooth counts as noise, within the limits of its sigma.
+        Measured minus expected line numbers; the part that is not smooth is treated as noise, within limits given by
+        its sigma.
     basis : (n, width) ndarray
-        Smooth functions of the points.
+        Values of `width` smooth functions at the points.
     """
     sigma = np.sqrt(line.covariance[:, 0, 0])
     accepted = np.isfinite(off)
@@ -469,9 +474,9 @@ def _moments(line: _Line, off: np.ndarray, basis: np.ndarray) -> np.ndarray:
 
 
 def _visibility_groups(seen: np.ndarray, tie: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Return sets of lines (indices (m,)) that see the same points (indices (n,)) of one sort.
+    """Group the points by the set of lines that see them, separately for tie points and others.
 
-    Each set has m lines, at least two, and n points.
+    Each group is given by the indices (m,) of its m lines, at least two, and those (n,) of its n points.
     """
     groups = []
     for sort in (True, False):
@@ -484,10 +489,10 @@ def _visibility_groups(seen: np.ndarray, tie: np.ndarray) -> list[tuple[np.ndarr
 
 
 def _basis(lines: Mapping[str, _Line], shared: np.ndarray, search: JitterSearchSpec) -> np.ndarray:
-    """Return Legendre polynomials of each of n points' position across the strip and of its time, (n, width).
+    """Return `width` Legendre polynomials in position across the strip and in time, at n points, (n, width).
 
-    They are the same for all lines: the part that lines have in common moves only the ground point and is eliminated,
-    with its noise.
+    They are the same for all lines: the part that is common to all lines only displaces the ground point and is
+    eliminated with it.
     """
     total, seen = np.zeros((len(shared), 2)), np.zeros(len(shared))
     for line in lines.values():
@@ -508,7 +513,7 @@ def _pixel(camera: LineCamera) -> float:
 def _pairs(
     lines: Mapping[str, _Line], order: list[str], count: int, residual: Mapping[str, np.ndarray]
 ) -> tuple[dict[tuple[str, str], tuple[float, float, float]], dict[tuple[str, str], tuple[np.ndarray, np.ndarray]]]:
-    """Return the time gaps of all pairs of lines, and the disparities of neighbouring lines without smooth parts."""
+    """Return time gaps of all pairs of lines, and disparities of neighbouring lines without their smooth parts."""
     gaps, pairs = {}, {}
     for a, b in combinations(order, 2):
         _, mine, theirs = np.intersect1d(lines[a].point, lines[b].point, return_indices=True)

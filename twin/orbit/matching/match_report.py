@@ -9,7 +9,7 @@ from twin.orbit.images.point_report import found_table, how_measured, point_arte
 from twin.orbit.matching.match_run import IMAGE, Match
 
 _FAR = 0.5
-"""Share of the search range above which a median displacement is reported as leaving the search too little margin."""
+"""Share of the search range above which a median displacement is reported as too near the limit of the search."""
 
 
 def match_report(run: Match) -> Report:

@@ -1,7 +1,8 @@
 """Measurement of control, check and tie points in a user's line images: ``python -m twin.orbit match``.
 
-Images and maps are related by the prior knowledge: the laboratory's camera, orbit and attitude, line times. The
-measurement is that of a simulated patch (`twin.orbit.images.image_points`). The records at the end define match.json.
+Images and maps are related by the known geometry: the laboratory's camera, orbit and attitude, line times. The method
+is the one for simulated patches (`twin.orbit.images.image_points`). The quantities at the end of the module are those
+of match.json.
 """
 
 from __future__ import annotations
@@ -55,16 +56,18 @@ if TYPE_CHECKING:
     from scenes.specs.orbit.setup import MatchSetup
 
 _BORDER = 5
-"""Number of positions along each side of an image that are followed to the ground."""
+"""Number of positions along each side of an image that are projected to the ground to find its extent."""
 _SPARE = 300.0
-"""Margin of the map about the images' ground, in metres, beside the search range, for errors of camera and platform."""
+"""Margin of the map about the images' ground, in metres, in addition to the search range, for errors of camera and
+platform.
+"""
 _PIXEL = 30.0
-"""Memory that a pixel of an image needs, with the part of the maps that it shows, in bytes."""
+"""Memory per pixel of an image, including the part of the maps that shows the same ground, in bytes."""
 
 
 @dataclass(frozen=True, eq=False)
 class UserGround(ImagedGround):
-    """Patch of ground in a user's images and maps."""
+    """Patch of ground with a user's images of it, orthophoto and elevation model."""
 
     control: Maps[MapPart]
 
@@ -82,9 +85,10 @@ class Match:
     points : PatchPoints
         Measured points.
     measurements : PassMeasurements
-        Points with orbit, attitude and line times, as a calibration takes them.
+        Points with orbit, attitude and line times, in the form that a calibration uses as input.
     accuracy : float or None
-        Accuracy of the maps' transformation to WGS 84 according to its authority, metres; None where it gives none.
+        Accuracy of the maps' transformation to WGS 84 according to its authority (such as EPSG), metres; None where
+        none is given.
     """
 
     setup: MatchSetup
@@ -95,7 +99,7 @@ class Match:
 
 
 def run_match(setup: MatchSetup, backend: Backend | None, seed: int, advance: Advance = silent) -> Match:
-    """Measure points in images; nothing is traced or drawn at random.
+    """Measure control, check and tie points in a user's images; nothing is traced or drawn at random.
 
     Raises
     ------
@@ -280,7 +284,7 @@ def _measured(points: PatchPoints, spec: OrbitMatchSpec) -> tuple[GroundPoints, 
 
 
 def _used(points: MatchedPoints) -> np.ndarray:
-    """Return the mask of those of n points that enough lines accept: one, or two for tie points, (n,) bool."""
+    """Return the mask (n,) of those of n points that are accepted in enough lines: one, or two for tie points."""
     seen = np.sum([line.accepted for line in points.lines.values()], axis=0)
     return np.asarray(seen >= (2 if points.kind == "tie" else 1))
 

@@ -1,11 +1,11 @@
 """Time scales: conversion of clock readings in UTC, GPS, TAI, TT and others to seconds of atomic time.
 
-A reading is a day and seconds of that day, as the clock shows them. An instant is SI seconds of TAI in two parts, so
-that nothing is lost over decades: whole days since MJD 0 (of TAI) and the rest in seconds.
+A reading is a day and seconds of that day, as the clock shows them. An instant is a time in TAI in two parts, to keep
+full precision over decades: whole days since MJD 0 and the remaining SI seconds.
 
-GPS time is 19 s behind TAI and BeiDou time 33 s, permanently; Galileo and QZSS time are taken as GPS time, from which
-they are steered to differ by nanoseconds; TT is 32.184 s ahead of TAI. UTC is behind by the leap seconds (IERS
-Conventions 2010, chapter 10).
+GPS time is 19 s behind TAI and BeiDou time 33 s, permanently; Galileo and QZSS time are treated as GPS time, from which
+they differ by nanoseconds only; TT is 32.184 s ahead of TAI. UTC is behind by the leap seconds (IERS Conventions 2010,
+chapter 10).
 """
 
 from __future__ import annotations
@@ -29,13 +29,13 @@ SCALES = ("UTC", *TAI_MINUS)
 """Names of the time scales that can be read."""
 _MJD_ZERO = date(1858, 11, 17).toordinal()
 FIRST_DAY, LAST_DAY = date(1972, 1, 1).toordinal() - _MJD_ZERO, date(2100, 1, 1).toordinal() - _MJD_ZERO
-"""First and last modified Julian day of instants: UTC has whole leap seconds since the first."""
+"""First and last modified Julian day that is accepted; UTC has had whole leap seconds since the first."""
 _FORM = "a date and time such as 2011-03-05T03:05:00.25 or 2011-064T03:05:00.25, 1972 to 2099"
 
 
 @dataclass(frozen=True, eq=False)
 class Readings:
-    """Readings of a clock.
+    """Readings of a clock: days and seconds of the day, before a time scale is assigned.
 
     Attributes
     ----------
@@ -109,12 +109,12 @@ class Readings:
         return Readings(self.day[keep], self.second[keep])
 
     def instants(self, scale: str) -> Instants:
-        """Return the instants of the readings, taken as readings of this time scale.
+        """Convert the readings of a clock, in a given time scale, to instants of TAI.
 
         Raises
         ------
         Problem
-            A leap second on a day or in a scale that has none.
+            A reading lies in a leap second on a day or in a scale that has none.
         """
         late = self.second >= DAY
         if scale != "UTC":
@@ -219,7 +219,7 @@ def single_reading(text: str) -> Readings:
 
 
 def known_scale(name: str) -> str:
-    """Return the time scale of a name as other files spell it: GPST for GPS, GLO and GLONASS for UTC.
+    """Return the time scale for a name as files spell it: GPS for GPST, UTC for GLO and GLONASS.
 
     Raises
     ------
@@ -234,7 +234,10 @@ def known_scale(name: str) -> str:
 
 
 def _day_of(text: str) -> int:
-    """Return the modified Julian day of 2011-03-05, or of day 64 of a year, 2011-064; ValueError if it is neither."""
+    """Return the modified Julian day of a date such as 2011-03-05 or, with the day of the year, 2011-064.
+
+    Raises ValueError for any other text.
+    """
     if len(text) == 8 and text[4] == "-" and text[5:].isdigit() and text[:4].isdigit():
         start = date(int(text[:4]), 1, 1)
         parsed = start + timedelta(days=int(text[5:]) - 1)

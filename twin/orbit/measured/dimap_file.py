@@ -1,22 +1,26 @@
 """DIMAP files (versions 2 and 3) of Pléiades, Pléiades Neo and SPOT 6 and 7: rigorous model of a scene.
 
-The product is one in sensor geometry.
+The product must be one in sensor geometry. Its conventions are:
 
 - Rows and columns of the image count from 1, the centre of the first pixel. Row r is exposed at START + (r - 1)
   LINE_PERIOD; times are UTC.
 - Positions and velocities are Earth-fixed. Velocities are relative to the rotating Earth; inertial velocities, as the
-  ground segment of Pléiades writes them, are recognised by omega x P, which is subtracted.
+  ground segment of Pléiades writes them, are recognised by the term omega x P (Earth's rotation vector, position),
+  which is subtracted.
 - A quaternion Q0 .. Q3 has its scalar first and rotates the body's axes into the Earth-fixed ones, v_earth = R(q)
   v_body. The attitude is given as samples, or as polynomials of (t - OFFSET) / SCALE, where t is seconds of the day of
   START, which are then normalised.
-- In the body X points forward, Z to the scene, Y to the right. A column's look is (tan psi_y, -tan psi_x, 1), where
-  tan psi_x = XLOS_0 + XLOS_1 c + ... and tan psi_y likewise by YLOS, of c = column - 1 + FIRST_COL - 1.
-- Looks are straight up to the atmosphere, whose refraction is part of the model where ATMOSPHERIC_REFRACTION_SETTING is
-  true: in a scene of Pleiades Neo, polynomials of 0 to 8 km leave looks that are constant to 0.03 urad with the
-  refraction of the standard atmosphere, and to 1 urad without.
+- In the body X points forward, Z to the scene, Y to the right. The line of sight of a column is
+  (tan psi_y, -tan psi_x, 1), where tan psi_x = XLOS_0 + XLOS_1 c + ... and tan psi_y likewise by YLOS, of c = column -
+  1 + FIRST_COL - 1.
+- Lines of sight are straight outside the atmosphere, whose refraction is part of the model where
+  ATMOSPHERIC_REFRACTION_SETTING is true: in a scene of Pleiades Neo, lines of sight derived from the rational
+  polynomials at heights of 0 to 8 km agree to 0.03 urad with the refraction of the standard atmosphere, and to 1 urad
+  without.
 
-Orders and signs are those by which the Ames Stereo Pipeline reads these files. The formula of the looks is that of the
-imagery user guide of Pléiades; FIRST_COL is added as in that program, where the guide subtracts it.
+Orders and signs are those with which the Ames Stereo Pipeline reads these files. The formula of the lines of sight is
+that of the imagery user guide of Pléiades, but FIRST_COL is added as in the Ames Stereo Pipeline, whereas the guide
+subtracts it.
 """
 
 from __future__ import annotations
@@ -46,7 +50,7 @@ from twin.orbit.measured.orbit_files import (
 from twin.orbit.measured.xml_file import Element, read_xml, readings, require_increasing
 
 PROFILES = ("PHR_SENSOR", "PNEO_SENSOR", "S6_SENSOR", "S7_SENSOR")
-"""Metadata profiles of products with a rigorous model."""
+"""Metadata profiles of the products for which a rigorous model can be read."""
 _WHAT = "a DIMAP file of a product in sensor geometry"
 _VERSIONS = ("2", "3")
 _PERIOD: Mapping[str, float] = FrozenMap(
@@ -59,17 +63,19 @@ _MOST_TERMS = 8
 """Largest number of terms of a polynomial in a DIMAP file."""
 _DAY = 86400.0
 _SAMPLES = 240
-"""Number of samples of a polynomial attitude: a cubic spline through them is accurate to 1e-12 rad for a rotation of 30
-deg.
+"""Number of samples of an attitude given by polynomials: a cubic spline through them is accurate to 1e-12 rad for a
+rotation of 30 deg.
 """
 _MARGIN = 0.05
-"""Share of an image's time, before its first line and after its last one, for which attitudes are sampled."""
+"""Time before the first and after the last image line for which polynomial attitudes are sampled, as a share of the
+image's duration.
+"""
 _NEAR = 0.1
 """Longest extrapolation of an orbit beyond its readings, in seconds: the neglected third derivative of its positions
 causes an error of 2 um.
 """
 _LINES_OFF = 3.0
-"""Largest allowed disagreement between the duration of the image and its number of lines, in lines."""
+"""Largest allowed difference between the number of lines and the image's duration divided by the line period."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,7 +89,7 @@ class AttitudePolynomial:
     offset : float
         Second of the day at which the polynomials' variable is 0.
     scale : float
-        Seconds by which the variable grows by 1.
+        Seconds for which the polynomials' variable increases by 1.
     coefficients : (4, K) ndarray for K powers
         Coefficients of Q0, the scalar, to Q3, ascending powers.
     """
@@ -124,16 +130,17 @@ class DimapPass:
     attitude : AttitudeReadings or AttitudePolynomial
         Attitude, as samples or as polynomials.
     forward, right : (K,) ndarray
-        K coefficients of the tangents of the angles of a pixel's look, forward and to the right, ascending powers of
-        the pixel from 0.
+        K coefficients of the tangents of a pixel's look angles, forward and to the right, ascending powers of the pixel
+        number from 0.
     pitch : float or None
-        Pixel pitch of the detector, metres; None where the file does not say.
+        Pixel pitch of the detector, metres; None where the file does not give it.
     refracted : bool
-        The model contains atmospheric refraction.
+        True if the model contains atmospheric refraction.
     inertial_velocity : bool
-        The file's velocities were inertial and have been converted.
+        True if the file's velocities were inertial and have been converted.
     light_speed : bool
-        The file says that the speed of light was taken into account; in which way is not documented.
+        True if the file declares that the speed of light was taken into account (aberration or light time; the format
+        does not document which).
     rpc : tuple of str
         Names of the files of the product's rational polynomials.
     """
@@ -164,8 +171,8 @@ class DimapPass:
     def samples(self) -> AttitudeReadings:
         """Return the attitude as readings; polynomials are sampled over the time of the image.
 
-        Samples that begin and end with the first and the last line do not cover the outer halves of these lines: the
-        spline through them is extrapolated by up to a sample's interval.
+        Samples that begin and end with the first and the last line do not cover the outer halves of these lines; there
+        the spline through them is extrapolated by at most one interval of the samples.
         """
         if isinstance(self.attitude, AttitudeReadings):
             return self._spanning_samples(self.attitude)
@@ -179,12 +186,12 @@ class DimapPass:
         return AttitudeReadings(self.file, clock, turns, None, "ITRS", "UTC", "first", "body_to_frame")
 
     def spanning_orbit(self) -> OrbitReadings:
-        """Return the orbit's readings, extended by one at either end where the image reaches a moment beyond them.
+        """Return the orbit's readings, extrapolated by one at each end where the image extends slightly beyond them.
 
         Raises
         ------
         InputError
-            The image reaches further beyond the readings.
+            The image extends farther beyond the readings.
         """
         time = self._since(self.orbit.clock)
         assert self.orbit.velocity is not None
@@ -205,7 +212,7 @@ class DimapPass:
         return OrbitReadings(self.file, self._clock(time), position, velocity, "ITRS", "UTC")
 
     def _spanning_samples(self, attitude: AttitudeReadings) -> AttitudeReadings:
-        """Return the attitude samples, extended by one at either end where the image reaches a moment beyond them."""
+        """Return the attitude samples, extrapolated by one at each end where the image extends slightly beyond them."""
         assert attitude.quaternion is not None
         time = self._since(attitude.clock)
         far = min(_NEAR, float(np.median(np.diff(time))))
@@ -240,7 +247,8 @@ class DimapPass:
 _GRAVITY = 3.986004418e14
 """Gravitational parameter of the Earth, in m^3/s^2.
 
-Relative to the rotating Earth an acceleration differs by a seventh, which moves an orbit by 6 mm in `_NEAR` seconds.
+The acceleration relative to the rotating Earth differs by a seventh from that of gravity; neglecting this displaces an
+orbit that is extrapolated by `_NEAR` seconds by 6 mm.
 """
 
 
@@ -255,14 +263,14 @@ def is_dimap(lines: list[str]) -> bool:
 
 
 def read_dimap(path: str | Path, band: str | None = None) -> DimapPass:
-    """Read the rigorous model of a product.
+    """Read the rigorous model of a product from its DIMAP file.
 
     Parameters
     ----------
     path : str or Path
         File DIM_*.XML of the product.
     band : str or None
-        Band whose looks are read; may be omitted where all bands have the same.
+        Band whose lines of sight are read; may be omitted where all bands have the same.
 
     Raises
     ------
@@ -362,7 +370,7 @@ def _times(time: Element, lines: int) -> tuple[Readings, float]:
 
 
 def _clock(items: list[Element], file: str) -> Readings:
-    """Return the times of elements, which must increase."""
+    """Return the times of XML elements as clock readings; raise InputError unless they increase."""
     moments = [_moment(item.one("TIME")) for item in items]
     clock = Readings(np.array([m.day[0] for m in moments]), np.array([m.second[0] for m in moments]))
     require_increasing(file, clock, [item.line for item in items])
@@ -416,7 +424,7 @@ def _attitude(attitudes: Element, file: str, day: int) -> AttitudeReadings | Att
 
 
 def _looks(calibration: Element, band: str | None) -> tuple[Array, Array]:
-    """Return coefficients of the looks' tangents forward and to the right, ascending powers of the pixel from 0."""
+    """Return coefficients of the look angles' tangents forward and to the right, ascending powers of the pixel."""
     direct = calibration.all("Polynomial_Look_Angles")
     bands = [*calibration.all("Band_Calibration_List", "Band_Calibration"), *calibration.all("Band_Calibration")]
     named = {element.words("BAND_ID"): element.one("Polynomial_Look_Angles") for element in bands}
@@ -442,7 +450,7 @@ def _looks(calibration: Element, band: str | None) -> tuple[Array, Array]:
 
 
 def _tangent(element: Element, name: str, first: int) -> Array:
-    """Return K coefficients of a look's tangent in powers of the pixel.
+    """Return the K coefficients of the tangent of a look angle in ascending powers of the pixel number.
 
     Pixel 0 is the value ``first`` of the file's variable.
     """

@@ -1,8 +1,8 @@
 """Earth orientation from tables: UT1, polar motion, celestial pole offsets, and the rotation GCRS -> ITRS.
 
-Between the days of a table its numbers are interpolated by cubics through four of them (IERS Gazette 13, 1997). UT1 is
-interpolated as UT1 - TAI, which has no steps. The tables do not contain the effects of ocean tides on pole and UT1
-within a day, which are omitted: some 3 cm on the ground.
+Between the days of a table, values are interpolated by cubics through the four nearest days (IERS Gazette 13, 1997).
+UT1 is interpolated as UT1 - TAI, which has no leap seconds. Diurnal and semidiurnal effects of ocean tides on pole and
+UT1, which the tables do not contain, are neglected: some 3 cm on the ground.
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ from twin.orbit.measured.xml_file import first_lines, numbers, text_lines
 WHAT = "a table of Earth orientation: finals2000A or C04 as the IERS gives them, or CSV"
 """Description of the file for error messages."""
 _RATE_STEP = 1.0
-"""Half step of the difference quotient of the rotation rate, in seconds: the error due to rounding is 1e-16 rad/s, that
-due to curvature far less.
+"""Half step of the difference quotient for the rotation rate, in seconds: its error due to rounding is 1e-16 rad/s, and
+that of the linear approximation far smaller.
 """
 _COLUMNS = (
     Column("mjd", least=FIRST_DAY, most=LAST_DAY),
@@ -41,7 +41,7 @@ _COLUMNS = (
 
 @dataclass(frozen=True, eq=False)
 class EarthOrientation:
-    """Table of Earth orientation, made by `read_earth_orientation`.
+    """Table of Earth orientation (UT1, polar motion, celestial pole offsets), from `read_earth_orientation`.
 
     Attributes
     ----------
@@ -108,7 +108,8 @@ class TableRotation:
     epoch : str
         UTC from which times are counted in SI seconds, ISO 8601 text.
     celestial_pole : callable
-        Spline of the pole's X and Y and of the locator s according to IAU 2006/2000A, radians.
+        Function of the time that returns the celestial pole's X and Y and the CIO locator s according to IAU
+        2006/2000A, radians.
     """
 
     table: EarthOrientation
@@ -116,7 +117,7 @@ class TableRotation:
     celestial_pole: Any
 
     def turn(self, seconds: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return UT1 (...), in days, and pole and celestial pole offsets (..., 2), in radians, at times (...).
+        """Return UT1 (...), days, and polar motion and celestial pole offsets (..., 2), radians, at times (...).
 
         UT1 is the second part of a Julian date whose first part is `julian`.
         """
@@ -154,12 +155,12 @@ class TableRotation:
 
 
 def angular_velocity(matrix: Any, seconds: np.ndarray) -> np.ndarray:
-    """Return the angular velocity of the target axes of a rotation, in these axes, (N, 3) for N times, in rad/s.
+    """Return the angular velocity of the axes to which a rotation transforms, in these axes, (N, 3), in rad/s.
 
     Parameters
     ----------
     matrix : callable
-        Function from seconds (N,) to rotation matrices (N, 3, 3).
+        Function of N times (N,), in seconds, that returns rotation matrices (N, 3, 3).
     seconds : (N,) ndarray
         Times, seconds.
     """
@@ -185,7 +186,7 @@ def constant_orientation(epoch: str, ut1_utc: float, pole: tuple[float, float]) 
     epoch : str
         UTC, ISO 8601 text.
     ut1_utc : float
-        UT1 - UTC at the epoch, seconds; UT1 runs on evenly from there, also over a leap second.
+        UT1 - UTC at the epoch, seconds; UT1 is taken to run at a constant rate from there, also over a leap second.
     pole : tuple of float
         x and y of the pole, radians.
     """
@@ -224,7 +225,7 @@ def read_earth_orientation(path: str | Path) -> EarthOrientation:
 
 
 def _c04(file: str, rows: list[tuple[int, str]]) -> EarthOrientation:
-    """Parse the rows of a C04 table."""
+    """Parse the rows of an Earth orientation table of the IERS series C04."""
     cells = [line.split() for _, line in rows]
     lines = [k for k, _ in rows]
     columns = [4, 5, 6, 7, 8, 9] if len(cells[0]) == 21 else [3, 4, 5, 6, 8, 9]
@@ -241,13 +242,15 @@ def _c04(file: str, rows: list[tuple[int, str]]) -> EarthOrientation:
 
 
 _FINAL = {"x": (134, 144), "y": (144, 154), "UT1-UTC": (154, 165), "dX": (165, 175), "dY": (175, 185)}
-"""Character columns of Bulletin B in finals2000A, by quantity; it is final, and later days have Bulletin A alone."""
+"""Character columns of the final values (Bulletin B) in finals2000A, by quantity; recent days have only those of
+Bulletin A.
+"""
 _FINALS = {"MJD": (7, 15), "x": (18, 27), "y": (37, 46), "UT1-UTC": (58, 68), "dX": (97, 106), "dY": (116, 125)}
 """Character columns of Bulletin A in finals2000A, by quantity."""
 
 
 def _finals(file: str, rows: list[tuple[int, str]]) -> EarthOrientation:
-    """Parse the rows of a finals2000A table: values of Bulletin B where the file has them, else of Bulletin A.
+    """Parse the rows of a finals2000A table: values of Bulletin B if the file has them, otherwise of Bulletin A.
 
     Days without a prediction of pole and UT1 are omitted.
     """

@@ -43,7 +43,8 @@ class GroundFile:
     points : GroundPoints
         Ground points with covariances and roles, in the ITRS.
     accuracy : float or None
-        Accuracy of the transformation to the ITRS according to its authority, metres; None where it gives none.
+        Accuracy of the transformation to the ITRS according to its authority (such as EPSG), metres; None where none is
+        given.
     images : mapping of str to (n, 5) ndarray for n measurements
         Image measurements by image file, where the file has some: index in `points`, line, pixel, and the sigmas of
         line and pixel in pixels.
@@ -56,7 +57,7 @@ class GroundFile:
 
 @dataclass(eq=False)
 class _Rows:
-    """Rows of a file: names, coordinates in the file's system, sigmas (NaN if there are none), roles, line numbers."""
+    """Points of a file: names, coordinates in the file's system, sigmas (NaN if not given), roles, line numbers."""
 
     ids: list[str]
     places: np.ndarray
@@ -116,7 +117,7 @@ def read_ground_points(spec: GroundFileSpec, folder: Path) -> GroundFile:
 
 
 def _required(spec: GroundFileSpec) -> str:
-    """Return the coordinate system of the test's file, or raise InputError if it names none."""
+    """Return the coordinate system named in the test's file; raise InputError if it names none."""
     if spec.crs is None:
         raise spec.error("the coordinate system is not specified", ("crs",), allowed="EPSG:4979, EPSG:32650, ...")
     return spec.crs
@@ -156,7 +157,7 @@ def _role(file: str, role: str, line: int | None, key: tuple[str | int, ...] = (
 
 
 def _csv(path: Path, spec: GroundFileSpec) -> _Rows:
-    """Read the rows of a CSV file."""
+    """Read ground points from the rows of a CSV file."""
     table, file = read_table(path, _COLUMNS), str(path)
     sets = [names for names in _PLACES if all(name in table for name in names)]
     others = [n for names in _PLACES for n in names if n in table and not (sets and n in sets[0])]
@@ -185,7 +186,7 @@ def _csv(path: Path, spec: GroundFileSpec) -> _Rows:
 
 
 def _fits(spec: GroundFileSpec, names: tuple[str, ...]) -> None:
-    """Raise InputError unless columns of these names can be coordinates of the system."""
+    """Raise InputError unless columns with these names can hold coordinates in the file's reference system."""
     import pyproj
 
     try:
@@ -200,7 +201,7 @@ def _fits(spec: GroundFileSpec, names: tuple[str, ...]) -> None:
 
 
 def _geojson(path: Path, spec: GroundFileSpec) -> _Rows:
-    """Read the point features of a GeoJSON file."""
+    """Read ground points from the point features of a GeoJSON file."""
     file, text = str(path), table_text(path, "a GeoJSON file")
     data = parse_json(text, file)
     features = data.get("features") if isinstance(data, dict) else None
@@ -264,7 +265,7 @@ def _alike(first: Any, second: Any) -> bool:
 
 
 def _of_header(spec: GroundFileSpec, header: str) -> str:
-    """Return the coordinate system of a header `# WKT:`, which the test file may repeat."""
+    """Return the coordinate system of a header `# WKT:`; raise InputError if the test file names another one."""
     import pyproj
 
     try:
@@ -277,8 +278,8 @@ def _of_header(spec: GroundFileSpec, header: str) -> str:
         problem, allowed = "the header names a projected system", "a geographic system: latitude, longitude, height"
         raise spec.error(problem, ("file",), found=crs.name, allowed=allowed)
     if not same:
-        allowed = f"{crs.name}, as the file's header says, or none"
-        raise spec.error("the file's header names another coordinate system", ("crs",), found=spec.crs, allowed=allowed)
+        problem, allowed = f"the file's header names {crs.name}, not the specified system", f"{crs.name}, or no key crs"
+        raise spec.error(problem, ("crs",), found=spec.crs, allowed=allowed)
     return spec.crs or header
 
 

@@ -4,9 +4,9 @@ Rasters are GeoTIFF and other files that GDAL reads; they are read in parts, sin
 memory. The part of a user's map that images show is used in the plane coordinates of the ground without resampling.
 
 Coordinates of any reference system are transformed to the ITRS and back, and heights above a geoid to heights above the
-ellipsoid. PROJ provides the systems. It never guesses: ballpark transformations are excluded, and a missing grid is an
-error. WGS 84 is taken as the ITRS, as everywhere in the program. So is CGCS2000, from which PROJ has no transformation:
-it is ITRF97 at epoch 2000.0, and plates have moved since by some 3 cm a year.
+ellipsoid. PROJ provides the systems. Approximate (ballpark) transformations are excluded, and a missing grid is an
+error. WGS 84 is treated as the ITRS, as everywhere in the program. So is CGCS2000, for which PROJ has no
+transformation: it is ITRF97 at epoch 2000.0, and tectonic plates have moved since by some 3 cm a year.
 """
 
 from __future__ import annotations
@@ -33,14 +33,16 @@ if TYPE_CHECKING:
     from scenes.specs.orbit.measurements import RasterFileSpec
 
 LARGEST_PART = 100_000_000
-"""Largest number of pixels of a raster that are read at once."""
+"""Largest number of pixels of a raster that are read at a time."""
 _DRIVERS = ("GTiff", "GTX", "COG")
-"""GDAL drivers of plain grids; other drivers open files and addresses that a raster names."""
+"""GDAL drivers that are allowed, those of plain grids; other drivers can open further files and network addresses that
+a raster names.
+"""
 
 
 @dataclass(frozen=True, eq=False)
 class GeoRaster:
-    """Georeferenced raster file, made by `open_raster`; its values are read on request.
+    """Georeferenced raster file, opened by `open_raster`; its values are read on request.
 
     Attributes
     ----------
@@ -194,7 +196,7 @@ CGCS2000 = "China 2000"
 
 @dataclass(frozen=True, eq=False)
 class Geoid:
-    """Heights of a geoid above the ellipsoid on a grid of longitude and latitude, bilinear between its nodes.
+    """Heights of a geoid above the ellipsoid on a grid of longitude and latitude, interpolated bilinearly.
 
     Attributes
     ----------
@@ -265,7 +267,7 @@ class Geoid:
 
 @dataclass(frozen=True, eq=False)
 class Datum:
-    """Coordinate reference system with the reference surface of its heights, made by `Datum.of`.
+    """Coordinate reference system with the reference surface of its heights, from `Datum.of`.
 
     Attributes
     ----------
@@ -365,7 +367,7 @@ class Datum:
 
     @property
     def accuracy(self) -> float | None:
-        """Accuracy of the transformation to the ITRS according to its authority, metres.
+        """Accuracy of the transformation to the ITRS according to its authority (such as EPSG), in metres.
 
         It is None if it is unknown, or before `itrs` is called.
         """
@@ -379,7 +381,7 @@ class Datum:
 
 
 def _to_itrs(crs: pyproj.CRS) -> pyproj.Transformer:
-    """Return the transformation from a system to geocentric coordinates of the ITRS."""
+    """Return the transformation from a coordinate reference system to geocentric coordinates of the ITRS."""
     geodetic, target = crs.geodetic_crs, pyproj.CRS("EPSG:4978")
     if geodetic is not None and geodetic.datum is not None and geodetic.datum.name == CGCS2000:
         target = GeocentricCRS(datum=geodetic.datum)
@@ -387,9 +389,9 @@ def _to_itrs(crs: pyproj.CRS) -> pyproj.Transformer:
 
 
 MOST_HEIGHT = 2.0e4
-"""Largest height of ground above or depth below an ellipsoid or geoid, whatever its datum, in metres."""
+"""Largest plausible height or depth of ground relative to any ellipsoid or geoid, in metres."""
 _SAMPLED = 512
-"""Number of rows and columns at which a map is searched for its extreme heights."""
+"""Number of rows and of columns at which an elevation model is sampled to find its extreme heights."""
 _WGS84 = "EPSG:4326"
 
 
@@ -444,7 +446,7 @@ class MapPart:
 
 @dataclass(frozen=True, eq=False)
 class UserMap:
-    """Map in a file, of which parts are read; made by `UserMap.open`.
+    """Orthophoto or elevation model in a file, of which parts are read; opened by `UserMap.open`.
 
     Attributes
     ----------

@@ -1,8 +1,8 @@
 """Tables of a pass's measurements: reading with explicit conventions, writing without loss of digits.
 
-Rows may be in any order, columns in any order and unit. Conventions that the numbers do not show, such as the order of
-a quaternion's components, are specified by the test's file; what the numbers do show, such as a velocity that is not
-that of the positions, is checked.
+Rows may be in any order, columns in any order and unit. Conventions that cannot be inferred from the numbers, such as
+the order of a quaternion's components, are specified in the test's file; inconsistencies in the numbers, such as a
+velocity that is not the rate of change of the positions, are reported as errors.
 """
 
 from __future__ import annotations
@@ -38,13 +38,15 @@ from twin.orbit.measured.orbit_files import EARTH_FIXED_VELOCITY, INERTIAL_VELOC
 from twin.orbit.measured.pass_measurements import GroundPoints, ImagePoints, PassMeasurements
 
 _FAR, _FAST, _LATE, _MANY = 1e9, 1e5, 1e10, 1e9
-"""Limits of plausible input, in metres, m/s, seconds and lines; below them sums of squares do not overflow."""
+"""Largest accepted absolute values of coordinates (metres), velocities (m/s), times (seconds) and line numbers; sums of
+their squares do not overflow.
+"""
 _TIME = Column("time", TIME, least=-_LATE, most=_LATE)
 _PLACE = tuple(Column(axis, LENGTH, least=-_FAR, most=_FAR) for axis in "xyz")
 _SPEED = tuple(Column(f"v{axis}", SPEED, needed=False, least=-_FAST, most=_FAST) for axis in "xyz")
 _QUATERNION = tuple(Column(f"q{k}", least=-1.001, most=1.001) for k in range(1, 5))
 _LARGE = 1e6
-"""Largest sigma of a ground coordinate that is plausible, in metres."""
+"""Largest accepted sigma of a ground coordinate, in metres."""
 _CORRELATIONS = ("correlation_xy", "correlation_xz", "correlation_yz")
 COLUMNS: Mapping[str, tuple[Column, ...]] = {
     "platform": (_TIME, *_PLACE, *_SPEED, *_QUATERNION),
@@ -75,9 +77,7 @@ _SIGMAS = (("sigma",), ("plan_sigma", "height_sigma"), ("x_sigma", "y_sigma", "z
 _EARTH_AXES = np.array([6_378_137.0, 6_378_137.0, 6_356_752.314])
 """Semi-axes of the WGS84 ellipsoid, in metres."""
 CALIBRATING: Mapping[str, int] = {"control": 1, "check": 2}
-"""Number of line cameras in which one or more of the ground points must be seen, by role of the point, for a
-calibration.
-"""
+"""Number of line cameras that must see at least one of the ground points for a calibration, by role of the points."""
 
 
 def read_pass(
@@ -100,7 +100,7 @@ def read_pass(
     camera : ThreeLineCameraSpec
         Payload whose lines the tables name.
     needed : mapping of str to int
-        Smallest number of line cameras that must see one of the points, by role.
+        Role of points (such as control) -> smallest number of line cameras that must see at least one of them.
 
     Raises
     ------
@@ -173,7 +173,7 @@ def read_measurements(
     advance : Advance
         Callback that reports progress.
     needed : mapping of str to int
-        Smallest number of line cameras that must see one of the points, by role.
+        Role of points (such as control) -> smallest number of line cameras that must see at least one of them.
 
     Raises
     ------
@@ -190,14 +190,14 @@ def read_measurements(
 def _line_times_of(
     table: Table, conventions: ConventionsSpec, camera: ThreeLineCameraSpec, platform: PlatformTable
 ) -> tuple[dict[str, LineTimes], dict[str, float]]:
-    """Return the line times of each line camera, counted from its first line, and that line's number in the file.
+    """Return each line camera's line times, with lines counted from its first, and the file's number of that line.
 
     Parameters
     ----------
     table : Table
         Times of the lines of all cameras.
     conventions : ConventionsSpec
-        Conventions, which say to which moment of an exposure its time refers.
+        Conventions, which specify to which moment of an exposure its time refers.
     camera : ThreeLineCameraSpec
         Payload with the lines.
     platform : PlatformTable
@@ -303,7 +303,7 @@ def _image_points_of(
     camera: ThreeLineCameraSpec,
     trajectory: TabulatedTrajectory,
 ) -> dict[str, ImagePoints]:
-    """Return the image points of each line camera, by number of the ground point.
+    """Return the image points of each line camera, with the numbers of their ground points.
 
     Parameters
     ----------
@@ -372,14 +372,14 @@ def image_covariance(table: Table, rows: NDArray[np.intp]) -> Array:
 
 
 def require_known(table: Table, column: str, names: tuple[str, ...]) -> None:
-    """Raise InputError unless every cell of a column is one of these names."""
+    """Raise InputError unless every cell of a table's column is one of the given names."""
     for row in np.flatnonzero(~np.isin(table[column].astype(str), names))[:1]:
         cell = str(table[column][row])
         raise table.error(int(row), column, f"no such {column}", shown(cell), names_text(names), nearest(cell, names))
 
 
 def _once(table: Table, column: str) -> None:
-    """Raise InputError if a name occurs twice in a column."""
+    """Raise InputError if a name occurs twice in a column of a table."""
     seen: dict[str, int] = {}
     for row, name in enumerate(table[column].tolist()):
         if name in seen:
@@ -398,7 +398,7 @@ CONVENTIONS: Mapping[str, Any] = {
     "first_pixel": 0,
     "first_pixel_sees": "right",
 }
-"""Conventions of the files that are written: the project's own."""
+"""Conventions (frames, quaternion order, pixel origin) of the files that are written, those of the project."""
 CAMERA_FILE = "camera.yaml"
 TEST_FILE = "calibrate.yaml"
 
@@ -497,7 +497,7 @@ def _columns(names: Sequence[str], values: np.ndarray) -> dict[str, np.ndarray]:
 
 
 def _csv(columns: Mapping[str, Any]) -> str:
-    """Return the text of a table, with the shortest digits that read back to the same bits."""
+    """Return a table as CSV text, each number with the fewest digits that reproduce it exactly."""
     cells = [[str(v) for v in np.asarray(c, dtype=object).tolist()] for c in columns.values()]
     rows = [", ".join(columns), *map(",".join, zip(*cells, strict=True))]
     return "\n".join(rows) + "\n"
@@ -506,11 +506,15 @@ def _csv(columns: Mapping[str, Any]) -> str:
 _LEAST_RADIUS, _MOST_RADIUS = 6.45e6, 5.0e7
 """Range of geocentric distances of mapping satellites, in metres."""
 _UNIT_TOLERANCE = 1e-3
-"""Largest departure of a quaternion's norm from 1."""
+"""Largest accepted deviation of a quaternion's norm from 1."""
 _FALL, _JUMP = 12.0, 0.05
-"""Largest acceleration, in m/s^2, and largest change of the velocity by noise of readings, as a share of the speed."""
+"""Largest accepted acceleration of a satellite, in m/s^2, and largest change of velocity that the noise of readings may
+cause, as a share of the speed.
+"""
 _LEAST_TURN, _FASTEST_TURN = np.radians(2.0), np.radians(10.0)
-"""Limit of the rotation between two readings, radians plus radians per second: more than that of agile satellites."""
+"""Limit of the rotation between two readings: a constant, in radians, plus a rate, in radians per second, which is
+higher than that of agile satellites.
+"""
 
 
 def platform_of(epoch: str, orbit: Table, attitude: Table, conventions: ConventionsSpec) -> PlatformTable:
@@ -519,7 +523,7 @@ def platform_of(epoch: str, orbit: Table, attitude: Table, conventions: Conventi
     Parameters
     ----------
     epoch : str
-        Zero of the times, UTC, ISO 8601.
+        Instant from which times count, UTC, ISO 8601.
     orbit : Table
         Table of the orbit.
     attitude : Table
@@ -530,8 +534,8 @@ def platform_of(epoch: str, orbit: Table, attitude: Table, conventions: Conventi
     Raises
     ------
     InputError
-        A time occurs twice, a position is impossible for a satellite, a velocity is not that of the positions, or a
-        quaternion is not of unit length.
+        A time occurs twice, a position is impossible for a satellite, a velocity is not the rate of change of the
+        positions, or a quaternion is not of unit length.
     """
     order, looks = _rising(orbit), _rising(attitude)
     time, place = orbit["time"][order], orbit.stacked("x", "y", "z")[order]
@@ -588,7 +592,7 @@ def _quaternions_of(numbers: Array, conventions: ConventionsSpec) -> Array:
 
 
 def _rising(table: Table) -> NDArray[np.intp]:
-    """Return the indices of the rows in the order of time; raise InputError if a time occurs twice."""
+    """Return the indices that sort the rows by time; raise InputError if a time occurs twice."""
     order = np.argsort(table["time"], kind="stable")
     for row in order[1:][np.diff(table["time"][order]) == 0.0][:1]:
         raise table.error(int(row), "time", "this time occurs twice", f"{table['time'][row]:.9g} s", "each time once")
@@ -596,7 +600,7 @@ def _rising(table: Table) -> NDArray[np.intp]:
 
 
 def _check_jumps(table: Table, order: NDArray[np.intp], time: Array, place: Array) -> None:
-    """Raise InputError for a position that no orbit passes between its neighbours."""
+    """Raise InputError for a position that is impossible on an orbit through its neighbours in time."""
     step = np.diff(time)
     with np.errstate(over="ignore", invalid="ignore"):  # times can almost coincide
         rate = np.diff(place, axis=0) / step[:, None]

@@ -1,12 +1,13 @@
 """Orbit and attitude files of other programs: CCSDS messages (OEM 502.0-B, AEM 504.0-B), SP3-c and SP3-d.
 
-CCSDS: an attitude's quaternion q = (e sin(a/2), cos(a/2)) belongs to the rotation by an angle a about a unit vector e
-that takes frame A to frame B. So from A to the body the axes of the body are those of A rotated by q, and components in
-the body become those in A by R(q): the convention is body_to_frame. ATTITUDE_DIR B2A, or a body that is frame A, is the
-other way. In version 1 QUATERNION_TYPE gives the position of the scalar; version 2 has it last.
+CCSDS: an attitude's quaternion q = (e sin(a/2), cos(a/2)) is the rotation by an angle a about a unit vector e that
+takes frame A to frame B. Where B is the body, the body's axes are those of A rotated by q, and R(q) converts components
+in the body to those in A: the convention is body_to_frame. It is the opposite for ATTITUDE_DIR B2A, or where frame A is
+the body. In version 1 QUATERNION_TYPE gives the position of the scalar; version 2 has it last.
 
 SP3: positions are in kilometres, velocities in dm/s, both Earth-fixed; the time system is in the header. A position of
-zeros is a missing one. A file without its last line EOF is complete where it has as many epochs as its header says.
+zeros means a missing value. A file without its last line EOF is complete where it has as many epochs as its header
+says.
 """
 
 from __future__ import annotations
@@ -33,14 +34,14 @@ FRAMES: tuple[str, ...] = get_args(Frame)
 
 @dataclass(frozen=True, eq=False)
 class Segment:
-    """Part of an orbit that is interpolated by itself, as between two manoeuvres.
+    """Part of an orbit that is interpolated separately, such as between two manoeuvres.
 
     Attributes
     ----------
     first, last : int
         First and last of its readings, counted from 0.
     usable : Readings or None
-        Two clock readings between which the file allows its use; None for all of it.
+        Two clock readings between which the file allows the use of the segment; None for all of it.
     """
 
     first: int
@@ -63,9 +64,9 @@ class OrbitReadings:
     velocity : (N, 3) ndarray or None
         Velocities, m/s, in and relative to the axes of the same frame; None where the file has none.
     frame : str or None
-        Reference frame; None where the file does not say.
+        Reference frame; None where the file does not specify it.
     scale : str or None
-        Time scale of the clock; None where the file does not say.
+        Time scale of the clock; None where the file does not specify it.
     segments : tuple of Segment
         Parts between which no interpolation is allowed; empty for a single part.
     """
@@ -105,13 +106,13 @@ class AttitudeReadings:
     angles : (M, 3) ndarray or None
         Roll, pitch, yaw, radians; None for quaternions.
     frame : str or None
-        Frame relative to which the body is rotated; None where the file does not say.
+        Frame relative to which the body is rotated; None where the file does not specify it.
     scale : str or None
-        Time scale of the clock; None where the file does not say.
+        Time scale of the clock; None where the file does not specify it.
     scalar : Scalar or None
-        Position of the scalar part; None where the file does not say.
+        Position of the quaternion's scalar part, first or last; None where the file does not specify it.
     turns : Turns or None
-        Direction of the rotation; None where the file does not say.
+        Direction of the rotation, body to frame or frame to body; None where the file does not specify it.
     """
 
     file: str
@@ -130,10 +131,10 @@ class AttitudeReadings:
 
 
 def known_frame(name: str, file: str, line: int | None = None, key: str = "REF_FRAME") -> str:
-    """Return the reference frame of a name as other files spell it.
+    """Return the reference frame for a name as files spell it.
 
-    Every ITRF and WGS 84 counts as ITRS: realisations since 1992 agree to some centimetres. GCRF and ICRF are GCRS, and
-    J2000 is EME2000, which is rotated relative to it by 0.02 arcsec.
+    Every ITRF, and WGS 84, is treated as ITRS: realisations since 1992 agree to some centimetres. GCRF and ICRF are
+    treated as GCRS, and J2000 as EME2000, which is rotated relative to GCRS by 0.02 arcsec.
 
     Raises
     ------
@@ -154,7 +155,7 @@ def known_frame(name: str, file: str, line: int | None = None, key: str = "REF_F
 def require_orbit(file: str, position: np.ndarray, lines: list[int]) -> None:
     """Raise InputError unless N positions (N, 3), in metres, lie between the Earth's surface and 100 000 km.
 
-    Positions that fail have the wrong unit. `lines` are their line numbers in the file.
+    Other positions probably have the wrong unit. `lines` are the line numbers of the positions in the file.
     """
     radius = np.linalg.norm(position, axis=1)
     for row in np.flatnonzero((radius < 6.3e6) | (radius > 1e8))[:1]:
@@ -173,14 +174,15 @@ def require_unit(file: str, quaternion: np.ndarray, lines: list[int]) -> None:
 
 
 SPEED_TOLERANCE = 0.02
-"""Relative tolerance of a velocity.
+"""Largest relative difference between a velocity and the rate of change of the positions.
 
-Positions of 1 m noise 1 s apart differ by less, and the inertial velocity differs by 6 % and more.
+Noise of 1 m in positions 1 s apart causes a smaller difference, and inertial velocities differ by at least 6 % from
+those relative to the Earth.
 """
 
 
 def velocity_misfit(time: Array, place: Array, speed: Array) -> tuple[Array, bool]:
-    """Return the misfit of velocities to the change of Earth-fixed positions, and whether they are inertial ones.
+    """Return the misfit of velocities to Earth-fixed positions, and whether the velocities are inertial.
 
     Inertial velocities are larger by omega x P, with the Earth's rotation vector omega and the position P.
 
@@ -196,7 +198,8 @@ def velocity_misfit(time: Array, place: Array, speed: Array) -> tuple[Array, boo
     Returns
     -------
     tuple of (N - 1,) ndarray and bool
-        Relative differences, and whether the velocities minus omega x P fit while they themselves do not.
+        Relative differences between velocities and rates of change of positions, and True if the velocities fit only
+        after subtraction of omega x P.
     """
     rate = np.diff(place, axis=0) / np.diff(time)[:, None]
     # Across a long step the chord is shorter than the arc and lies to its side, which is not an error of the velocity.
@@ -208,7 +211,7 @@ def velocity_misfit(time: Array, place: Array, speed: Array) -> tuple[Array, boo
 
 
 def require_earth_fixed_velocity(orbit: OrbitReadings) -> None:
-    """Raise InputError if the velocities of Earth-fixed positions are inertial ones."""
+    """Raise InputError if Earth-fixed positions come with inertial velocities."""
     time = (orbit.clock.day - orbit.clock.day[0]) * 86400.0 + orbit.clock.second
     if orbit.velocity is not None and velocity_misfit(time, orbit.position, orbit.velocity)[1]:
         raise InputError(Issue(INERTIAL_VELOCITY, orbit.file, None, (), None, EARTH_FIXED_VELOCITY))
@@ -373,9 +376,9 @@ def _from_text(file: str, lines: list[str], kind: str) -> Iterator[_Segment]:
 
 
 _STATE = ("EPOCH", "X", "Y", "Z", "X_DOT", "Y_DOT", "Z_DOT")
-"""Elements of a state vector in XML."""
+"""Names of the elements of a state vector (position and velocity) in XML."""
 _TURN = {"LAST": ("EPOCH", "Q1", "Q2", "Q3", "QC"), "FIRST": ("EPOCH", "QC", "Q1", "Q2", "Q3")}
-"""Elements of an attitude state in XML, by QUATERNION_TYPE."""
+"""Names of the elements of an attitude state in XML, by QUATERNION_TYPE (position of the scalar)."""
 
 
 def _from_xml(file: str, text: str, kind: str) -> Iterator[_Segment]:
@@ -423,7 +426,7 @@ def _chosen(file: str, segments: list[_Segment], satellite: str | None) -> list[
 
 
 def _same(file: str, segments: list[_Segment], key: str, usual: str | None = None) -> tuple[str, int]:
-    """Return the value of a key that all segments share, and its line in the file."""
+    """Return the value of a key, which must be the same in all segments, and its line in the file."""
     entries = [s.keys.get(key) for s in segments]
     values = {None if value is None else value[0] for value in entries}
     if values == {None} and usual is not None:
@@ -449,8 +452,8 @@ def _scale(file: str, segments: list[_Segment]) -> str:
 def _parts(file: str, segments: list[_Segment]) -> tuple[Segment, ...]:
     """Return the segments of an orbit as parts that are interpolated separately.
 
-    Nothing may be interpolated from one to the next, for they meet where an orbit breaks, as at a manoeuvre, nor used
-    outside of USEABLE_START_TIME and USEABLE_STOP_TIME (502.0-B, 5.2.4).
+    No interpolation is allowed from one to the next, because they meet at discontinuities such as manoeuvres, and no
+    use outside of USEABLE_START_TIME and USEABLE_STOP_TIME (502.0-B, 5.2.4).
     """
     found, first = [], 0
     for segment in segments:
@@ -467,7 +470,7 @@ def _parts(file: str, segments: list[_Segment]) -> tuple[Segment, ...]:
 
 
 def _joined(segments: list[_Segment]) -> tuple[list[list[str]], list[int]]:
-    """Return the data rows of all segments with their line numbers; a time that two segments share is kept once."""
+    """Return the data rows of all segments with their line numbers; a time shared by two segments is listed once."""
     rows: list[list[str]] = []
     lines: list[int] = []
     for segment in segments:
@@ -552,7 +555,7 @@ def read_sp3(path: str | Path, satellite: str | None = None) -> OrbitReadings:
 
 
 def _satellite(file: str, lines: list[str], wanted: str | None, old: bool) -> str:
-    """Return the name of a satellite in the file; in files of versions a and b it may be a bare number."""
+    """Return the identifier of a satellite as the SP3 file writes it; in versions a and b it may be a bare number."""
     names = list(dict.fromkeys(line[1:4].strip() for line in lines if line[:1] == "P"))
     key, found = ("satellite",), names_text(names[:20]) or "none"
     if wanted is None:
@@ -567,7 +570,7 @@ def _satellite(file: str, lines: list[str], wanted: str | None, old: bool) -> st
 
 
 def _sp3_scale(file: str, lines: list[str], old: bool) -> str:
-    """Return the time scale of an SP3 file; without a statement, versions a and b have GPS time."""
+    """Return the time scale of an SP3 file; files of versions a and b that do not specify one have GPS time."""
     for k, line in enumerate(lines[:400]):
         if line.startswith("%c"):
             if old and line[9:12].lower() in ("ccc", "", "   "):

@@ -1,4 +1,4 @@
-"""Measurements of a pass in the project's own conventions: frames, signs and pixel coordinates.
+"""Measurements of a pass in the project's conventions of frames, signs and pixel coordinates.
 
 Every analysis uses this form, whether the measurements were read from a satellite's files or simulated.
 """
@@ -19,13 +19,14 @@ from twin.orbit.flight.platform_table import PlatformTable
 ROLES = ("control", "check", "tie")
 """Roles of ground points.
 
-Coordinates of control points are used, those of check points only test the result, those of tie points are unknown.
+The coordinates of control points are used as observations, those of check points only test the result, and those of tie
+points are unknown.
 """
 
 
 @dataclass(frozen=True, eq=False)
 class GroundPoints:
-    """Ground points with covariance and role.
+    """Ground points of a pass with their names, coordinates, covariances and roles.
 
     Attributes
     ----------
@@ -162,13 +163,13 @@ class ImagePoints:
 
 
 def point_names(roles: NDArray[np.object_]) -> list[str]:
-    """Return names for points of these roles: c, k or t (control, check, tie), and their number."""
+    """Return names for points: a letter for the role, c, k or t (control, check, tie), and a number."""
     letter = {"control": "c", "check": "k", "tie": "t"}
     return [f"{letter[role]}{k}" for k, role in enumerate(roles.tolist())]
 
 
 _APART = 0.01
-"""Smallest distance of two targets that images from orbit resolve, in metres."""
+"""Distance of two ground points, in metres, below which they count as the same: images from orbit do not resolve it."""
 
 
 def duplicates(ids: NDArray[np.object_], places: Array) -> str:
@@ -194,7 +195,7 @@ _NAMED = 8
 
 
 def listed(names: Sequence[str]) -> str:
-    """Return a text with the first of some names, and the number of further ones."""
+    """Return a text that lists the first `_NAMED` names and the number of further ones."""
     more = f" and {len(names) - _NAMED} more" if len(names) > _NAMED else ""
     return ", ".join(names[:_NAMED]) + more
 
@@ -214,7 +215,7 @@ class PassMeasurements:
     ground : GroundPoints
         Control, check and tie points.
     images : mapping of str to ImagePoints
-        Image points of each line camera; `point` counts the rows of `ground`.
+        Image points of each line camera; their attribute `point` is an index into `ground`.
     """
 
     name: str

@@ -1,8 +1,8 @@
 """Orbit and attitude from files of any format: a table of readings in the ITRS, and the sensor of a DIMAP scene.
 
-Reading the files and interpreting them are two steps: `PlatformReadings` holds the numbers of the files, `Conventions`
-their meaning, and `platform_table` makes the table from both, so that the same readings can be interpreted in another
-way.
+Reading the files and interpreting them are separate steps: `PlatformReadings` holds the numbers of the files,
+`Conventions` specifies their meaning (frames, time scales, order of quaternion elements), and `platform_table` makes
+the table from both, so that the same readings can be interpreted under other conventions.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ _EME2000_FROM_GCRS = np.asarray(erfa.bp06(2451545.0, 0.0)[0])
 
 @dataclass(frozen=True)
 class Conventions:
-    """Conventions of orbit and attitude files, with the names of values that the keys of test files have.
+    """Conventions of orbit and attitude files, with the values of the corresponding keys of test files.
 
     Attributes
     ----------
@@ -126,7 +126,7 @@ def read_platform(spec: PlatformFilesSpec, folder: Path) -> tuple[PlatformReadin
     Raises
     ------
     InputError
-        A file cannot be read, or a convention is specified neither by file nor spec, or differently.
+        A file cannot be read, or a convention is specified neither by the file nor by `spec`, or differently by both.
     """
     orbit, attitude = _orbit(spec.orbit, folder), _attitude(spec.attitude, folder)
     quaternions = attitude.quaternion is not None
@@ -158,7 +158,7 @@ def read_platform(spec: PlatformFilesSpec, folder: Path) -> tuple[PlatformReadin
 
 
 def platform_table(readings: PlatformReadings, conventions: Conventions, epoch: str | None = None) -> PlatformTable:
-    """Return the table of readings under given conventions.
+    """Convert readings of orbit and attitude to a table in the ITRS, under given conventions.
 
     Parameters
     ----------
@@ -167,7 +167,7 @@ def platform_table(readings: PlatformReadings, conventions: Conventions, epoch: 
     conventions : Conventions
         Conventions of the readings.
     epoch : str or None
-        Zero of the times, UTC, ISO 8601; None for the first second of the orbit.
+        Instant from which times count, UTC, ISO 8601; None for the first orbit reading, rounded down to a second.
 
     Raises
     ------
@@ -228,7 +228,7 @@ def platform_table(readings: PlatformReadings, conventions: Conventions, epoch: 
 
 
 def _one_segment(readings: PlatformReadings, conventions: Conventions) -> tuple[OrbitReadings, Instants | None]:
-    """Return the segment of an orbit with most of the attitude, and the instants between which it may be used."""
+    """Return the orbit segment that covers most attitude readings, and the instants between which it may be used."""
     orbit, attitude = readings.orbit, readings.attitude
     looks = _instants(attitude.file, attitude.clock, conventions.attitude_scale, conventions.attitude_offset)
     fixes = _instants(orbit.file, orbit.clock, conventions.orbit_scale, conventions.orbit_offset)
@@ -295,7 +295,7 @@ def _instants(file: str, clock: Readings, scale: str, offset: float) -> Instants
 
 
 def _stated(spec: Any, key: str, in_spec: str | None, in_file: str | None, what: str) -> str:
-    """Return the convention that the spec or the file specifies; raise InputError if neither does or they differ."""
+    """Return the value of a convention; raise InputError if neither test file nor data file gives it or they differ."""
     if in_spec is None and in_file is None:
         raise spec.error(f"{what} is not specified, neither by the file nor here", (key,), allowed=f"`{key}:` here")
     if in_spec is not None and in_file is not None and in_spec != in_file:
@@ -387,7 +387,7 @@ def clock_of(table: Table, spec: OrbitFileSpec | AttitudeFileSpec | LineTimesFil
 
 
 def _clock(table: Table, spec: OrbitFileSpec | AttitudeFileSpec) -> tuple[Readings, str | None]:
-    """Return increasing readings of a table, with the scale UTC where each of them ends in Z."""
+    """Return the clock readings of a table, checked to increase, and the scale UTC if all their texts end in Z."""
     clock = clock_of(table, spec)
     if "date_time" in table:
         if spec.epoch is not None:
@@ -402,7 +402,7 @@ def _clock(table: Table, spec: OrbitFileSpec | AttitudeFileSpec) -> tuple[Readin
 
 
 def _counted(spec: OrbitFileSpec | AttitudeFileSpec, clock: Readings) -> Readings:
-    """Return readings of a clock that shows UTC, corrected if the file counts leap seconds since the epoch."""
+    """Return UTC clock readings, corrected where the file's seconds since the epoch include leap seconds."""
     try:
         days, where = np.unique(clock.day, return_inverse=True)
         start = tai_minus_utc(calendar_reading(str(spec.epoch))[0])
@@ -446,9 +446,9 @@ def read_scene(path: str | Path, band: str | None = None, effects: LightEffects 
     path : str or Path
         File DIM_*.XML of the product.
     band : str or None
-        Band whose looks are read; may be omitted where all bands have the same.
+        Band whose lines of sight are read; may be omitted where all bands have the same.
     effects : LightEffects or None
-        Effects on the light; None for refraction where the file says so, and nothing else.
+        Effects on the light; None for refraction alone, where the file specifies it.
 
     Raises
     ------
@@ -475,4 +475,4 @@ def read_scene(path: str | Path, band: str | None = None, effects: LightEffects 
 
 
 _REMEDY = "ephemeris and attitudes from before the first line to after the last one"
-"""Text for error messages: the ephemeris and attitude that a file must contain."""
+"""Part of error messages: ephemeris and attitude that a file must contain."""

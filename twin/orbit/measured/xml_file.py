@@ -1,8 +1,8 @@
-"""Safe parsing of XML and of lines of numbers from other programs' files, with errors that name file and line.
+"""Safe parsing of XML and of tables of numbers from external files, with errors that name file and line.
 
-XML is parsed to elements that know their lines. A document type and entity declarations are refused before anything is
-expanded, nothing is fetched, and size, depth and number of elements are bounded. The text is UTF-8, whatever its first
-line says.
+XML is parsed to elements that have line numbers. Document types and entity declarations are rejected before anything is
+expanded, no external files are loaded, and size, depth and number of elements are limited. The text is read as UTF-8,
+even if its first line declares another encoding.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from twin.orbit.measured.clock import Readings
 
 
 def text_lines(path: str | Path, what: str) -> list[str]:
-    """Return the lines of a text file without line ends, or raise InputError if it cannot be read."""
+    """Return the lines of a text file without line ends; raise InputError if it cannot be read."""
     text = table_text(path, what)
     if "\0" in text:
         line = text[: text.index("\0")].count("\n") + 1
@@ -155,14 +155,14 @@ class Element:
             waiting += reversed(element.children)
 
     def all(self, *tags: str) -> list[Element]:
-        """Return the elements at a path below this one; an empty list where there are none."""
+        """Return all elements at a path of tags below this element; an empty list if there are none."""
         elements = [self]
         for tag in tags:
             elements = [child for element in elements for child in element.children if child.tag == tag]
         return elements
 
     def maybe(self, *tags: str) -> Element | None:
-        """Return the element at a path below this one; None where there is none.
+        """Return the only element at a path of tags below this element; None if there is none.
 
         Raises
         ------
@@ -175,7 +175,7 @@ class Element:
         return elements[0] if elements else None
 
     def one(self, *tags: str) -> Element:
-        """Return the element at a path below this one.
+        """Return the only element at a path of tags below this element.
 
         Raises
         ------
@@ -195,7 +195,7 @@ class Element:
         raise InputError(issue)
 
     def words(self, *tags: str) -> str:
-        """Return the text at a path below this one; InputError where there is none, or it is empty."""
+        """Return the text of the element at a path of tags below this one; raise InputError if missing or empty."""
         element = self.one(*tags)
         if not element.text:
             element.wrong("the element is empty", None, "a value")
@@ -220,7 +220,7 @@ class Element:
     def number(
         self, *tags: str, least: float = -np.inf, most: float = np.inf, unit: Mapping[str, float] | None = None
     ) -> float:
-        """Return the number at a path below this one.
+        """Return the number in the element at a path of tags below this one.
 
         Parameters
         ----------
@@ -251,7 +251,7 @@ class Element:
         return value
 
     def whole(self, *tags: str, least: int = 1, most: int = 10_000_000) -> int:
-        """Return the whole number at a path of tags below this element.
+        """Return the integer in the element at a path of tags below this one.
 
         Raises
         ------
@@ -274,7 +274,7 @@ class Element:
 
 
 class _Builder:
-    """Builder of elements from the parser's events."""
+    """Builder of a tree of elements from the events of the XML parser (start, end, characters)."""
 
     def __init__(self, file: str) -> None:
         self.file = file

@@ -1,14 +1,14 @@
 """Closed loop of a monitor and correcting mechanisms on their instrument, simulated over time.
 
-At every moment, spots are rendered and recovered with the mechanisms at their positions, the filter processes them,
-commands are sent, mechanisms move, and images are taken. The filter knows the prior of the motions, with the laws by
-which they vary in time, the readings, and the commanded positions of the mechanisms; it never uses the true state. All
-effects come from exact traces: those of the prior's motions and of every mechanism on spots, cameras and foci, and the
-truth of the state that the mechanisms have corrected.
+At every moment, the monitor's spots are rendered and measured with the mechanisms at their present positions, the
+filter processes them, commands are sent, mechanisms move, and images are taken. The filter uses the prior of the
+motions, with their temporal correlation, the readings, and the commanded positions of the mechanisms; it never uses the
+true state. All effects are exact ray traces: the effects of the prior's motions and of every mechanism on spots,
+cameras and foci, and the truth for the state that the mechanisms have corrected.
 
 The quantities of a loop are P = 5 K numbers for the instrument's K cameras: rotations d_alpha, d_beta, d_gamma (rad)
-and change of principal distance d_f (m) of each, in the order of all estimators, followed by the defocus of each: best
-focus minus position of the line CCD, in metres, mean over `FOCUS_FIELDS`.
+and change of principal distance d_f (m) of each camera, followed by the defocus of each camera: best focus minus
+position of the line CCD, in metres, mean over `FOCUS_FIELDS`.
 """
 
 from __future__ import annotations
@@ -54,37 +54,41 @@ if TYPE_CHECKING:
     from scenes.specs.orbit.setup import MonitorSetup
 
 FOCUS_FIELDS = (0.7, 0.0, -0.7)
-"""Positions on the line at which the focus is computed, from its middle, as shares of half its length."""
+"""Field positions at which the focus is computed, as distances from the middle of the line CCD in units of half its
+length.
+"""
 _READ = 1e-3
-"""Approximate standard deviation of a spot coordinate in one reading, in pixels."""
+"""Standard deviation of a spot coordinate assumed for one reading of the monitor, in pixels (approximate)."""
 _SMALL = 1e-6
-"""Effect of a mechanism on its quantity, for 1 rad or 1 m, below which it counts as zero, in rad or m."""
+"""Effect of a mechanism on the quantity that it corrects, for a motion of 1 rad or 1 m, below which it counts as zero,
+in rad or m.
+"""
 _DISTANCE: Mapping[str, float] = FrozenMap({"shift": 1e-5, "rotate": 5e-6})
 """Steps of the difference quotients of a focus with respect to a mechanism's position, in m for shifts and rad for
 rotations; foci are accurate to 1e-8 m.
 """
 _DRAWN = 20
-"""Number of the random stream of the motions; the detectors use the first ones."""
+"""Number of the random stream of the motions; the detectors use the numbers below it."""
 
 
 @dataclass(frozen=True, eq=False)
 class Corrector:
-    """Correction of one quantity, by a mechanism of the instrument or on the ground.
+    """Correction of one quantity of the loop, by a mechanism of the instrument or in the ground processing.
 
     Attributes
     ----------
     name : str
         Name of the correction.
     spec : CorrectionSpec
-        Section of the file.
+        Section of the test file that specifies the correction.
     motion : ElementaryMotion or None
-        Motion of its mechanism; None for a correction on the ground.
+        Motion of its mechanism; None for a correction in the ground processing.
     row : int
         Index of its quantity among the P quantities of the loop.
     effect : (P,) ndarray for P quantities
-        Effect of 1 rad or 1 m of the correction on the quantities.
+        Derivatives of the P quantities with respect to the correction, per rad or per m.
     spots : (D,) ndarray for D spot coordinates
-        Effect of 1 rad or 1 m of the correction on the spots, in px.
+        Derivatives of the spot coordinates with respect to the correction, in px per rad or per m.
     """
 
     name: str
@@ -96,7 +100,7 @@ class Corrector:
 
     @property
     def sensitivity(self) -> float:
-        """Effect of 1 rad or 1 m of the correction on its quantity."""
+        """Derivative of the corrected quantity with respect to the correction, in rad or m per rad or m."""
         return float(self.effect[self.row])
 
     @property
@@ -115,7 +119,7 @@ class LoopModel:
     experiment : MonitorExperiment
         Instrument with its monitor.
     prior : Disturbances
-        Prior of the motions, with all P quantities instead of the cameras' parameters alone.
+        Prior of the motions, for all P quantities (cameras' parameters and defocus).
     correctors : tuple of Corrector
         Corrections sorted by name, so that their order in the file does not matter.
     """
@@ -130,7 +134,7 @@ class LoopModel:
         return tuple(self.experiment.instrument.cameras)
 
     def row(self, camera: str, quantity: str) -> int:
-        """Return the index of a camera's quantity, such as d_alpha or defocus, among the P quantities."""
+        """Return the index of a camera's quantity, such as a rotation or the defocus, among the loop's P quantities."""
         return _row(self.cameras, camera, quantity)
 
     def unit(self, camera: str, quantity: str) -> np.ndarray:
@@ -154,7 +158,7 @@ class LoopModel:
         return state
 
     def on_ground(self, camera: str, positions: np.ndarray) -> np.ndarray:
-        """Return the change (4,) of a camera that the ground processing corrects, in rad (three angles) and m (d_f)."""
+        """Return the change (4,) of a camera that the ground processing corrects: three angles (rad) and d_f (m)."""
         change = np.zeros(4)
         for corrector, position in zip(self.correctors, positions.tolist(), strict=True):
             if corrector.motion is None and corrector.spec.camera == camera:
@@ -163,17 +167,17 @@ class LoopModel:
 
     @cached_property
     def effects(self) -> np.ndarray:
-        """Effects (P, n) of 1 rad or 1 m of each of n corrections on the P quantities, in rad and m."""
+        """Derivatives (P, n) of the P quantities with respect to n corrections, in rad or m per rad or m."""
         return np.stack([corrector.effect for corrector in self.correctors], axis=1)
 
     @cached_property
     def spots(self) -> np.ndarray:
-        """Effects (D, n) of 1 rad or 1 m of each of n corrections on the D spot coordinates, in px."""
+        """Derivatives (D, n) of the D spot coordinates with respect to n corrections, in px per rad or m."""
         return np.stack([corrector.spots for corrector in self.correctors], axis=1)
 
     @cached_property
     def coupling(self) -> np.ndarray:
-        """Effect of each mechanism (column) on each correction's quantity (row), relative to that correction's own.
+        """Effect of each mechanism (column) on each corrected quantity (row), relative to that of its own mechanism.
 
         It is an (n, n) array for n corrections, with a diagonal of ones.
         """
@@ -184,7 +188,7 @@ class LoopModel:
 
     @cached_property
     def observed_share(self) -> np.ndarray:
-        """Share of each of n mechanisms' unmodelled response that one reading of the spots reveals, (n,), 0 to 1."""
+        """Share of an unmodelled motion of each of n mechanisms that one reading of the spots reveals, (n,), 0 to 1."""
         gain = self.prior.best_gain(_READ**2 * np.eye(len(self.spots)))
         estimate = gain @ self.spots
         return np.array(
@@ -198,7 +202,7 @@ def _row(cameras: Sequence[str], camera: str, quantity: str) -> int:
 
 
 def loop_model(setup: MonitorSetup, experiment: MonitorExperiment) -> LoopModel:
-    """Trace the effects of the prior's motions and of the mechanisms.
+    """Trace the effects of the prior's motions and of the mechanisms, and return the linear model of the loop.
 
     Raises
     ------
@@ -244,7 +248,10 @@ def loop_model(setup: MonitorSetup, experiment: MonitorExperiment) -> LoopModel:
 
 
 def defocus(quality: ImageQuality) -> np.ndarray:
-    """Return best focus minus line CCD of K cameras in S states, (K, S), in metres; NaN where it is not known."""
+    """Return the defocus of K cameras in S states, (K, S), in metres; NaN where it is not known.
+
+    Defocus is the best focus minus the position of the line CCD.
+    """
     return np.stack([camera.defocus.mean(axis=1) for camera in quality.cameras.values()])
 
 
@@ -277,7 +284,7 @@ def _mechanism(
 
 @dataclass(frozen=True, eq=False)
 class LoopCourse:
-    """States and commands over T moments with the loop closed or open.
+    """Time series of states, estimates and commands over T moments, with the loop closed or open.
 
     Attributes
     ----------
@@ -288,13 +295,13 @@ class LoopCourse:
     positions : (T, n) ndarray for n mechanisms
         Commanded positions of the mechanisms when images are taken, in rad or m.
     held : (T, n) ndarray of bool
-        True where a command was limited by the end of a range.
+        True where the command of a mechanism was limited by the end of its range.
     expected : (T, P) ndarray for P quantities
         Posterior mean of the quantities when images are taken.
     covariance : (T, P, P) ndarray
         Posterior covariance of the quantities.
     chi_square : (T,) ndarray
-        Chi-square of each reading against its prediction.
+        Chi-square of the difference of each reading from the filter's prediction.
     jumps : tuple of Jump
         Jumps that the filter detected.
     states : tuple of State
@@ -326,26 +333,30 @@ class LoopCourse:
 
     @property
     def limit(self) -> float:
-        """Limit of the sum of all chi-squares, exceeded with a probability of `FALSE_ALARM` if the prior is right."""
+        """Critical value of the sum of all chi-squares, exceeded with probability `FALSE_ALARM` for a right prior."""
         return float(limit_of(FALSE_ALARM, self.degrees))
 
     @property
     def agrees(self) -> bool:
-        """True if the readings, together and one by one, agree with the prior."""
+        """True if the readings, together and each alone, are consistent with the prior."""
         return float(self.chi_square.sum()) <= self.limit and self.contradiction is None
 
     @property
     def contradiction(self) -> int | None:
-        """Index of the first reading that contradicts the prior, at `FALSE_ALARM` over all readings, or None."""
+        """Index of the first reading that contradicts the prior; None if none does.
+
+        The probability of a false alarm, over all readings, is `FALSE_ALARM`.
+        """
         p_value = chance_beyond(self.chi_square, self.model.prior.spots.shape[0])
         beyond = np.flatnonzero(p_value < FALSE_ALARM / len(self.times))
         return int(beyond[0]) if len(beyond) else None
 
 
 def drifting_states(spec: OrbitMonitorSpec, experiment: MonitorExperiment, seed: int) -> Sequence[State]:
-    """Return the instrument's states at all moments without mechanisms, with the motions of the file.
+    """Return the instrument's states at all moments, without the mechanisms, due to the motions in the file.
 
-    The motions are those that the file tabulates over time, or random ones that follow the file's laws in time.
+    The motions are those that the file tabulates over time, or random ones with the sigmas and temporal correlations of
+    the file.
 
     Raises
     ------
@@ -364,11 +375,13 @@ def drifting_states(spec: OrbitMonitorSpec, experiment: MonitorExperiment, seed:
 
 
 Read: TypeAlias = Callable[[State, int], Recovery]
-"""Function of a state and the index of its moment that returns the spots' shifts since the nominal images."""
+"""Function of a state and the index of its moment that returns the measured shifts of the spots since the nominal
+images.
+"""
 
 
 def reader(model: LoopModel, spec: OrbitMonitorSpec, seed: int) -> Read:
-    """Return the function that renders the monitor's images of a state at a moment and measures their spots.
+    """Return a function that renders the monitor's images of a state at a moment and measures their spots.
 
     The function raises BenchError where light is lost or a spot cannot be measured.
 
@@ -426,13 +439,13 @@ def simulate_course(
     spec : OrbitMonitorSpec
         Content of the test file.
     states : sequence of State
-        States of the T moments without mechanisms.
+        States at the T moments, without the corrections of the mechanisms.
     read : Read
         Function that reads the spots, from `reader`.
     open_loop : bool
         True to leave all mechanisms at their initial positions.
     advance : Callable[[int], None]
-        Callback with the number of moments done.
+        Callback that receives the number of moments finished.
     """
     commands = Commands.none(model, open_loop)
     rows: list[tuple[np.ndarray, ...]] = []
@@ -475,18 +488,18 @@ def simulate_course(
 
 @dataclass(frozen=True, eq=False)
 class Commands:
-    """Commands to n mechanisms up to a moment.
+    """Commands sent to n mechanisms up to a moment.
 
     Attributes
     ----------
     model : LoopModel
         Model of the loop.
     idle : bool
-        True if no commands are sent.
+        True if the loop is open, so that no commands are sent.
     history : tuple of (n,) ndarray
         Commands in rad or m, the newest first; empty before any reading.
     held : (n,) ndarray of bool
-        True where the newest command was limited by the end of a range.
+        True where the newest command was limited by the end of the mechanism's range.
     """
 
     model: LoopModel
@@ -496,7 +509,7 @@ class Commands:
 
     @classmethod
     def none(cls, model: LoopModel, idle: bool) -> Commands:
-        """Return the commands before any reading."""
+        """Return the initial state of the commands, before any reading of the monitor."""
         return cls(model, idle, (), np.zeros(len(model.correctors), bool))
 
     @property

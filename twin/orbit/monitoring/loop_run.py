@@ -62,7 +62,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class ImagedPair:
-    """Points matched in one pair of rendered images, and intersected.
+    """Ground points matched in one pair of rendered line images and intersected.
 
     Attributes
     ----------
@@ -75,7 +75,7 @@ class ImagedPair:
     sigma : (2,) ndarray
         Median standard deviation predicted by the matching, in lines and pixels.
     sought : int
-        Number of points that were sought.
+        Number of points for which matches were searched.
     """
 
     moment: int
@@ -106,14 +106,14 @@ def imaged_pair(
     flown: OrbitAndAttitude,
     seed: np.random.SeedSequence,
 ) -> ImagedPair:
-    """Render a pair of line images, match points in them, and intersect the points.
+    """Render a pair of line images, match points in them, and intersect the points to ground coordinates.
 
     Parameters
     ----------
     setup : MonitorSetup
         Resolved test file and instrument.
     flight : PairFlight
-        True lines, and calibrated lines in the analysis's form.
+        True lines, and calibrated lines as the analysis models them.
     moment : int
         Index of the reading.
     nominal : Mapping[str, LineCamera]
@@ -174,7 +174,7 @@ def imaged_pair(
 
 
 _FEWEST = 8
-"""Smallest number of points from which a mean height and its scatter are computed."""
+"""Smallest number of matched points from which a mean height error and its scatter are computed."""
 _TRANSMISSION = 0.8
 """Transmission of the lens of a rendered line image, mean over the spectrum: the default of payloads."""
 
@@ -200,26 +200,27 @@ def _optics(setup: MonitorSetup, name: str, defocus: float) -> LineOptics:
 
 
 _IMAGES = 100_000
-"""Random stream of line images; the moments of the check points use streams up to the number of readings."""
+"""Number of the random stream of line images; the streams of the check points have the indices of the readings."""
 GAIN_MARGIN, PHASE_MARGIN_DEG = 1.5, 30.0
-"""Margins below which a loop is barely stable: it amplifies what is near its crossover twice and more. Of an integrator
-with a delay the two are the same limit (Astrom, Hagglund, PID Controllers, 1995, sec. 4.4).
+"""Gain margin (a factor) and phase margin (degrees) below which a loop is barely stable: it amplifies disturbances near
+its crossover frequency by a factor of two or more. For an integrator with a delay, both margins are the same limit
+(Astrom, Hagglund, PID Controllers, 1995, sec. 4.4).
 """
 WORSE = 0.01
-"""Relative increase of an error due to the loop, with the same random errors, above which the loop is reported to make
-it worse: half of the last of two digits that reports show.
+"""Relative increase of an error with the loop closed, for the same random errors, above which the loop is reported to
+make it worse: half a unit in the last of the two digits that reports show.
 """
 _NOTHING = 1e-9
-"""Errors in rad, m or MTF below which an error counts as zero: a fraction of a milliarcsecond, a nanometre."""
+"""Size, in rad, m or MTF, below which an error counts as zero: a fraction of a milliarcsecond, a nanometre."""
 FOCUS_SCALE = 10e-6
-"""Defocus, in metres, that weighs as much as a metre of height in the search for unobservable modes: a tenth of what
-blurs an image.
+"""Defocus, in metres, that has the same weight as a metre of height in the search for unobservable modes: a tenth of
+the defocus that blurs an image.
 """
 
 
 @dataclass(frozen=True, eq=False)
 class LoopOutcome:
-    """States over time with the loop closed or open, with the true errors that remain.
+    """Results over time with the loop closed or open: states, estimates, and the true errors that remain.
 
     Attributes
     ----------
@@ -232,10 +233,10 @@ class LoopOutcome:
     heights : CaseErrors
         Errors at the check points.
     slopes : (T, P) ndarray
-        Derivatives of the mean height error with respect to the quantities, in m/rad and m/m.
+        Derivatives of the mean height error with respect to the P quantities, in m/rad and m/m.
     angle : (P,) ndarray
-        Derivatives of the angle between the pair's lines of sight with respect to the quantities; positive where the
-        angle increases.
+        Derivatives of the angle (rad) between the pair's lines of sight with respect to the P quantities (rad, m);
+        positive where the angle increases.
     mtf : Mapping[str, (T, 2) ndarray]
         Camera -> MTF at Nyquist along the line and along the track, mean over the fields.
     images : tuple of ImagedPair
@@ -289,14 +290,14 @@ class LoopOutcome:
 
 @dataclass(frozen=True, eq=False)
 class LoopAnalysis:
-    """Stability of one correction as a loop.
+    """Stability of the control loop of one correction.
 
     Attributes
     ----------
     corrector : Corrector
-        Correction that the loop makes.
+        Correction that the loop applies.
     loop_gain : float
-        Gain of the file, times the share of the mechanism's response that acts in the loop.
+        Gain specified in the file, times the share of the mechanism's response that acts in the loop.
     margins : Margins
         Gain and phase margin of a loop with this gain and the file's delay.
     cycle : LimitCycle or None
@@ -314,7 +315,7 @@ class LoopAnalysis:
 
 @dataclass(frozen=True, eq=False)
 class LoopRun:
-    """Results of a test with a closed loop.
+    """Results of a test with the loop of monitor and mechanisms closed, and open for comparison.
 
     Attributes
     ----------
@@ -333,9 +334,10 @@ class LoopRun:
     margin : float
         Factor by which all gains together may be increased before the loop is unstable.
     modes : tuple of UnobservableMode
-        Unobservable modes; their quantities are height (m) and the defocus (m) of the pair.
+        Combinations of motions that the spots do not observe; their effects are given on the height (m) and on the
+        defocus (m) of the two cameras.
     unobservable_sigma : (3, T) ndarray for T moments
-        Lower limits of the standard deviations of these quantities for any estimate from the spots.
+        Lower limits of the standard deviations of height and of both defocuses (m) for any estimate from the spots.
     """
 
     setup: MonitorSetup
@@ -361,9 +363,10 @@ class LoopRun:
 
     @property
     def worse(self) -> dict[str, tuple[float, float]]:
-        """Errors that the loop increases: name -> RMS over the moments with the loop open and closed.
+        """Errors that are larger with the loop closed: name -> RMS over the moments with the loop open, and closed.
 
-        Angle and quantities are in rad and m, height in m; for the MTF at Nyquist it is the largest difference from 1.
+        Angle and quantities are in rad and m, height in m; for the MTF at the Nyquist frequency the largest difference
+        from 1 is given.
         """
         open_errors, closed_errors = self._errors(self.open), self._errors(self.closed)
         return {
@@ -380,7 +383,7 @@ class LoopRun:
 
     @property
     def pair(self) -> tuple[str, str]:
-        """Names of the two cameras."""
+        """Names of the two cameras of the stereo pair."""
         return self.setup.pair
 
     @property
@@ -396,12 +399,12 @@ class LoopRun:
 
     @property
     def ratio_limit(self) -> float:
-        """Limit of `ratios`, exceeded with a probability of at most `FALSE_ALARM` however the errors correlate."""
+        """Critical value of `ratios`, exceeded with probability `FALSE_ALARM` at most for any correlation of errors."""
         return float(norm.isf(0.5 * FALSE_ALARM / (2 * len(self.closed.course.times) * len(self.ratios))))
 
     @property
     def phase_deg(self) -> float:
-        """Smallest phase margin of the loops, in degrees; NaN where no loop has one."""
+        """Smallest phase margin of the control loops, in degrees; NaN where no loop has a phase margin."""
         margins = [
             analysis.margins.phase_deg for analysis in self.loops.values() if math.isfinite(analysis.margins.phase_deg)
         ]
@@ -413,7 +416,7 @@ _SCALE = np.array([1.0, FOCUS_SCALE, FOCUS_SCALE])
 
 
 def run_loop(setup: MonitorSetup, backend: Backend, seed: int, advance: Advance) -> LoopRun:
-    """Simulate the loop closed and open: `run_monitor` of a test with mechanisms.
+    """Simulate a test with mechanisms with the loop closed and open, and compute the remaining errors.
 
     Raises
     ------
@@ -495,7 +498,7 @@ def _outcome_of(
     seed: np.random.SeedSequence,
     advance: Advance,
 ) -> LoopOutcome:
-    """Compute the true errors and the heights that result from simulated states."""
+    """Compute the true errors of cameras, foci and heights that result from a simulated time series of states."""
     model, pair, experiment, test = course.model, setup.pair, course.model.experiment, setup.test
     axes, distance = experiment.sight.axes, experiment.nominal_truth.principal_distance
     lines = tuple(traced_pair(experiment, state, pair) for state in course.states)

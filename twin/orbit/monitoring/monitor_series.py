@@ -1,4 +1,4 @@
-"""Readings of the monitor of a stereo pair over time, relative to its reference images."""
+"""Measurements of a stereo pair's on-board monitor over time, relative to its reference images."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from scenes.specs.orbit.monitor import OrbitMonitorSpec
 
 CHUNK = 25
-"""Number of states rendered at once, which bounds the memory."""
+"""Number of states rendered at a time, to limit memory."""
 
 
 def states_of(
@@ -54,8 +54,9 @@ def states_of(
     numbers : sequence of int, optional
         Indices of the times; all by default.
     only : tuple of str, optional
-        "temperature" or "motion", and the only node that then has it. The other nodes of the file's tables over time
-        have temperature changes of 0 K, so that nothing is inherited; the key `perturb` still applies.
+        Pair of "temperature" or "motion" and the path of the only node to which it is applied. Other nodes in the
+        file's tables over time get temperature changes of 0 K, so that they do not inherit any; the key `perturb` still
+        applies.
 
     Raises
     ------
@@ -83,18 +84,19 @@ def states_of(
 
 @dataclass(frozen=True, eq=False)
 class Readings:
-    """Estimated changes of two cameras since the reference at T times.
+    """Changes of two cameras since the reference that the monitor measured at T times, with their covariances.
 
     Attributes
     ----------
     cameras : tuple of str
         Names of the two cameras.
     values : (T, 8) ndarray
-        d_alpha, d_beta, d_gamma (rad) and d_f (m) of the first camera, then of the second.
+        Rotations d_alpha, d_beta, d_gamma (rad) and change d_f of the principal distance (m) of the first camera, then
+        of the second.
     noise : (T, 8, 8) ndarray
-        Covariance of their errors from the noise of the images.
+        Covariance of the errors of `values` due to the noise of the images.
     total : (T, 8, 8) ndarray or None
-        Covariance of the whole error; None without a prior of disturbances.
+        Covariance of the total error of `values`, with unmodelled disturbances; None without a prior of disturbances.
     """
 
     cameras: tuple[str, str]
@@ -107,27 +109,27 @@ class Readings:
         return slice(at, at + 4)
 
     def __getitem__(self, camera: str) -> CameraParameters:
-        """Return the changes (T, 4) of one camera: d_alpha, d_beta, d_gamma (rad) and d_f (m) at T times."""
+        """Return the changes (T, 4) of one camera at T times: three rotations (rad) and principal distance (m)."""
         part = self._part(camera)
         total = None if self.total is None else self.total[:, part, part]
         return CameraParameters.from_vector(self.values[:, part], self.noise[:, part, part], total)
 
     @property
     def across(self) -> tuple[np.ndarray, np.ndarray | None]:
-        """Covariances between the errors of the two cameras at T times, (T, 4, 4): from noise, and of all errors."""
+        """Cross-covariances of the errors of the two cameras at T times, (T, 4, 4): due to noise, and total."""
         return self.noise[:, :4, 4:], None if self.total is None else self.total[:, :4, 4:]
 
 
 @dataclass(frozen=True, eq=False)
 class SmoothedReadings:
-    """Changes of the cameras smoothed from all measurements at one interval.
+    """Changes of the cameras, smoothed from all measurements of the monitor at one interval.
 
     Attributes
     ----------
     readings : Readings
         Smoothed changes at all times of the test.
     consistency : Consistency
-        Chi-square test of the measurements.
+        Chi-square test of the measurements against the prior.
     jumps : tuple of Jump or None
         Detected jumps; None where the prior has no jumps.
     """
@@ -144,13 +146,14 @@ class Measured:
     Attributes
     ----------
     positions : (2, S, C, 2) ndarray
-        Positions of the C spots at the reference (first) and in the S states (second), row and column, in px.
+        Positions of the C spots at the reference (index 0 of the first axis) and in the S states (index 1), row and
+        column, in px.
     covariance : (S, 2 C, 2 C) ndarray
         Covariance of each state's shifts, in px^2.
     noise : SeriesNoise or None
         Joint noise of the shifts of all states; None where the states are not a time series.
     evidence : SpotEvidence
-        Test of the spots' sigmas by their fits.
+        Test of the spots' sigmas against the residuals of the spots' fits.
     truth : tuple of Truth
         Truth of the states.
     """
@@ -170,7 +173,7 @@ class Measured:
         return cls(np.concatenate(positions, axis=1), spread, noise, evidence, tuple(truth))
 
     def doubts(self, times: Sequence[float], spots: Sequence[str]) -> tuple[str, ...]:
-        """Return a warning about the worst of the states if the spots' fits contradict their sigmas.
+        """Return a warning about the worst state if the residuals of the spots' fits contradict their sigmas.
 
         Parameters
         ----------
@@ -190,7 +193,7 @@ class Measured:
 
 @dataclass(frozen=True, eq=False)
 class _NoiseSubset:
-    """Joint noise of a selection of the measurements of a time series."""
+    """Joint covariance of the noise of selected measurements of a time series."""
 
     noise: SeriesNoise
     at: np.ndarray
@@ -202,8 +205,8 @@ class _NoiseSubset:
 class MonitorSeries:
     """Monitor with its reference images, which measures the changes of the cameras in a series of states.
 
-    With a prior of disturbances each state is estimated by `posterior`, with the changes expected since the reference;
-    otherwise by `model`.
+    With a prior of disturbances, each state is estimated by the estimator `posterior`, with the prior of changes since
+    the reference; otherwise by the estimator `model`.
 
     Parameters
     ----------
@@ -229,11 +232,11 @@ class MonitorSeries:
 
     @property
     def estimator(self) -> str:
-        """Name of the estimator that is used for each state."""
+        """Name of the estimator that is used for each state, `posterior` or `model`."""
         return "model" if self.experiment.disturbances is None else "posterior"
 
     def measured(self, states: Sequence[State], seed: int) -> tuple[Measured, Measured]:
-        """Measure the states from exposed frames, and from expected images without noise.
+        """Measure the spots' shifts in all states, from noisy frames and from expected images without noise.
 
         Raises
         ------
@@ -252,7 +255,7 @@ class MonitorSeries:
         return Measured.of(*exposed), Measured.of(*expected)
 
     def clean(self, states: Sequence[State]) -> Measured:
-        """Measure the states from expected images without noise.
+        """Measure the spots' shifts in all states from expected images without noise.
 
         Raises
         ------
@@ -264,9 +267,9 @@ class MonitorSeries:
         return Measured.of(*self._observed(states, (self._expected,))[0])
 
     def prism_shifts(self) -> np.ndarray:
-        """Return the shifts of C spots due to the temperatures of the monitor's prisms, (T, 2 C), in px.
+        """Return the shifts of C spots due to the temperatures of the monitor's prisms.
 
-        The temperatures are those of the file at T times; the shifts have no noise.
+        They are (T, 2 C), in px, for the temperatures that the file gives at T times, without noise.
         """
         job = self.spec.job
         states = []
@@ -277,7 +280,7 @@ class MonitorSeries:
         return np.asarray(shifts - shifts[self.spec.reference_index])
 
     def repeated(self, state: State, count: int, seed: int, number: int) -> Measured:
-        """Measure the reference and one state ``count`` times, each time with another fixed pattern of the detectors.
+        """Measure the reference and one state ``count`` times, each time with new fixed-pattern noise of the detectors.
 
         Parameters
         ----------
@@ -301,9 +304,10 @@ class MonitorSeries:
         return Measured.of([recovery for recoveries, _, _ in repeats for recovery in recoveries], None, repeats[0][2])
 
     def gains(self, measured: Measured, numbers: Sequence[int]) -> np.ndarray:
-        """Return the estimator's gains for C spots in S states, (S, 8, 2 C): parameters per pixel of shift.
+        """Return the estimator's gains for C spots in S states, (S, 8, 2 C), in rad or m per pixel of shift.
 
-        The 8 parameters are d_alpha, d_beta, d_gamma (rad) and d_f (m) of the first camera, then of the second.
+        The 8 parameters are the rotations d_alpha, d_beta, d_gamma (rad) and the change d_f of the principal distance
+        (m) of the first camera, then of the second.
 
         Parameters
         ----------
@@ -325,7 +329,7 @@ class MonitorSeries:
         return np.array(gains)
 
     def readings(self, measured: Measured, numbers: Sequence[int]) -> Readings:
-        """Return the changes of the two cameras, estimated from the shifts of the spots in each state alone.
+        """Estimate the changes of the two cameras in each state from the shifts of the spots in that state alone.
 
         Parameters
         ----------
@@ -348,7 +352,7 @@ class MonitorSeries:
         return Readings(self.pair, values, noise, total)
 
     def smoothed(self, measured: Measured, interval: float) -> SmoothedReadings:
-        """Return the changes at all times, smoothed from the measurements at one interval.
+        """Estimate the cameras' changes at all times by smoothing the measurements at one interval.
 
         Parameters
         ----------
@@ -396,11 +400,11 @@ class MonitorSeries:
         return mean_frames(self.experiment.frames_after(photons, self.frames, seed, numbers))
 
     def _expected(self, photons: np.ndarray, numbers: np.ndarray) -> tuple[MeasuredSpots, np.ndarray]:
-        """Return the reference spots and the images without noise, in the form of a function that records images."""
+        """Return the reference spots and noise-free images, with the interface of a function that records images."""
         return self._clean_reference, self.experiment.expected_frames(photons)
 
     def _reference_spots(self, images: np.ndarray) -> MeasuredSpots:
-        """Measure the C spots of mean frames (1, C, rows, columns) at the reference."""
+        """Measure the C spots in mean frames (1, C, rows, columns) of the reference state."""
         experiment, centroid = self.experiment, self.spec.analysis.centroid
         with self._reporting_spot_errors([self.spec.reference_index]), one_blas_thread():
             return judged_spots(images[0], self.frames, experiment.calibration, centroid, cores())
@@ -408,7 +412,7 @@ class MonitorSeries:
     def _observed(
         self, states: Sequence[State], records: Sequence[Record], numbers: Sequence[int] = (), series: bool = False
     ) -> list[tuple[list[Recovery], SeriesNoise | None, list[Truth]]]:
-        """Measure the same states with several functions that record images, in groups for `Measured.of`.
+        """Measure the spots in the same states with several functions that record images, in groups for `Measured.of`.
 
         Parameters
         ----------
@@ -419,7 +423,7 @@ class MonitorSeries:
         numbers : sequence of int
             Indices of the states' times; by default those of the test.
         series : bool
-            True if the states are those of all times and their joint noise is needed.
+            True if the states are those of all times and the joint covariance of their noise is needed.
         """
         experiment, spots = self.experiment, self.experiment.calibration.spots
         series = series and experiment.disturbances is not None
@@ -450,7 +454,7 @@ class MonitorSeries:
 
     @contextmanager
     def _reporting_spot_errors(self, numbers: Sequence[int]) -> Iterator[None]:
-        """Convert errors about spots that cannot be measured to errors of the file that name the state's time.
+        """Convert errors about unmeasurable spots to errors about the test's file that name the state's time.
 
         Parameters
         ----------

@@ -1,6 +1,6 @@
 """Result keys of a monitored orbit (monitor.json): times in s, changes in arcsec and µm, errors in m.
 
-The numbers of a closed loop are below the key `loop`.
+The results of a closed loop are under the key `loop`.
 """
 
 from __future__ import annotations
@@ -348,7 +348,7 @@ def _observed_share(run: LoopRun, name: str, facts: LoopAnalysis) -> float | Non
 
 
 def motions_of(run: LoopRun, mode: UnobservableMode) -> list[dict[str, Any]]:
-    """Return the largest motions of an unobservable mode, with their sizes for one standard deviation of the mode."""
+    """Return the largest motions in an unobservable mode, with their sizes for one standard deviation of the mode."""
     prior = run.model.prior
     order = np.argsort(-np.abs(mode.motions), kind="stable")[:MOST_MOTIONS]
     return [
@@ -370,7 +370,7 @@ MODE: Record[tuple[LoopRun, UnobservableMode]] = Record(
 
 
 def angle_of(run: LoopRun, mode: UnobservableMode) -> float:
-    """Return the change of the intersection angle for one standard deviation of a mode, in radians."""
+    """Return the change of the intersection angle for one standard deviation of an unobservable mode, in radians."""
     return float(run.open.angle @ run.model.prior.parameters @ mode.motions)
 
 

@@ -42,16 +42,16 @@ PARTS = {
     "beyond_parameters": ("beyond the four parameters", svg.SKY),
     "interpolation": ("interpolation over the interval", svg.GREEN),
 }
-"""Name in reports and colour of each part of the height error."""
+"""Name in reports and colour in figures of each part of the height error, by its key."""
 _DRAWN_PART = 5e-3
-"""Size below which a part of the height error is not drawn, in metres, if it is smaller at all times."""
+"""Size, in metres, that a part of the height error must reach at some time to be drawn."""
 _COLOURS = (svg.BLUE, svg.VERMILION, svg.GREEN, svg.PURPLE, svg.ORANGE, svg.SKY)
 _BESIDE = {"loc": "upper left", "bbox_to_anchor": (1.0, 1.0)}
-"""Position of a legend that would otherwise hide curves."""
+"""Position of a legend beside the axes, where it does not hide curves."""
 _BODIES, _MOTIONS = 3, 3
-"""Bodies and motions of a mode that are named in words."""
+"""Largest numbers of bodies, and of motions of each, that the report names for an unobservable mode."""
 _LEAST = 1e-6
-"""Size below which numbers of an unobservable mode are rounding errors and are not reported."""
+"""Size below which values of an unobservable mode are rounding errors and are not reported."""
 
 
 def _figure(name: str, title: str, caption: str, draw: Callable[..., Figure], run: Any) -> SvgFigure:
@@ -111,7 +111,7 @@ def _height_figure(run: MonitorRun) -> Figure:
 
 
 def _smoothed_figure(run: MonitorRun) -> Figure:
-    """Draw the mean height error due to the cameras, smoothed and interpolated, and the sigma of the smoothed one."""
+    """Draw the mean height error due to the cameras for smoothed and interpolated readings, with its sigma."""
     spec, minutes, chosen = run.spec, run.times / 60.0, run.smoothed
     figure, (axes,) = _panels(3.8, 1)
     for many, alpha, label in ((2.0, 0.2, "2σ of the smoother"), (1.0, 0.4, "σ of the smoother")):
@@ -313,14 +313,14 @@ def _verdict(run: MonitorRun) -> tuple[str, tuple[str, ...]]:
 
 
 def _times(factor: float, less: str) -> str:
-    """Return the factor by which an error is smaller or larger, in words."""
+    """Return a text on the factor by which an error is smaller or larger."""
     if factor >= 1.0:
         return f"{factor:.2f} times {less}"
     return f"{1.0 / factor:.2f} times {'more' if less == 'less' else 'larger'}"
 
 
 def _gain(run: MonitorRun) -> str:
-    """Return a sentence on the gain of smoothing at the file's interval; empty without a prior."""
+    """Return a sentence on how much smoothing reduces the height error; empty without a prior."""
     if not run.smoothing:
         return ""
     chosen = run.smoothed
@@ -450,7 +450,7 @@ def _rest(run: MonitorRun) -> Section:
 
 
 def _worse(run: MonitorRun) -> tuple[str, ...]:
-    """Return a sentence naming the parameters that the monitor reads with errors larger than their true changes."""
+    """Return a sentence on the parameters for which the monitor's errors are larger than the true changes."""
     worse = []
     for name in run.pair:
         for k, key in enumerate(PARAMETERS):

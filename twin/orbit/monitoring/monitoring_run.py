@@ -1,9 +1,9 @@
 """Heights with and without on-board monitoring, from points intersected at a series of times.
 
-The cameras are used as calibrated, corrected by the monitor, corrected by values interpolated over an interval, and as
-they truly are. The analysis has the calibrated lines, measured orbit and attitude, image points and the monitor's
-values. The truth enters where errors are computed, and in two cases that are bounds: the true four parameters, and the
-true lines.
+The points are intersected with the cameras as calibrated, corrected with the monitor's readings, corrected with
+readings interpolated over an interval, and with the true cameras. The analysis uses the calibrated lines, measured
+orbit and attitude, image points and the monitor's readings. The truth is used to compute errors, and in two cases that
+serve as bounds: correction with the true four parameters, and the true lines.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ if TYPE_CHECKING:
     from scenes.specs.orbit.setup import MonitorSetup
 
 FALSE_ALARM = 1e-4
-"""Probability, both sides together, with which correct sigmas are reported as wrong."""
+"""Probability of a false alarm: a two-sided test reports correct sigmas as wrong."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,7 +64,7 @@ class Cause:
     truth : Mapping[str, (4,) ndarray]
         Camera -> true changes since the reference, in rad (three angles) and m (principal distance).
     error : Mapping[str, (4,) ndarray]
-        Camera -> reading of the monitor without noise, minus the truth, in rad and m.
+        Camera -> noise-free reading of the monitor minus the truth, in rad (three angles) and m (principal distance).
     """
 
     what: str
@@ -75,15 +75,15 @@ class Cause:
 
 @dataclass(frozen=True, eq=False)
 class Conversion:
-    """Height change for one arcsecond, in metres, at the reference time.
+    """Height change for a rotation of a camera by one arcsecond, in metres, at the reference time.
 
     Attributes
     ----------
     traced : Mapping[str, float]
         Camera -> height change, by ray trace, when this camera alone is rotated by 1 arcsec about its Y, in m.
     theory : Mapping[str, float]
-        Camera -> the same from base to height, in m: slant range x 1 arcsec / cos(incidence), divided by the difference
-        of the tangents of both angles of incidence.
+        Camera -> height change from the base-to-height ratio, in m: slant range x 1 arcsec / cos(incidence), divided by
+        the difference of the tangents of both angles of incidence.
     base_to_height : float
         Base-to-height ratio: the difference of these tangents.
     """
@@ -100,20 +100,21 @@ class Conversion:
 
     @property
     def of_common(self) -> float:
-        """Height change for a common rotation of both cameras by 1 arcsec, in metres; the angle does not change."""
+        """Height change for a common rotation of both cameras by 1 arcsec, in metres; their angle does not change."""
         return float(sum(self.traced.values()))
 
 
 @dataclass(frozen=True, eq=False)
 class Scatter:
-    """Height errors at one time over repeated measurements of the monitor.
+    """Height errors at one time due to the monitor's noise, over repeated measurements.
 
     Attributes
     ----------
     heights : (R,) ndarray for R repeats
-        Mean height error from the monitor's values alone, in metres.
+        Mean height error due to the errors of the monitor's readings alone, in metres.
     sigma : float
-        Standard deviation propagated from the predicted covariance, mean over the repeats, in metres.
+        Standard deviation of the mean height propagated from the readings' predicted covariance, mean over the repeats,
+        in metres.
     """
 
     heights: np.ndarray
@@ -126,30 +127,30 @@ class Scatter:
 
     @property
     def limits(self) -> tuple[float, float]:
-        """Limits of the ratio spread / sigma, exceeded with a probability of `FALSE_ALARM` where sigma is right."""
+        """Limits of `spread` / `sigma`, exceeded with a probability of `FALSE_ALARM` where `sigma` is right."""
         degrees = len(self.heights) - 1
         low, high = chi2.ppf([0.5 * FALSE_ALARM, 1.0 - 0.5 * FALSE_ALARM], degrees)
         return float(np.sqrt(low / degrees)), float(np.sqrt(high / degrees))
 
     @property
     def agrees(self) -> bool:
-        """True if the ratio of observed to predicted standard deviation lies within the limits."""
+        """True if the ratio of observed to predicted standard deviation lies within `limits`."""
         low, high = self.limits
         return low < self.spread / self.sigma < high
 
 
 @dataclass(frozen=True, eq=False)
 class Smoothing:
-    """Heights with values smoothed from the measurements at one interval.
+    """Height errors with readings smoothed from the measurements at one interval.
 
     Attributes
     ----------
     case : CaseErrors
-        Errors with the smoothed values.
+        Errors at the check points with smoothed readings.
     interpolated : CaseErrors
-        Errors with values interpolated between the same measurements.
+        Errors at the check points with readings interpolated between the same measurements.
     error : (T,) ndarray for T times
-        Mean height error due to the errors of the smoothed values, to first order, in metres.
+        Mean height error due to the errors of the smoothed readings, to first order, in metres.
     sigma : (T,) ndarray
         Standard deviation of that error according to the smoother, in metres; 0 at the reference.
     consistency : Consistency
@@ -164,7 +165,7 @@ class Smoothing:
 
     @property
     def factor(self) -> float:
-        """RMS height error due to the cameras with interpolated values, divided by that with smoothed values."""
+        """RMS height error due to the cameras with interpolated readings, divided by that with smoothed readings."""
         return self.interpolated.camera_height_rms / self.case.camera_height_rms
 
     @property
@@ -180,12 +181,12 @@ class Smoothing:
 
     @property
     def limit(self) -> float:
-        """Limit of the largest ratio, exceeded with a probability of at most `FALSE_ALARM` however errors correlate."""
+        """Critical value of `largest_ratio`, exceeded with probability `FALSE_ALARM` at most, for any correlation."""
         return float(norm.isf(0.5 * FALSE_ALARM / max(len(self.ratios), 1)))
 
     @property
     def agrees(self) -> bool:
-        """True if no height error divided by its sigma is beyond the limit."""
+        """True if all height errors divided by their sigmas lie within the limit, as expected for correct sigmas."""
         return self.largest_ratio <= self.limit
 
 
@@ -204,15 +205,17 @@ class MonitorRun(PairFlight):
     looks : tuple of float
         Nominal look angles of the two cameras, in radians.
     truth : Mapping[str, (T, 4) ndarray]
-        Camera -> true d_alpha, d_beta, d_gamma (rad) and d_f (m) since the reference.
+        Camera -> true changes since the reference: rotations d_alpha, d_beta, d_gamma about the camera's Y, X and line
+        of sight (rad), and change d_f of the principal distance (m).
     true_angle : (T,) ndarray
         True angle between the lines of sight, in radians.
     estimator : str
         Name of the estimator that is used for the monitor's shifts.
     monitored : Readings
-        Readings of the monitor since the reference.
+        Changes since the reference that the monitor measured.
     together : Mapping[float, SmoothedReadings]
-        Interval in seconds -> changes smoothed from all measurements at this interval; empty without a prior.
+        Interval between measurements, in seconds -> changes smoothed from all measurements at this interval; empty
+        without a prior.
     clean : Mapping[str, (T, 4) ndarray]
         Camera -> readings from expected images without noise.
     prisms : Mapping[str, (T, 4) ndarray]
@@ -226,7 +229,7 @@ class MonitorRun(PairFlight):
     rotated : Mapping[str, LineCamera]
         Camera -> its line at the reference with the whole camera rotated by 1 arcsec about its Y.
     doubts : tuple of str
-        Warnings that the monitor's sigmas do not hold because its spots differ from the calibrated ones.
+        Warnings that the monitor's sigmas are not valid because its spots differ from the calibrated ones.
     """
 
     setup: MonitorSetup
@@ -252,11 +255,11 @@ class MonitorRun(PairFlight):
 
     @property
     def mask(self) -> np.ndarray:
-        """Mask over d_alpha, d_beta, d_gamma, d_f, (4,): 1 for parameters that are applied, 0 for the others."""
+        """Mask (4,) of a camera's three rotations and principal distance: 1 for those that are corrected, else 0."""
         return np.array([float(name in self.spec.apply) for name in PARAMETERS])
 
     def height(self, values: Mapping[str, np.ndarray]) -> np.ndarray:
-        """Return the mean height errors due to errors (T, 4) of each camera's parameters at T times, (T,), in m."""
+        """Return the mean height errors at T times, (T,), in m, due to errors (T, 4) of each camera's parameters."""
         heights = [np.sum(self.slopes[n] * values[n], axis=1) for n in self.pair]
         return np.asarray(np.sum(heights, axis=0))
 
@@ -285,12 +288,12 @@ class MonitorRun(PairFlight):
 
     @cached_property
     def cases(self) -> Mapping[str, CaseErrors]:
-        """Errors at the check points for each way of correcting the cameras, by its name.
+        """Errors at the check points, by name of the method with which the cameras are corrected.
 
-        none: cameras as calibrated; monitored: corrected by the monitor at every time; interval: corrected by values
-        interpolated over the file's interval; smoothed: corrected by values smoothed from the same measurements, if
-        there is a prior; parameters: corrected by the true four parameters; true: the true lines. The last two are
-        bounds that no measurement reaches.
+        none: cameras as calibrated; monitored: corrected with the monitor's readings at every time; interval: corrected
+        with readings interpolated over the file's interval; smoothed: corrected with readings smoothed from the same
+        measurements, if there is a prior; parameters: corrected with the true four parameters; true: the true lines.
+        The last two are bounds that no measurement reaches.
         """
         cases = {
             "none": self.case({name: np.zeros((len(self.times), 4)) for name in self.pair}),
@@ -303,7 +306,7 @@ class MonitorRun(PairFlight):
 
     @cached_property
     def intervals(self) -> Mapping[float, CaseErrors]:
-        """Errors at the check points with interpolated values: interval between measurements, in seconds -> errors."""
+        """Errors at the check points with interpolated readings, by interval between measurements, in seconds."""
         return FrozenMap({interval: self._interpolated(interval) for interval in self.spec.compared})
 
     @cached_property
@@ -330,12 +333,12 @@ class MonitorRun(PairFlight):
 
     @cached_property
     def smoothing(self) -> Mapping[float, Smoothing]:
-        """Heights with smoothed values: interval between measurements, in seconds -> result; empty without a prior."""
+        """Height errors with smoothed readings, by interval between measurements, in seconds; empty without a prior."""
         return FrozenMap({interval: self._smoothing(interval) for interval in sorted(self.together)})
 
     @property
     def smoothed(self) -> Smoothing:
-        """Heights smoothed from the measurements at the file's interval; needs a prior."""
+        """Height errors with readings smoothed from the measurements at the file's interval; requires a prior."""
         return self.smoothing[self.spec.every]
 
     def _smoothing(self, interval: float) -> Smoothing:
@@ -351,7 +354,7 @@ class MonitorRun(PairFlight):
 
     @cached_property
     def parts(self) -> Mapping[str, np.ndarray]:
-        """Parts of the corrected cameras' mean height error: name -> (T,) values at T times, in metres."""
+        """Contributions to the corrected cameras' mean height error at T times: cause -> (T,) values, in metres."""
 
         def applied(values: Callable[[str], np.ndarray]) -> np.ndarray:
             return self.height({name: self.mask * values(name) for name in self.pair})
@@ -370,7 +373,7 @@ class MonitorRun(PairFlight):
 
     @cached_property
     def conversion(self) -> Conversion:
-        """Height change for a rotation by an arcsecond, at the reference, where the calibrated cameras are true."""
+        """Height change for a rotation of a camera by an arcsecond, at the reference time."""
         k = self.spec.reference_index
         view, traced = self.views[k], {}
         first, second = self.pair
@@ -409,9 +412,9 @@ class MonitorRun(PairFlight):
 
     @cached_property
     def residual(self) -> float:
-        """Largest angle between a true line and the calibrated one corrected by the true four parameters, in radians.
+        """Largest angle between true lines of sight and those corrected with the true four parameters, in radians.
 
-        The maximum is over the line and all times.
+        It is the error of a model with four parameters per camera; the maximum is over pixels and times.
         """
         away = []
         for k, lines in enumerate(self.lines):
@@ -429,9 +432,9 @@ class MonitorRun(PairFlight):
 
 
 def run_monitor(setup: MonitorSetup, backend: Backend, seed: int, advance: Advance = silent) -> MonitorRun | LoopRun:
-    """Simulate a monitored pair and intersect its points: ``python -m twin.orbit monitor``.
+    """Simulate a monitored stereo pair and intersect its points: ``python -m twin.orbit monitor``.
 
-    With mechanisms the closed loop is simulated.
+    If the file has mechanisms, the closed loop of monitor and mechanisms is simulated instead.
 
     Raises
     ------
@@ -530,10 +533,10 @@ def simulate_monitoring(setup: MonitorSetup, backend: Backend, seed: int, advanc
 
 
 def _changes(truths: Sequence[Truth], reference: int) -> tuple[dict[str, np.ndarray], dict[str, float]]:
-    """Return each camera's true changes (T, 4) since the reference at T times, and its principal distance there.
+    """Return each camera's true changes (T, 4) since the reference at T times, and its principal distance then.
 
-    The trace refers changes to the nominal camera; their differences are those between two states except for products
-    of two arcseconds, 1e-11 rad.
+    The ray trace gives changes relative to the nominal camera. Their differences are the changes between two states,
+    except for products of two small angles, 1e-11 rad.
     """
     changes, distance = {}, {}
     for name in truths[0].cameras:
@@ -560,7 +563,8 @@ def _causes(
     worst : int
         Index of the time.
     gain : (8, 2 C) ndarray
-        Gain of the estimator for C spots at that time: 8 parameters of the pair, in rad and m, per px.
+        Gain of the estimator for C spots at that time: 8 parameters of the pair, in rad and m per px of the spots'
+        shifts.
     """
     assert spec.course is not None
     named = [("temperature", path) for path in spec.course.temperature] + [("motion", path) for path in spec.motion]

@@ -32,22 +32,22 @@ if TYPE_CHECKING:
     from scenes.specs.orbit.monitor import OrbitMonitorSpec
 
 TOO_FAR = "temperatures and motions that keep the beams on the mirrors and the spots on their CCDs"
-"""Remedy that messages give where light is lost or a spot cannot be measured."""
+"""Advice to the user in messages where light is lost or a spot cannot be measured."""
 HALF_SPAN = 60.0
-"""Time of the orbit before and after each time of the test that its images cover, in seconds; two views 53 degrees
+"""Duration of the orbit before and after each time of the test that the images cover, in seconds; two views 53 degrees
 apart from 500 km are 70 s apart.
 """
 _SPARE = 2
-"""Number of candidates drawn per ground point; those that one of the lines does not see are dropped."""
+"""Number of candidates drawn per required ground point; those that one of the lines does not see are dropped."""
 _MIDDLE = 1e-3
-"""Tolerance, in seconds, to which the two views are placed at equal times before and after; a satellite moves 8 m in
-it.
+"""Tolerance, in seconds, with which the two views of a point lie at equal times before and after the time of the test;
+a satellite moves 8 m in it.
 """
 
 
 _STEP = np.array([ARCSEC, ARCSEC, ARCSEC, 10e-6])
-"""Steps of the derivatives with respect to d_alpha, d_beta, d_gamma (rad) and d_f (m): over them the intersection is
-linear to 1e-5.
+"""Steps of the derivatives with respect to a camera's rotations d_alpha, d_beta, d_gamma (rad) and change d_f of the
+principal distance (m), over which the intersection is linear to 1e-5.
 """
 
 
@@ -79,16 +79,16 @@ def motions_at(spec: OrbitMonitorSpec, time: float, only: str | None = None) -> 
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """Check points at one time.
+    """Check points of a stereo pair at one time, with their image points in both cameras.
 
     Attributes
     ----------
     ground : (n, 3) ndarray for n points
         True points, ITRS, in metres.
     exact : tuple of Sightings
-        Exact sightings by each true camera of the pair, with the true orbit and attitude.
+        Exact image points in each true camera of the pair, with the true orbit and attitude.
     seen : tuple of Sightings
-        Measured sightings.
+        Measured image points, with the measured orbit and attitude.
     """
 
     ground: np.ndarray
@@ -107,8 +107,8 @@ class CaseErrors:
     bias : (T,) ndarray
         Mean of the height errors, intersected minus true.
     camera : (T,) ndarray
-        Mean height error due to the cameras alone: reduced by that of the true cameras with the same image points,
-        orbit and attitude.
+        Mean height error due to the cameras alone: the difference from that of the true cameras with the same image
+        points, orbit and attitude.
     camera_plan, camera_height : (T,) ndarray
         RMS over the points of the errors due to the cameras alone, in plan and in height.
     """
@@ -166,7 +166,7 @@ class PairFlight:
     views: tuple[View, ...]
 
     def true_line(self, camera: str, k: int) -> CalibratedLine:
-        """Return the true line of a camera at time index k, in the analysis's form, for comparisons only."""
+        """Return a camera's true line at time index k, as the analysis models lines, for comparisons only."""
         return in_calibrated_form(self.lines[k][camera], self.calibrated[camera])
 
     def true_pair(self, k: int) -> list[CalibratedLine]:
@@ -199,13 +199,13 @@ class PairFlight:
     def slopes(self) -> Mapping[str, np.ndarray]:
         """Derivatives of the mean height with respect to the correction of each camera, (T, 4) at T times.
 
-        The corrections are d_alpha, d_beta, d_gamma (m/rad) and d_f (m/m). The derivatives are central differences of
-        the intersection of exact image points.
+        The corrections are the rotations d_alpha, d_beta, d_gamma (derivatives in m/rad) and the change d_f of the
+        principal distance (in m/m). The derivatives are central differences of the intersection of exact image points.
         """
         return FrozenMap({name: self._slopes(i) for i, name in enumerate(self.pair)})
 
     def _slopes(self, i: int) -> np.ndarray:
-        """Return derivatives (T, 4) of the mean height to camera i's correction at T times, in m/rad and m/m."""
+        """Return derivatives (T, 4) of mean heights at T times to camera `i`'s correction, in m/rad and m/m."""
         table = np.empty((len(self.views), 4))
         for k, view in enumerate(self.views):
             for j, step in enumerate(_STEP):
@@ -219,7 +219,7 @@ class PairFlight:
 
 
 def in_calibrated_form(line: LineCamera, like: CalibratedLine) -> CalibratedLine:
-    """Return a traced line in the analysis's form, with the axes and principal distance of the line `like`."""
+    """Convert a traced line to the analysis's camera model, with the axes and principal distance of `like`."""
     return calibrated_line(line, like.axes, like.principal_distance)
 
 
@@ -251,7 +251,7 @@ def point_errors(cameras: Sequence[CalibratedLine], view: View, exact_data: bool
 
 
 def case_errors(errors: np.ndarray, true: np.ndarray) -> CaseErrors:
-    """Return RMS and mean of the errors of n points at T times, in all and due to the cameras alone.
+    """Return RMS and mean of the errors of n points at T times: total errors, and those due to the cameras alone.
 
     Parameters
     ----------
@@ -325,7 +325,7 @@ class OrbitAndAttitude:
 
 
 def fly(spec: OrbitMonitorSpec, seed: np.random.SeedSequence) -> OrbitAndAttitude:
-    """Simulate the orbit and attitude of a test; the same seed gives the same ones.
+    """Simulate the true and measured orbit and attitude of a test, reproducibly for a given seed.
 
     Raises
     ------
@@ -350,7 +350,7 @@ def _view(
     orbit_and_attitude: OrbitAndAttitude,
     seed: np.random.SeedSequence,
 ) -> View:
-    """Draw the check points of one time, and compute their sightings."""
+    """Draw the check points of one time, and compute their exact and measured image points."""
     random_ground, random_image = (np.random.default_rng(stream(seed, k)) for k in range(2))
     true, earth = orbit_and_attitude.true, orbit_and_attitude.earth
     ground = spec.ground
@@ -387,9 +387,9 @@ def _view(
 
 
 def second_view(sensors: Sequence[Sensor], time: float, pixel: float, height: float) -> float:
-    """Return the time, in seconds, at which the second line sees a point, for views placed evenly about ``time``.
+    """Return the time, in seconds, at which the second line sees a point, for views symmetric about ``time``.
 
-    The first line sees the point as long before ``time`` as the second sees it after, or the other way round.
+    The first line sees the point as long before ``time`` as the second sees it after, or the reverse.
 
     Parameters
     ----------
@@ -423,6 +423,6 @@ def second_view(sensors: Sequence[Sensor], time: float, pixel: float, height: fl
 
 
 def sightings(sensor: Sensor, trajectory: Platform, row: np.ndarray, column: np.ndarray) -> Sightings:
-    """Return image points with orbit and attitude of a trajectory at the times of their lines."""
+    """Return image points together with the position and attitude of a trajectory at the times of their lines."""
     seconds = sensor.time(row)
     return Sightings(column, trajectory.position(seconds), trajectory.body_to_itrs(seconds))

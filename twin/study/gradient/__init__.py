@@ -1,1 +1,1 @@
-"""Jacobian of a study's responses with respect to its factors."""
+"""Jacobian of a study's responses (result numbers) with respect to its factors (varied inputs)."""

@@ -1,4 +1,8 @@
-"""Command ``python -m twin.study --gradient``: the Jacobian of a study as data, figures, tables and a report."""
+"""Command ``python -m twin.study --gradient``: the Jacobian of a study as data, figures, tables and a report.
+
+The Jacobian holds the derivatives of the study's responses (result numbers) with respect to its factors (inputs). The
+spread of a factor is the sigma of its normal distribution, otherwise half of the range of its values.
+"""
 
 from __future__ import annotations
 
@@ -31,7 +35,7 @@ DOUBTFUL_TEXT = (
     "Finite differences not accurate to 1% of the response's largest change (their step crosses a bend, or the job "
     "is noisy)"
 )
-"""Beginning of the warning about inaccurate finite differences."""
+"""Beginning of the warning that finite differences are inaccurate."""
 
 
 def _write_report(setup: StudySetup, gradient: Gradient, folder: RunFolder, warnings: Sequence[str] = ()) -> None:
@@ -103,7 +107,7 @@ def _agreement(gradient: Gradient) -> str:
 
 
 def verdict(gradient: Gradient) -> tuple[str, tuple[str, ...]]:
-    """Return the verdict on which factors dominate and how accurate that is, and the sentences that follow it."""
+    """Return the verdict, on which factors dominate and how accurate that statement is, and further sentences."""
     moved = [i for i in range(len(gradient.responses)) if np.any(gradient.change[i])]
     strongest = Counter(gradient.factors[int(np.argmax(np.abs(gradient.change[i])))].name for i in moved)
     total = len(gradient.responses)
@@ -165,7 +169,7 @@ def _response_table(gradient: Gradient) -> Table:
 
 
 def _factor_rows(gradient: Gradient) -> Table:
-    """Return the table of the factors: value in the base, spread, and step of the finite differences."""
+    """Return the table of the factors: value in the base job, spread, and step of the finite differences."""
     rows: list[list[Cell]] = []
     for k, factor in enumerate(gradient.factors):
         keys = [*factor.spec.places, *(scale.key for scale in factor.spec.scales)]
@@ -182,17 +186,23 @@ def _factor_rows(gradient: Gradient) -> Table:
 
 
 MOST_BARS = 8
-"""Largest number of bars in a panel."""
+"""Largest number of bars (factors) in one panel of the bar chart."""
 LINEAR = 1e-3
-"""Share of a response's largest change per spread, below which the logarithmic colour scale becomes linear."""
+"""Threshold between the linear and the logarithmic part of the heat map's colour scale.
+
+It is relative to the response's largest change due to the spread of any factor.
+"""
 NEGLIGIBLE = 1e-3
-"""Share of a response's largest change per spread, below which no bar is drawn for a factor."""
+"""Change due to a factor's spread below which the bar chart omits the factor.
+
+It is relative to the response's largest change due to the spread of any factor.
+"""
 
 
 def _normalised(gradient: Gradient) -> np.ndarray:
-    """Return each response's change due to the spread of each factor, (R, F), relative to its largest change.
+    """Return the change of each response due to the spread of each factor, (R, F), relative to its largest change.
 
-    Zero where no factor moves the response. Array dimensions: R responses, F factors.
+    It is zero where no factor changes the response. Array dimensions: R responses, F factors.
     """
     change = gradient.change
     largest = np.max(np.abs(change), axis=1, initial=0.0, keepdims=True)
@@ -253,9 +263,10 @@ def _bars(axes: Axes, gradient: Gradient, i: int, order: np.ndarray) -> None:
 
 
 DOUBTFUL = 0.01
-"""Correction by Richardson's extrapolation beyond which finite differences are reported as inaccurate.
+"""Error estimate of a finite difference above which it is reported as inaccurate.
 
-It is a share of the response's largest change per spread of a factor.
+The estimate is the correction by Richardson's extrapolation, relative to the response's largest change due to the
+spread of any factor.
 """
 
 
@@ -267,7 +278,10 @@ def _unit_text(response: str, factor: str) -> str:
 
 
 def _entries(of: Callable[[Gradient], np.ndarray]) -> Callable[[Gradient], list[list[float | None]]]:
-    """Return a function that gives a table of the Jacobian as lists, None for NaN."""
+    """Return a function that writes an (R, F) array of a Jacobian as nested lists, with None for NaN.
+
+    R responses, F factors; ``of`` selects the array of the Jacobian, such as its derivatives or their errors.
+    """
 
     def rows(gradient: Gradient) -> list[list[float | None]]:
         return [[None if np.isnan(value) else float(value) + 0.0 for value in row] for row in of(gradient)]
@@ -314,7 +328,7 @@ def _whole_table(gradient: Gradient) -> Table:
 def _doubtful(gradient: Gradient) -> list[str]:
     """Return the responses whose finite differences are not accurate to 1 % of the largest change.
 
-    Causes are noise, or a kink or bend within the step.
+    Possible causes are noise, or a discontinuity of the response or of its slope within the step.
     """
     spread = np.array([factor.spread for factor in gradient.factors])
     largest = np.max(np.abs(gradient.change), axis=1, initial=0.0, keepdims=True)

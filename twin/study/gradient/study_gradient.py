@@ -1,13 +1,14 @@
-"""Jacobian of a study's responses with respect to its factors, at the base's values.
+"""Jacobian of a study's responses with respect to its factors, at the values of the base job.
 
-Spots and lines of sight are differentiated by automatic differentiation through the trace (spots backward in
-``twin.monitor.monitor_derivative``, lines of sight forward in this file). The estimators, formulas on these numbers,
-are differentiated along the resulting directions. All other responses have finite differences only: of traces for
-everything that needs no image and so has no noise, else of the whole job with the noise of the base's seed.
+Spots and lines of sight are differentiated by automatic differentiation through the ray trace (spots in reverse mode in
+``twin.monitor.monitor_derivative``, lines of sight in forward mode in this file). The estimators, which are formulas of
+these numbers, are differentiated along the resulting directions. All other responses have finite differences only: of
+ray traces for everything that needs no image and so has no noise, else of the whole job with the noise of the base
+job's seed.
 
 A chief ray starts at a point of the line CCD and is aimed through the centre of the stop. By the implicit function
-theorem the change of its direction per motion is -(d hit / d direction)^-1 (d hit / d motion); with it the ray's
-derivative is propagated forward to object space.
+theorem the change of its direction per motion is -(d hit / d direction)^-1 (d hit / d motion), where hit is the point
+in the plane of the stop; with it the ray's derivative is propagated forward to object space.
 """
 
 from __future__ import annotations
@@ -47,26 +48,26 @@ from twin.study.runs.render_base import PERTURB, JobMaker, run_results
 from twin.study.runs.setup import StudySetup
 
 CAP = {"shift": 1e-3, "rotate": 3e-4, "scale": 1e-3, "figure": 1e-6}
-"""Largest steps of the finite differences by kind of motion: metres, radians or pure numbers.
+"""Kind of motion -> largest step of its finite difference, in metres, radians or pure numbers.
 
 Such a step moves the beam on the mirrors by a few millimetres at most.
 """
 ROUNDING = 1e-9
-"""Size of a motion, relative to the motions that it is composed of, below which it is rounding error."""
+"""Amplitude of a resulting motion, relative to the motions that it is the sum of, below which it is rounding error."""
 
 Slopes = Mapping[ElementaryMotion, float]
-"""Derivative of the amount of each elementary motion (one body, kind and axis) with respect to a factor."""
+"""Elementary motion (one body, kind and axis) -> derivative of its amount with respect to a factor of the study."""
 
 
 def motion_slopes(about: State, state: Callable[[float], State], step: float) -> Slopes | None:
-    """Return the derivative of a state's motions with respect to a factor.
+    """Return the derivatives of the amounts of a state's motions with respect to a factor of the study.
 
-    None if the factor changes more than rigid motions, figures and scales.
+    The result is None if the factor changes more than rigid motions, figures and scales.
 
     Parameters
     ----------
     about : State
-        State of the base.
+        State of the instrument in the base job.
     state : callable
         Function from a change of the factor to the state.
     step : float
@@ -97,28 +98,30 @@ def _rest(motion: Motion) -> Motion:
 
 
 SPOT_REACH, SIGHT_REACH = 1.0, 1e-4
-"""Steps of the derivative of the formulas, px and rad.
+"""Steps of the numerical derivatives of the formulas: of spot shifts in px, and of the line of sight in rad.
 
-They are so small that the error after Richardson's extrapolation is below rounding, and so large that rounding is
-below 1e-11."""
+They are so small that the error after Richardson's extrapolation is below rounding, and so large that rounding is below
+1e-11.
+"""
 SIGHT_SHARE = 5e-3
-"""Largest step of directions as a share of half the field along a line.
+"""Largest step by which the lines of sight are rotated for a derivative, as a fraction of half the field of a line CCD.
 
-The principal distance is a fit over that field; the relative error of its derivative is the fourth power of this share.
+The principal distance is a fit over that field; the relative error of its derivative is the fourth power of this
+fraction.
 """
 
 
 @dataclass(frozen=True, eq=False)
 class Chain:
-    """Instrument of a job with the formulas that the job applies to traced spots and directions.
+    """Instrument of a job with the formulas by which the job converts spots and directions to results.
 
-    Spots are means of rays, which are the energy centroids of the images. An instrument without a monitor has lines of
-    sight alone.
+    Spots are means of traced rays, which are the energy centroids of the images. An instrument without a monitor has
+    only lines of sight.
 
     Attributes
     ----------
     resolved : ResolvedJob
-        Resolved job with everything that it refers to.
+        Job with the contents of all files that it refers to.
     experiment : MonitorExperiment
         Instrument of the job.
     """
@@ -141,9 +144,7 @@ class Chain:
         return self.experiment.path.coarse.mean_spots(states)
 
     def sight(self, states: Sequence[State]) -> np.ndarray:
-        """Return the lines of sight of the line CCDs' points in S states, (S, cameras, points, 3), unit vectors.
-
-        Array dimensions: S states.
+        """Return the viewing directions of the line CCDs' points in S states, (S, cameras, points, 3), unit vectors.
 
         Raises
         ------
@@ -154,25 +155,29 @@ class Chain:
 
     @cached_property
     def reach(self) -> float:
-        """Length of the step by which directions of lines of sight are changed, radians; smaller for a narrow field."""
+        """Step by which lines of sight are rotated for a derivative, in radians; smaller for a narrow field."""
         ends = self.experiment.sight.nominal[:, 0, [0, -1]]
         half = 0.5 * np.linalg.norm(ends[:, 1] - ends[:, 0], axis=-1)
         return float(min(SIGHT_REACH, SIGHT_SHARE * np.min(half)))
 
     @cached_property
     def nominal(self) -> np.ndarray:
-        """Spots of the unperturbed instrument, (1, C, 2).
-
-        Array dimensions: C spots.
-        """
+        """Spot positions of the unperturbed instrument, (1, C, 2): row and column of C spots, in pixels."""
         return self.spots([{}])
 
     def outcome(self, state: State, spots: np.ndarray, sight: np.ndarray) -> dict[str, Any]:
-        """Return ``truth`` and ``recovered`` of one state with spots (C, 2) and directions (cameras, points, 3).
+        """Return the results ``truth`` and ``recovered`` of one state from its spot positions and lines of sight.
 
-        Without a monitor there is ``truth`` alone.
+        Without a monitor there is only ``truth``.
 
-        Array dimensions: C spots.
+        Parameters
+        ----------
+        state : State
+            State of the instrument.
+        spots : (C, 2) ndarray
+            Row and column of C spots, in pixels.
+        sight : (cameras, points, 3) ndarray
+            Unit vectors of the lines of sight.
         """
         truth = self.experiment.sight.truth_of(sight[:, None])
         if not self.experiment.monitored:
@@ -188,12 +193,20 @@ class Chain:
     def moved(
         self, state: State, at: tuple[np.ndarray, np.ndarray], spots: np.ndarray, sight: np.ndarray
     ) -> tuple[list[dict[str, Any]], float]:
-        """Return the results at four steps from a state along given derivatives of its spots and lines of sight.
+        """Return the results at four points near a state, along given derivatives of its spots and lines of sight.
 
-        The length of the step is returned too. ``at`` holds the spots and directions of the state; ``spots`` and
-        ``sight`` are their derivatives, of shapes (C, 2) and (cameras, points, 3).
+        The four results belong to ``SHARES`` times a step; its length is returned too.
 
-        Array dimensions: C spots.
+        Parameters
+        ----------
+        state : State
+            State of the instrument.
+        at : tuple of ndarray
+            Spot positions and lines of sight of the state.
+        spots : (C, 2) ndarray
+            Derivative of the positions of C spots, in pixels per unit of the factor.
+        sight : (cameras, points, 3) ndarray
+            Derivative of the lines of sight, per unit of the factor.
         """
         largest = max(np.abs(spots).max(initial=0.0) / SPOT_REACH, np.abs(sight).max() / self.reach)
         step = 1.0 / float(largest) if largest > 0.0 else 1.0
@@ -204,7 +217,7 @@ class Chain:
 
 
 SHARES = (1.0, -1.0, 0.5, -0.5)
-"""Multiples of a step from the base at which values are taken for Richardson's extrapolation."""
+"""Multiples of a step from the base value at which values are taken for Richardson's extrapolation."""
 
 
 def extrapolated(values: np.ndarray, step: float) -> tuple[np.ndarray, np.ndarray]:
@@ -213,7 +226,7 @@ def extrapolated(values: np.ndarray, step: float) -> tuple[np.ndarray, np.ndarra
     Parameters
     ----------
     values : (4, ...) ndarray
-        Values at the base plus ``SHARES`` times the step.
+        Function values at the base value plus ``SHARES`` times the step.
     step : float
         Full step.
     """
@@ -297,7 +310,7 @@ class GradientFactor:
     unit : str
         Unit of its numbers, empty for pure ones.
     value : float
-        Value in the base.
+        Value in the base job.
     spread : float
         Sigma of a normal distribution, otherwise half of the range of its values; in the factor's unit.
     spread_of : str
@@ -313,12 +326,12 @@ class GradientFactor:
 
     @classmethod
     def of(cls, setup: StudySetup, name: str) -> GradientFactor:
-        """Return the factor of that name.
+        """Return the factor of the study that has the given name, with its value in the base job and its spread.
 
         Raises
         ------
         InputError
-            It has no numbers, or the base has none at its key.
+            The factor has no numerical values, or the base job has no number at its key.
         """
         factor = setup.study.factors[name]
         numbers = factor.numbers()
@@ -344,7 +357,7 @@ class GradientFactor:
         return self.setup.study.factors[self.name]
 
     def values(self, value: float) -> tuple[tuple[KeyPath, Any], ...]:
-        """Return key and value of each entry of the base job that the factor sets when it has this value.
+        """Return (key, value) of each entry of the base job that the factor sets when it has the given value.
 
         Raises
         ------
@@ -366,7 +379,7 @@ class GradientFactor:
 
 
 def _in_base(setup: StudySetup, name: str, factor: FactorSpec, unit: str) -> float:
-    """Return the factor's value in the base, in its own unit; 1 for a factor that only scales."""
+    """Return the factor's value in the base job, in its own unit; 1 for a factor that only scales other values."""
     numbers: list[float] = []
     for k, place in enumerate(factor.places):
         try:
@@ -381,13 +394,19 @@ def _in_base(setup: StudySetup, name: str, factor: FactorSpec, unit: str) -> flo
 
 
 MOVE = 2.0
-"""Displacement of a spot by the step of a motion, pixels; the CCDs have room for about ten."""
+"""Displacement of a spot, in pixels, for which the finite-difference step of a motion is chosen.
+
+The CCDs have room for about ten pixels.
+"""
 TURN = 1e-4
-"""Rotation of a line of sight by the step of a motion, radians, where there are no spots; about ten pixels."""
+"""Rotation of a line of sight, in radians, for which the finite-difference step is chosen where there are no spots.
+
+It corresponds to about ten pixels.
+"""
 PART = 0.5
-"""Step of the finite differences with respect to factors that are no motions, in units of their spreads."""
+"""Step of the finite differences for factors that are not motions, in units of the factor's spread."""
 QUALITY_PART = 0.1
-"""Step of the finite differences for responses of image quality, in units of the factor's spread.
+"""Step of the finite differences for image quality responses, in units of the factor's spread.
 
 It is small because image quality is far from linear (a wavefront error is a root of squares); it is traced without
 noise.
@@ -395,19 +414,20 @@ noise.
 TOGETHER = 8
 """Number of factors whose finite differences are traced at once."""
 SMALL = 1e-3
-"""Share of a response's largest change per spread, to which the errors of smaller changes are related.
+"""Smallest reference for relative errors of derivatives, as a fraction of the response's largest change.
 
-Entries that are zero by symmetry have no significant digits. An entry of a response that is a difference counts as much
-as the larger of its two terms, since their common digits cancel.
+Changes are those due to the spread of a factor. Derivatives that are zero by symmetry have no significant digits, so
+that their errors are related to this fraction of the largest change. For a response that is a difference, the larger of
+its two terms counts, since their common digits cancel.
 """
 AD, TRACED, WHOLE = "ad", "traced differences", "differences of the whole job"
 AD_PART = "automatic differentiation"
-"""Name of the automatic differentiation in the progress display; the other parts are named after their method."""
+"""Name of the automatic differentiation in the progress display; other stages have the name of their method."""
 
 
 @dataclass(frozen=True, eq=False)
 class Gradient:
-    """Jacobian of R responses with respect to F factors, per unit of the factor.
+    """Jacobian of a study: derivatives of R responses with respect to F factors, in response units per factor unit.
 
     Attributes
     ----------
@@ -422,14 +442,14 @@ class Gradient:
     differences : (R, F) ndarray
         Derivatives by central differences.
     error : (R, F) ndarray
-        Correction of the differences by Richardson's extrapolation.
+        Correction of the differences by Richardson's extrapolation, as an estimate of their error.
     scale : (R, F) ndarray
-        Size of the derivatives' terms: of the larger term where a response is a difference of two numbers, otherwise of
-        the derivative itself.
+        Absolute value of the derivative; where a response is the difference of two numbers, that of the larger
+        derivative of the two.
     step : (R, F) ndarray
         Steps of the differences, in the factor's unit.
     method : (R, F) ndarray of str
-        Method by which the best available derivative was computed.
+        Method of the best available derivative.
     """
 
     factors: tuple[GradientFactor, ...]
@@ -444,29 +464,43 @@ class Gradient:
 
     @classmethod
     def unknown(cls, factors: tuple[GradientFactor, ...], asked: Sequence[_GradientResponse]) -> Gradient:
-        """Return a Jacobian whose entries are not filled in yet."""
+        """Return a Jacobian for the given factors and responses whose entries are still NaN."""
         shape = (len(asked), len(factors))
         names, units = tuple(response.name for response in asked), tuple(response.spec.units for response in asked)
         ad, differences, error, scale, step = (np.full(shape, np.nan) for _ in range(5))
         return cls(factors, names, units, ad, differences, error, scale, step, np.full(shape, WHOLE, object))
 
     def put(self, rows: Sequence[int], k: int, values: np.ndarray, step: float, method: str) -> None:
-        """Fill in the finite differences of selected responses with respect to factor k from four values each."""
+        """Store the finite differences of some responses with respect to factor number ``k``.
+
+        Parameters
+        ----------
+        rows : sequence of int
+            Indices of the R responses.
+        k : int
+            Index of the factor.
+        values : (4, R) ndarray
+            Values of the responses at the base value plus ``SHARES`` times the step.
+        step : float
+            Step, in the factor's unit.
+        method : str
+            Name of the method.
+        """
         self.differences[rows, k], self.error[rows, k] = extrapolated(values, step)
         self.step[rows, k] = step
         self.method[rows, k] = method
 
     @property
     def best(self) -> np.ndarray:
-        """Derivatives (R, F) of the responses with respect to the factors, by AD if available, else by differences.
+        """Derivatives of R responses with respect to F factors, (R, F), in response units per factor unit.
 
-        AD is automatic differentiation. Array dimensions: R responses, F factors.
+        They are by automatic differentiation where available, else by finite differences.
         """
         return np.where(np.isnan(self.ad), self.differences, self.ad)
 
     @property
     def change(self) -> np.ndarray:
-        """Change of each response when the factor changes by its spread, (R, F).
+        """Change of each response when each factor changes by its spread, (R, F), in the response's unit.
 
         Array dimensions: R responses, F factors.
         """
@@ -476,8 +510,8 @@ class Gradient:
     def relative(self) -> np.ndarray:
         """Relative deviation of the finite differences from automatic differentiation, (R, F); NaN without the latter.
 
-        Deviations of small derivatives are relative to ``SMALL`` times the largest one. Array dimensions: R responses,
-        F factors.
+        Deviations of small derivatives are relative to ``SMALL`` times the response's largest one. Array dimensions: R
+        responses, F factors.
         """
         spread = np.array([factor.spread for factor in self.factors])
         size = self.scale * spread
@@ -513,7 +547,10 @@ class _GradientResponse:
         return first - second
 
     def terms(self, outcome: Any, setup: StudySetup) -> tuple[float, float]:
-        """Return the number and the subtracted one, 0 if there is none; raise InputError if the results lack them."""
+        """Return the response's number and the number that is subtracted from it, 0 if there is none.
+
+        InputError is raised if the results lack one of them.
+        """
         out = []
         for key, where in ((self.spec.key, "key"), (self.spec.minus, "minus")):
             if key is None:
@@ -531,7 +568,7 @@ class _GradientResponse:
 
     @property
     def roots(self) -> set[str]:
-        """Result files that the response needs.
+        """Names of the result files, without suffix, that the response needs; ``image`` for numbers that need images.
 
         Sigmas, and the test of the shifts against the prior, depend on the noise and so need images.
         """
@@ -555,10 +592,10 @@ def study_gradient(setup: StudySetup, backend: Backend, advance: Advance = silen
     Raises
     ------
     InputError
-        A factor or response has no number, the base's schema refuses a value beside the base's, or a factor's step
-        loses the light.
+        A factor or response has no number, a value one step away from the base job's is not allowed, or the light is
+        lost one step away.
     InputErrorText
-        The base itself cannot be run.
+        The base job itself cannot be run.
     """
     factors = tuple(GradientFactor.of(setup, name) for name in setup.study.factors)
     asked = [_GradientResponse(name, spec) for name, spec in setup.study.responses.items()]
@@ -590,9 +627,9 @@ def _spot_responses(resolved: ResolvedJob) -> list[_GradientResponse]:
 
 @dataclass(eq=False)
 class _Traced:
-    """Part of the Jacobian that needs no image.
+    """Part of the Jacobian that needs no image, only ray traces.
 
-    ``slopes`` holds the derivatives of the elementary motions with respect to those factors that only move bodies.
+    ``slopes`` holds, for the factors that do nothing but move bodies, the derivatives of the elementary motions.
     """
 
     setup: StudySetup
@@ -609,7 +646,7 @@ class _Traced:
         self.quality = [i for i in self.rows if i not in self.exact]
 
     def fill(self, table: Gradient) -> None:
-        """Fill in derivatives by automatic differentiation and by finite differences, for all factors."""
+        """Store the derivatives with respect to all factors, by automatic differentiation and by finite differences."""
         chain = Chain(self.maker.base, MonitorExperiment(self.maker.base, self.backend))
         try:
             about = _state(chain, self.maker.base)
@@ -632,7 +669,7 @@ class _Traced:
             table.method[self.exact, k] = AD
 
     def _differences(self, chain: Chain, table: Gradient, rows: Sequence[int], steps: Mapping[int, float]) -> None:
-        """Fill in the finite differences of selected responses with respect to all factors."""
+        """Store the finite differences of selected responses with respect to all factors."""
         if not rows:
             return
         moving = list(self.slopes)
@@ -671,7 +708,7 @@ class _Traced:
             raise _refused(self.setup, factor, change, error) from None
 
     def _exact(self, chain: Chain, about: State, table: Gradient) -> dict[int, float]:
-        """Fill in derivatives by automatic differentiation; return the steps for differences with the same factors."""
+        """Store derivatives by automatic differentiation; return factor index -> step for the finite differences."""
         self.advance(AD_PART, 0, 1)
         motions = list(dict.fromkeys(motion for slopes in self.slopes.values() for motion in slopes))
         spots: np.ndarray = np.zeros((*chain.nominal.shape[1:], 0))
@@ -701,9 +738,9 @@ class _Traced:
         return sizes
 
     def _values(self, chain: Chain, factor: GradientFactor, step: float, rows: Sequence[int]) -> np.ndarray:
-        """Return the selected responses of four jobs beside the base, (4, responses), for one factor.
+        """Return the selected responses of four jobs near the base job in which one factor is changed, (4, responses).
 
-        The factor differs from its value in the base by the step times ``SHARES``.
+        The factor differs from its value in the base job by ``SHARES`` times the step.
         """
         jobs = [self._job(factor, share * step) for share in SHARES]
         same = all(place[:2] == PERTURB for place, _ in factor.values(factor.value))
@@ -733,7 +770,10 @@ class _Traced:
 
 
 def _state(chain: Chain, resolved: ResolvedJob) -> State:
-    """Return the state of an instrument under a job, which may use short names of bodies; raise InputError."""
+    """Return the state of the instrument that a job describes; raise InputError if the job cannot be applied.
+
+    The job may name bodies by their short names.
+    """
     return chain.experiment.state(checked_nodes(resolved.job, chain.experiment.instrument.nodes))
 
 
@@ -746,7 +786,10 @@ def _whole(
     table: Gradient,
     advance: Advance,
 ) -> None:
-    """Fill in differences of the base command's results; all runs have the noise of the base's seed."""
+    """Store derivatives of responses by finite differences of complete runs of the base command.
+
+    All runs use the base job's noise seed.
+    """
     for k, factor in enumerate(factors):
         advance(WHOLE, k, len(factors))
         step = PART * factor.spread

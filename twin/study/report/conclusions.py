@@ -25,7 +25,7 @@ BAD_MODEL = 0.8
 
 
 def design_title(kind: str) -> str:
-    """Return the name of a kind of design for readers."""
+    """Return the name of a kind of design as the report writes it."""
     return "complete grid" if kind == GRID else SAMPLERS[kind].title
 
 
@@ -74,7 +74,7 @@ def warnings(analysis: StudyAnalysis) -> list[str]:
 
 
 def _reason(doubt: str) -> str:
-    """Return the beginning of a run's warning without numbers and names of spots, so that equal ones can be counted."""
+    """Return the start of a run's warning, without numbers and spot names, so that equal warnings can be counted."""
     head, _, rest = doubt.partition("; ")
     if "fit of the spots" in head:
         return f"the fit of spots is not good: {rest.partition(':')[0].partition('. ')[0]}"
@@ -148,15 +148,15 @@ def _needed(convergence: Convergence) -> str:
 
 
 def _round_up(count: int) -> int:
-    """Return a count rounded up to two digits."""
+    """Return a number of runs rounded up to two significant digits."""
     step = 10 ** max(len(str(count)) - 2, 0)
     return -(-count // step) * step
 
 
 LEAST_SHARE = 0.02
-"""Share of a response's variance below which a factor is not named in the conclusions."""
+"""Fraction of a response's variance below which a factor is not named in the conclusions."""
 LINEAR = 0.5
-"""Share of the variance explained by the linear model, below which the report says that it describes poorly."""
+"""Coefficient of determination (R²) of the linear model below which the report says that the model is poor."""
 
 
 def conclusions(analysis: StudyAnalysis) -> list[str]:
@@ -218,7 +218,10 @@ def _requirement_text(analysis: StudyAnalysis) -> str:
 
 
 def _open_range(r: Requirement) -> str:
-    """Return the range of shares that failed runs leave open, for the end of a sentence."""
+    """Return the possible range of the fraction that meets the requirement, as the end of a sentence.
+
+    The range is open because failed runs may or may not have met it.
+    """
     if r.bounds is None:
         return ""
     interval = f" (95% interval {span(r.bounds_interval)})" if r.bounds_interval is not None else ""
@@ -306,7 +309,7 @@ DASH = "\N{EN DASH}"
 
 
 def number(value: float | None, digits: int = 4) -> str:
-    """Return a number as text with some digits, a dash for None."""
+    """Return a number as text with ``digits`` significant digits, or a dash for None."""
     return DASH if value is None else significant(value, digits, floor=0.0)
 
 
@@ -318,7 +321,7 @@ def with_unit(value: float | None, unit: str, digits: int = 3) -> str:
 
 
 def limits(interval: Interval) -> str:
-    """Return an interval as text; an end that is None is a question mark."""
+    """Return an interval as text, with a question mark for an end that is unknown (None)."""
     low, high = interval
     if low is None and high is None:
         return ""
@@ -330,7 +333,7 @@ def limits(interval: Interval) -> str:
 
 
 def with_limits(value: Estimate | None) -> str:
-    """Return a number and its interval as text, with decimals according to the interval."""
+    """Return an estimate with its confidence interval as text; the interval determines the number of decimals."""
     if value is None:
         return DASH
     low, high = value.interval
@@ -348,7 +351,7 @@ def with_limits(value: Estimate | None) -> str:
 
 
 def share(value: Estimate | None) -> str:
-    """Return an index between 0 and 1 and its interval as text, with three decimals."""
+    """Return a sensitivity index between 0 and 1 with its confidence interval as text, with three decimals."""
     if value is None:
         return DASH
     low, high = value.interval
@@ -357,7 +360,7 @@ def share(value: Estimate | None) -> str:
 
 
 def percent(value: float | None, decimals: int = 1) -> str:
-    """Return a share as percent; values that only round to 0 or 100 get a sign < or >."""
+    """Return a fraction as percent; values that would round to 0 or 100 without being equal get a sign < or >."""
     if value is None:
         return DASH
     least = 10.0 ** -(decimals + 2)
@@ -369,7 +372,7 @@ def percent(value: float | None, decimals: int = 1) -> str:
 
 
 def span(interval: tuple[float, float] | None) -> str:
-    """Return an interval of a share as text, a dash for None."""
+    """Return an interval of a fraction as text in percent, or a dash for None."""
     return DASH if interval is None else f"{percent(interval[0])} … {percent(interval[1])}"
 
 

@@ -16,30 +16,34 @@ from scipy.special import roots_legendre
 from twin.study.report.study_statistics import CONFIDENCE, LEAST, Estimate, Factor, Response, StudyRuns, noise_share
 
 MOST_LEVELS = 20
-"""Largest number of different texts of a factor for which indices are computed."""
+"""Largest number of different text values of a factor for which sensitivity indices are computed."""
 
 
 class _NoBasis(Exception):
-    """Error that no polynomial basis can be made for a factor; the text gives the reason."""
+    """Error that no polynomial basis can be made for a factor, with the reason as text."""
 
 
 def axis_functions(axis: tuple[Factor, ...], good: np.ndarray, degree: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the orthonormal basis functions of a factor's axis at the runs: values (n, m) and degrees (m,).
+    """Return the orthonormal basis functions of an input axis at the runs, and their degrees.
 
-    Each function has mean 0 and mean square 1 under the axis' distribution, and different ones are orthogonal: Legendre
-    polynomials for a uniform factor, Hermite polynomials for a normal one, Gram-Schmidt on the distribution itself for
-    others, lists and texts. All functions of a text have degree 1.
-
-    Array dimensions: n runs, m functions.
+    An axis is one factor, or several that vary together. Each function has mean 0 and mean square 1 under the axis'
+    distribution, and different ones are orthogonal: Legendre polynomials for a uniform factor, Hermite polynomials for
+    a normal one, Gram-Schmidt on the distribution itself for others, for lists and for texts. All functions of a text
+    have degree 1.
 
     Parameters
     ----------
     axis : tuple of Factor
         Factors that vary together.
     good : (runs,) ndarray of bool
-        True for the runs that are used.
+        True for the n runs that are used.
     degree : int
         Highest degree.
+
+    Returns
+    -------
+    tuple of ndarray
+        Values (n, m) of m functions at n runs, and their degrees (m,).
 
     Raises
     ------
@@ -63,7 +67,7 @@ def axis_functions(axis: tuple[Factor, ...], good: np.ndarray, degree: int) -> t
 
 
 def _text_weights(axis: tuple[Factor, ...], levels: np.ndarray, counts: np.ndarray) -> np.ndarray:
-    """Return the probability of every text value of a factor: its frequency in a list, or among rows of a table."""
+    """Return the probability of every text value of a factor: its frequency in a list, or among the rows of a table."""
     if len(axis) == 1:
         listed = [_text(value) for value in axis[0].spec.scalars()]
         names = [str(value) for value in np.unique(axis[0].values)[levels[:, 0]]]
@@ -159,7 +163,7 @@ def _of_table(table: np.ndarray, values: np.ndarray, degree: int) -> tuple[np.nd
 
 
 def _orthonormal(columns: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """Return the columns orthonormalised under the weights; the first one must be constant."""
+    """Return the columns of a matrix orthonormalised under the given weights; the first column must be constant."""
     root = np.sqrt(weights)[:, None]
     q, r = np.linalg.qr(columns * root)
     return np.asarray(q * np.sign(np.diag(r)) / root)
@@ -172,9 +176,9 @@ MOST_TERMS = 250
 MOST_RUNS = 20_000
 """Largest number of runs to which a polynomial chaos model is fitted."""
 TINY = sys.float_info.min
-"""Smallest positive normal float64, which avoids divisions by zero."""
+"""Smallest positive normal float64, a lower limit for divisors so that none is zero."""
 RUNS_TO_CHOOSE = 3_000
-"""Number of runs, the first ones, with which the degree is selected."""
+"""Largest number of runs used to select the polynomial degree; of more runs only the first ones are used."""
 RUNS_PER_TERM = 2.5
 """Smallest number of runs per term of a polynomial chaos model."""
 RESAMPLES = 1000
@@ -182,29 +186,29 @@ RESAMPLES = 1000
 HARMONICS = 10
 """Number of harmonics whose power RBD-FAST (random balance designs) sums."""
 MANY_FAILED = 0.05
-"""Share of runs without a number, beyond which the other runs do not represent the specified distributions."""
+"""Fraction of runs without a result above which the other runs do not represent the specified distributions."""
 DISAGREE = 3.0
-"""Distance of the RBD-FAST index from the interval of the polynomial chaos index, from which the two disagree.
+"""Distance from which the RBD-FAST index and the confidence interval of the polynomial chaos index disagree.
 
-It is multiplied by the root of the number of runs, and is five standard deviations of RBD-FAST for smooth responses of
-100 to 300 runs.
+It is divided by the square root of the number of runs, and amounts to five standard deviations of RBD-FAST for smooth
+responses of 100 to 300 runs.
 """
 
 
 @dataclass(frozen=True)
 class Index:
-    """Sensitivity indices of an axis: one factor, or several that vary together.
+    """Sensitivity indices of an axis of the input space: one factor, or several that vary together.
 
     Attributes
     ----------
     factors : tuple of str
         Names of the factors that vary together, mostly one.
     first : Estimate
-        First-order index: share of the variance that the axis explains alone.
+        First-order index: fraction of the variance that the axis explains alone.
     total : Estimate
-        Total index: share of the variance that vanishes when the axis is fixed.
+        Total index: fraction of the variance that vanishes when the axis is fixed.
     check : float or None
-        First-order index by RBD-FAST, which needs no model; None where it cannot be used.
+        First-order index by RBD-FAST (random balance designs), which needs no model; None where it cannot be used.
     agrees : bool or None
         True if ``check`` lies within the interval of ``first``, apart from its noise; None without ``check``.
     """
@@ -217,7 +221,7 @@ class Index:
 
     @property
     def name(self) -> str:
-        """Names of the factors, joined."""
+        """Names of the factors that vary together, joined to one text."""
         return " + ".join(self.factors)
 
 
@@ -238,10 +242,10 @@ class Indices:
     held_out : float or None
         Leave-one-out cross-validated R²; None for a grid.
     rest : float
-        Share of the variance that the model does not explain; 0 for a grid.
+        Fraction of the variance that the model does not explain; 0 for a grid.
     noise : float or None
-        Share of the variance that the runs report as noise; None if they report none. It may exceed 1 by chance where
-        only noise varies.
+        Fraction of the variance due to the noise that the runs report; None if they report none. It may exceed 1 by
+        chance where only noise varies.
     """
 
     method: str
@@ -255,7 +259,7 @@ class Indices:
 
 @dataclass(frozen=True)
 class NoIndices:
-    """Reason, as text, why sensitivity indices cannot be computed for a response."""
+    """Result for a response whose sensitivity indices cannot be computed, with the reason as text."""
 
     reason: str
 
@@ -264,13 +268,13 @@ def sensitivity_indices(runs: StudyRuns, response: Response) -> Indices | NoIndi
     """Compute the sensitivity indices of a response by the method that fits the design.
 
     No design of a study is Saltelli's, so that the indices are estimated from the available runs. The variance of a
-    complete grid is decomposed exactly. To drawn designs polynomial chaos is fitted (Sudret, Reliability Engineering
+    complete grid is decomposed exactly. Polynomial chaos is fitted to random designs (Sudret, Reliability Engineering
     and System Safety 93, 964, 2008); the partial variances are sums of its squared coefficients, corrected for their
     noise. The degree is selected by leave-one-out cross-validation. Intervals come from 1000 bootstrap resamples of the
-    runs, for the selected terms; the unexplained variance may belong to any factor and is added to the upper end of
-    each, except for reported noise. If a few runs have no number, the intervals are widened for any values within the
-    range of the others; if many have none, the others do not follow the distributions of the factors, and there are no
-    indices.
+    runs, for the selected terms; the unexplained variance, without the part that is reported noise, may be due to any
+    factor and is added to the upper end of each. If a few runs have no result, the intervals are widened for any values
+    within the range of the others; if many have none, the others do not follow the distributions of the factors, and
+    there are no indices.
 
     Parameters
     ----------
@@ -309,7 +313,7 @@ def sensitivity_indices(runs: StudyRuns, response: Response) -> Indices | NoIndi
 
 
 def _of_grid(axes: Sequence[tuple[Factor, ...]], values: np.ndarray) -> tuple[Index, ...]:
-    """Return the exact indices of a complete grid, with all combinations equally likely."""
+    """Return the exact sensitivity indices for a complete grid of runs, with all combinations equally likely."""
     total = float(np.var(values))
     out = []
     for k, axis in enumerate(axes):
@@ -326,7 +330,7 @@ def _of_grid(axes: Sequence[tuple[Factor, ...]], values: np.ndarray) -> tuple[In
 
 
 def _cells(axes: Sequence[tuple[Factor, ...]]) -> np.ndarray:
-    """Return for each run the index of its combination of the factors' values, (runs,)."""
+    """Return for each run a number that identifies its combination of the factors' values, (runs,)."""
     factors = [factor for axis in axes for factor in axis]
     if not factors:
         return np.zeros(0, int)
@@ -360,7 +364,7 @@ class _Chaos:
     held_out : float
         Leave-one-out cross-validated R².
     rest : float
-        Share of the variance that is not explained.
+        Fraction of the variance that is not explained.
     """
 
     axes: Sequence[tuple[Factor, ...]]
@@ -430,7 +434,7 @@ class _Chaos:
         seed : int
             Seed of the bootstrap.
         missing : (runs,) ndarray of bool
-            True for runs without a number.
+            True for runs without a result.
         """
         shares = self._shares()
         ends = [
@@ -451,10 +455,12 @@ class _Chaos:
         return tuple(sorted(out, key=lambda index: -index.total.value))
 
     def _with_missing(self, low: np.ndarray, high: np.ndarray, missing: np.ndarray) -> list[np.ndarray]:
-        """Widen intervals (2, axes) for any responses of the missing runs within the range of the others.
+        """Widen confidence intervals (2, axes) to allow for runs without a result.
 
-        Of N runs, one whose response departs from the polynomials by d, and in which the terms of an axis sum to p,
-        changes the variance of the axis by 2 p d / N, and by at most d^2 / N in addition.
+        Their results may lie anywhere in the range of the others.
+
+        In N runs, a run whose response departs from the polynomials by d, and in which the terms of an axis sum to p,
+        changes the variance due to that axis by 2 p d / N, and by at most d^2 / N in addition.
         """
         functions = [axis_functions(axis, missing, HIGHEST_DEGREE)[0] for axis in self.axes]
         terms = _columns(functions, self.terms)[:, 1:] * self.coefficients
@@ -471,11 +477,10 @@ class _Chaos:
         return [lowest, np.minimum((high + moved + added) / max(1.0 - whole, TINY), 1.0)]
 
     def _parts(self, squares: np.ndarray) -> np.ndarray:
-        """Return sums of squared coefficients (..., m) for each axis alone and with interactions, (..., 2, axes).
+        """Return the sums of squared coefficients of each axis, alone and with its interactions, (..., 2, axes).
 
-        With interactions an axis explains no less than alone, although the noise correction may exceed the sum.
-
-        Array dimensions: m terms.
+        ``squares`` holds the squared coefficients (..., m) of m terms. With interactions an axis explains no less than
+        alone, although the noise correction may exceed the sum.
         """
         used = self.terms > 0
         alone = used & (used.sum(axis=1) == 1)[:, None]
@@ -484,10 +489,7 @@ class _Chaos:
 
     @cached_property
     def _fit_rest(self) -> tuple[np.ndarray, float]:
-        """Leave-one-out residuals of the runs, (n,), and the residual variance.
-
-        Array dimensions: n runs.
-        """
+        """Leave-one-out residuals of the n runs, (n,), and the residual variance."""
         centred = self.y - self.y.mean()
         residuals = centred - self.q @ (self.q.T @ centred)
         rest = float(np.sum(residuals**2)) / (len(self.y) - len(self.terms) - 1)
@@ -497,10 +499,7 @@ class _Chaos:
 
     @cached_property
     def _squares(self) -> np.ndarray:
-        """Squared coefficients (m,), corrected for the bias by their variance.
-
-        Array dimensions: m terms.
-        """
+        """Squared coefficients of the m terms, (m,), minus the coefficients' variances, by which they are biased."""
         inverse = np.linalg.inv(self.r)
         return np.asarray(self.coefficients**2 - np.sum(inverse**2, axis=1)[1:] * self._fit_rest[1])
 
@@ -512,9 +511,9 @@ class _Chaos:
     def _resampled(self, noise: float, seed: int) -> tuple[np.ndarray, np.ndarray]:
         """Return bootstrapped first-order and total indices, without and with the residual variance that is not noise.
 
-        Both arrays have the shape (resamples, 2, axes). Pairs of factors and response are resampled, so that
-        coefficients and total variance vary as between studies. Each run is weighted by a Poisson variable of mean 1;
-        the coefficients change to first order by the leave-one-out influence of each run.
+        Both arrays have the shape (resamples, 2, axes). Runs, pairs of factor values and response, are resampled, so
+        that coefficients and total variance vary as between studies. Each run is weighted by a Poisson variable of mean
+        1; the coefficients change to first order by the leave-one-out influence of each run.
         """
         n, m = len(self.y), len(self.terms)
         out, rest = self._fit_rest
@@ -543,9 +542,9 @@ class _Chaos:
 
 
 def _columns(functions: Sequence[np.ndarray], terms: np.ndarray) -> np.ndarray:
-    """Return the design matrix (n, m + 1): the constant, and the products of basis functions that ``terms`` name.
+    """Return the design matrix (n, m + 1): a constant column, then the product of basis functions of each term.
 
-    Array dimensions: n runs, m terms.
+    ``terms`` holds for each of m terms the index of its function of each axis; n is the number of runs.
     """
     columns = np.ones((len(functions[0]), len(terms) + 1))
     for k, values in enumerate(functions):
@@ -555,9 +554,10 @@ def _columns(functions: Sequence[np.ndarray], terms: np.ndarray) -> np.ndarray:
 
 
 def _terms(degrees: Sequence[np.ndarray], degree: int, norm: float, runs: int) -> np.ndarray | None:
-    """Return products of basis functions with (sum d^norm)^(1/norm) <= degree, d being the degree of each factor.
+    """Return the products of basis functions of limited degree; None if there are too many for the number of runs.
 
-    None if there are too many for the number of runs.
+    A product is included if (sum d^norm)^(1/norm) <= degree, where d is the degree of its function of each axis
+    (hyperbolic truncation). Each row holds the indices of the functions.
     """
     most = min(MOST_TERMS, int(runs / RUNS_PER_TERM))
     terms = []

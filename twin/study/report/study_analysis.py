@@ -20,7 +20,7 @@ from twin.study.report.study_statistics import Estimate, Response, StudyRuns
 
 @dataclass(frozen=True, eq=False)
 class ParetoFront:
-    """Non-dominated runs of a pair of factors or responses.
+    """Non-dominated runs for a pair of quantities (factors or responses) that are both to be optimised.
 
     Array dimensions: m runs on the front, n runs.
 
@@ -35,7 +35,7 @@ class ParetoFront:
     ranks : (n,) ndarray of int
         Rank of every run: 0 on the front, 1 on the front of the remaining runs, and so on; -1 without numbers.
     knee : int or None
-        Index into ``runs`` of the knee; None if the front has none.
+        Index into ``runs`` of the knee, the point farthest from the line between the ends; None if there is none.
     """
 
     spec: ParetoSpec
@@ -47,9 +47,7 @@ class ParetoFront:
 
 
 def pareto_front(spec: ParetoSpec, x: np.ndarray, y: np.ndarray) -> ParetoFront:
-    """Return the Pareto front of (n,) ``x`` and ``y``.
-
-    Array dimensions: n runs.
+    """Return the Pareto front of a pair of quantities, whose values in n runs are ``x`` and ``y``.
 
     Parameters
     ----------
@@ -116,7 +114,7 @@ def knee(costs: np.ndarray) -> int | None:
 
 @dataclass(frozen=True)
 class Requirement:
-    """Result of a requirement.
+    """Result of a requirement: how many runs of the study meet it.
 
     Attributes
     ----------
@@ -131,7 +129,7 @@ class Requirement:
     runs : int
         Number of all runs, also those without a value.
     interval : tuple of float or None
-        Interval of the share among runs with a value, in a drawn design; None in a grid.
+        Confidence interval of the fraction that meets it, among runs with a value, in a random design; None in a grid.
     judged : Description or None
         Statistics of the response or its absolute value; None for all requirements together.
     unit : str
@@ -149,7 +147,7 @@ class Requirement:
 
     @property
     def share(self) -> float | None:
-        """Share of the runs with a value that meet the requirement; None without any."""
+        """Fraction of the runs with a value that meet the requirement; None if no run has a value."""
         return self.met / self.count if self.count else None
 
     @property
@@ -159,19 +157,19 @@ class Requirement:
 
     @property
     def bounds(self) -> tuple[float, float] | None:
-        """Smallest and largest possible share of all runs that meet the requirement; None if all have a value.
+        """Smallest and largest possible fraction of all runs that meet the requirement; None if all have a value.
 
-        At the limits none, or all, of the runs without a value meet it. Failure may be correlated with the value that a
-        run would have given, so that the interval of the others does not hold for all runs.
+        At these limits none, or all, of the runs without a value meet it. Failure may be correlated with the value that
+        a run would have given, so that the confidence interval of the other runs does not hold for all runs.
         """
         return None if self.count == self.runs else (self.met / self.runs, self.most / self.runs)
 
     @property
     def bounds_interval(self) -> tuple[float, float] | None:
-        """Confidence interval of the share that meets the requirement, whatever the runs without a value would give.
+        """Confidence interval of the fraction that meets the requirement, whatever the runs without a value would give.
 
-        It reaches from the lower confidence limit of the smallest possible share to the upper one of the largest; None
-        in a grid.
+        It reaches from the lower confidence limit of the smallest possible fraction to the upper one of the largest;
+        None in a grid.
         """
         if self.bounds is None or (self.interval is None and self.count):
             return None
@@ -239,9 +237,9 @@ def _text(spec: ThresholdSpec) -> str:
 
 
 QUANTILES = {"p95": 0.95, "p99.7": 0.997}
-"""Quantiles whose convergence is reported, and their probabilities."""
+"""Name of each quantile whose convergence is reported -> its probability."""
 GOALS = {"mean": 0.1, "sigma": 0.1, "p95": 0.2, "p99.7": 0.2}
-"""Half-width of the 95 % interval, in units of sigma, below which a statistic counts as known."""
+"""Statistic -> half-width of its 95 % interval, in units of sigma, below which it is considered well determined."""
 POINTS = 40
 """Number of points of a convergence curve."""
 
@@ -331,7 +329,7 @@ class StudyAnalysis:
     effects : dict
         Main effects of a grid; empty in drawn designs.
     noise : dict
-        Share of each response's variance that the runs report as noise.
+        Fraction of each response's variance that the runs report as noise.
     indices : dict
         Sensitivity indices; empty if the study does not request them.
     convergences : dict
@@ -388,10 +386,10 @@ class StudyAnalysis:
         )
 
     def influence(self, response: str) -> dict[str, float]:
-        """Return the share of a response's variance due to each factor, the largest first, for sorting only.
+        """Return factor -> estimated fraction of a response's variance due to it, the largest first, for sorting only.
 
-        It is the total index if there is one, else the squared standardised coefficient or the share of the main
-        effect.
+        It is the total sensitivity index if there is one, else the squared standardised regression coefficient or the
+        fraction that the main effect explains.
         """
         indices = self.indices.get(response)
         out = {factor.name: 0.0 for factor in self.runs.factors}

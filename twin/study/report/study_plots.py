@@ -23,13 +23,13 @@ MARKS = ("o", "s", "^", "D", "v", "P")
 MOST_POINTS = 500
 """Largest number of points in a scatter plot, to limit the size of the page and overplotting."""
 STEPS = (1, 2, 2.5, 5, 10)
-"""Allowed spacings of ticks, times a power of ten."""
+"""Allowed spacings of an axis' ticks, apart from a power of ten."""
 LONGEST = 18
-"""Largest number of characters of a text on an axis."""
+"""Largest number of characters of a text at a tick of an axis; longer texts are cut."""
 
 
 def finish(axes: Axes, x_ticks: int | None = 6, y_ticks: int | None = 5) -> None:
-    """Format the axes of a panel with at most the given numbers of ticks; None leaves an axis unchanged."""
+    """Format the axes of a panel with at most ``x_ticks`` and ``y_ticks`` ticks; None leaves that axis unchanged."""
     svg.gridded(axes)
     if x_ticks is not None:
         axes.xaxis.set_major_locator(MaxNLocator(x_ticks, steps=STEPS))
@@ -52,14 +52,14 @@ def short(text: str) -> str:
 
 
 def positions(series: Series) -> np.ndarray:
-    """Return the positions (runs,) of values on an axis: numbers themselves, texts at 0, 1, ..."""
+    """Return the coordinate of each run's value along a plot axis, (runs,): a number itself, texts at 0, 1, ..."""
     if not series.numeric:
         return np.array([np.flatnonzero(series.levels == value)[0] for value in series.values], np.float64)
     return series.values
 
 
 def name_texts(axes: Axes, series: Series, axis: str) -> None:
-    """Label an axis of ``positions`` with the texts; do nothing for numbers."""
+    """Label the ticks of an axis with the text values of a series that ``positions`` placed; do nothing for numbers."""
     if series.numeric:
         return
     ticks, names = np.arange(len(series.levels)), [short(str(level)) for level in series.levels]
@@ -73,23 +73,24 @@ def name_texts(axes: Axes, series: Series, axis: str) -> None:
 
 
 def thinned(good: np.ndarray, most: int = MOST_POINTS) -> np.ndarray:
-    """Return the indices of up to ``most`` runs of (n,) ``good``, evenly spaced through the study.
-
-    Array dimensions: n runs.
-    """
+    """Return the indices of up to ``most`` of the runs for which ``good`` is True, evenly spaced through the study."""
     indices = np.flatnonzero(good)
     return indices if len(indices) <= most else indices[np.linspace(0, len(indices) - 1, most).astype(int)]
 
 
 def jitter(series: Series, seed: int) -> np.ndarray:
-    """Return random offsets (runs,) to ``positions`` that keep points of one text from hiding each other."""
+    """Return random offsets of plotted points, (runs,), that keep points with the same text from hiding each other."""
     if not series.numeric:
         return np.random.default_rng(np.random.SeedSequence(seed)).uniform(-0.2, 0.2, len(series.values))
     return np.zeros(len(series.values))
 
 
 def bins(factor: Factor, good: np.ndarray) -> Iterator[np.ndarray]:
-    """Yield the runs of a numeric factor in groups of neighbours of equal size, or of equal value for few values."""
+    """Yield the runs of a numeric factor in groups, for means over neighbouring values.
+
+    A group has equal numbers of runs with neighbouring values, or the runs with one value if there are only a few
+    values.
+    """
     levels = np.unique(factor.values[good])
     if len(levels) <= 12:
         for level in levels:
@@ -149,7 +150,7 @@ _TITLES = {"mean": "mean", "sigma": "standard deviation", "p95": "95% quantile",
 
 
 def convergence_figure(analysis: StudyAnalysis, response: Response) -> Figure:
-    """Plot mean, sigma and the upper quantiles of the first n runs, each with its interval."""
+    """Plot mean, sigma and the upper quantiles of the first n runs against n, with their confidence intervals."""
     convergences = analysis.convergences[response.name]
     figure, grid = svg.panels([2.8] * len(convergences), len(convergences))
     for axes, convergence in zip(grid, convergences, strict=True):
@@ -170,7 +171,7 @@ def convergence_figure(analysis: StudyAnalysis, response: Response) -> Figure:
 
 
 MOST_LINES = 6
-"""Largest number of lines in a panel."""
+"""Largest number of lines in one panel of a response curve figure."""
 MOST_PANELS = 6
 """Largest number of factors for which a response curve is drawn."""
 
@@ -204,7 +205,7 @@ def curve_figure(analysis: StudyAnalysis, response: Response) -> Figure:
 
 
 def _partner(factor: Factor, factors: Sequence[Factor]) -> Factor | None:
-    """Return the most important other factor with several values, for lines or groups."""
+    """Return the most important of the other factors, whose values are shown as separate lines or bar groups."""
     return next((f for f in factors if f is not factor and len(f.levels) > 1), None)
 
 
@@ -225,7 +226,7 @@ def _binned(axes: Axes, factor: Factor, response: Response) -> None:
 
 
 def _groups(other: Factor | None, response: Response) -> list[tuple[str, np.ndarray]]:
-    """Return the label and the runs of each value of a second factor, or one group without it."""
+    """Return (label, runs) for each value of a second factor, or a single group if there is no second factor."""
     if other is None:
         return [("", response.good)]
     number = (lambda level: plain(level, 4)) if other.numeric else (lambda level: short(str(level)))
@@ -249,7 +250,10 @@ def _lines(axes: Axes, factor: Factor, other: Factor | None, response: Response)
 
 
 def _bars(axes: Axes, factor: Factor, other: Factor | None, response: Response) -> None:
-    """Plot the mean for each text with one standard deviation; as bars if zero is near, else as points."""
+    """Plot the mean of a response for each text value of a factor, with one standard deviation.
+
+    Means are drawn as bars from zero if zero is not far from their range, else as points.
+    """
     groups = _groups(other, response)
     width = 0.8 / len(groups)
     means = [[response.values[runs & (factor.values == level)] for level in factor.levels] for _, runs in groups]
@@ -317,7 +321,7 @@ def pareto_figure(analysis: StudyAnalysis) -> Figure:
 
 
 MOST_BARS = 10
-"""Largest number of bars in a panel."""
+"""Largest number of bars (factors) in one panel of a tornado or sensitivity figure."""
 
 
 def _bar_panels(rows: Sequence[int]) -> tuple[Figure, list[Axes]]:
@@ -326,7 +330,7 @@ def _bar_panels(rows: Sequence[int]) -> tuple[Figure, list[Axes]]:
 
 
 def with_tornado(analysis: StudyAnalysis) -> list[Response]:
-    """Return the responses and reported sigmas for which the tornado figure has bars."""
+    """Return the responses and reported sigmas that have at least one bar in the tornado figure."""
     return [r for r in analysis.runs.everything if analysis.effects[r.name] or analysis.linear[r.name] is not None]
 
 
@@ -421,7 +425,10 @@ MOST_RESPONSES, MOST = 3, 6
 
 
 def chosen(analysis: StudyAnalysis) -> list[Series]:
-    """Return the series of the scatter matrix: the first three varying responses, and the most influential factors."""
+    """Return the quantities shown in the scatter matrix.
+
+    They are the first three varying responses and the most influential factors.
+    """
     responses = [r for r in analysis.runs.responses if not r.constant][:MOST_RESPONSES]
     weight = {factor.name: 0.0 for factor in analysis.runs.factors}
     for response in responses:
@@ -434,7 +441,10 @@ def chosen(analysis: StudyAnalysis) -> list[Series]:
 
 
 def matrix_figure(analysis: StudyAnalysis) -> Figure:
-    """Plot a matrix of points below the diagonal, rank correlations above it, and distributions on it."""
+    """Plot a matrix of all pairs of the chosen quantities.
+
+    Scatter plots are below the diagonal, rank correlations above it, and histograms on it.
+    """
     variables = chosen(analysis)
     n = len(variables)
     figure = svg.new_figure(min(1.65 * n + 0.6, 10.2), {"h_pad": 0.03, "w_pad": 0.03, "hspace": 0.02, "wspace": 0.02})

@@ -1,4 +1,4 @@
-"""Report of a study: ``report.html``, its artefacts and ``statistics.json``."""
+"""Report of a study: ``report.html``, the figures and tables in ``artefacts``, and ``statistics.json``."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class StudyReport:
     verdict : str
         Verdict at the top of the report.
     contents : dict
-        Contents of its files by their paths in the study's folder.
+        Path of each file in the study's folder -> its contents.
     undrawn : tuple of str
         One sentence for each figure that could not be drawn.
     warnings : tuple of str
@@ -111,13 +111,13 @@ def report_files(
 
 
 MOST_NAMED = 6
-"""Largest number of values of a factor that are listed."""
+"""Largest number of a factor's values that the table of factors lists one by one."""
 STATISTICS = "statistics.json"
-"""File with all digits of tables whose cells are texts and that have no file of their own."""
+"""Name of the file with all digits of those tables that show rounded numbers and have no file of their own."""
 
 
 def _factor_table(runs: StudyRuns) -> Table:
-    """Return the table of factors: name, position in the base, distribution and values run."""
+    """Return the table of factors: name, key in the base job, distribution, and the values of the runs."""
     rows: list[list[Cell]] = []
     for factor in runs.factors:
         positions = [key_text(key) for key in factor.spec.places]
@@ -154,7 +154,7 @@ def _values(factor: Factor) -> str:
 
 
 MOST_FIGURES = 12
-"""Largest number of responses with individual figures."""
+"""Largest number of responses that get figures of their own in the report."""
 MOST_FRONT = 50
 """Largest number of rows of a Pareto front in the report; its CSV file has all."""
 
@@ -195,7 +195,7 @@ def _response_table(analysis: StudyAnalysis) -> Table:
 
 
 def _figure(name: str, title: str, caption: str, draw: Callable[[], Figure]) -> SvgFigure | Undrawn:
-    """Return a figure, or a note in its place if it cannot be drawn, so that the numbers beside it are kept."""
+    """Return a figure, or a note instead of it if it cannot be drawn, so that the rest of the report is kept."""
     try:
         with svg.look(f"study-{name}"):
             figure = draw()

@@ -20,7 +20,7 @@ _SIGNS = {"um": "µm", "us": "µs", "urad": "µrad", "percent": "%", "deg": "°"
 
 
 def typeset(unit: str) -> str:
-    """Return a unit as the report writes it."""
+    """Return a unit as the report writes it, with typographic symbols."""
     return _SIGNS.get(unit, unit)
 
 
@@ -44,17 +44,17 @@ class Series:
 
     @property
     def label(self) -> str:
-        """Name with its unit, for the label of an axis."""
+        """Name of the factor or response with its unit, for the label of an axis."""
         return f"{self.name}, {typeset(self.unit)}" if self.unit else self.name
 
     @property
     def numeric(self) -> bool:
-        """True if the values are numbers."""
+        """True if the values of the factor or response are numbers, not texts."""
         return self.values.dtype.kind == "f"
 
     @cached_property
     def levels(self) -> np.ndarray:
-        """Distinct values, numbers in ascending order, texts in the order of the study."""
+        """Distinct values of the factor or response, numbers in ascending order, texts in the order of the study."""
         distinct = np.unique(self.values)
         if self.numeric:
             return distinct
@@ -64,14 +64,14 @@ class Series:
 
 @dataclass(frozen=True, eq=False)
 class Factor(Series):
-    """Varied factor.
+    """Factor of a study, an input that varies, with its value in each run.
 
     Attributes
     ----------
     spec : FactorSpec
         Distribution or list of its values.
     drawn : bool
-        True if the runs are drawn from it; those of a grid are not.
+        True if the values are drawn at random from it; those of a grid are not.
     """
 
     spec: FactorSpec
@@ -80,7 +80,7 @@ class Factor(Series):
 
 @dataclass(frozen=True, eq=False)
 class Response(Series):
-    """Response of the runs.
+    """Response of a study, a result number, with its value in each run.
 
     Attributes
     ----------
@@ -100,7 +100,7 @@ class Response(Series):
 
     @cached_property
     def known(self) -> np.ndarray:
-        """Values that are finite numbers, without those of failed runs."""
+        """Values of the response that are finite numbers, without those of failed runs."""
         return np.asarray(self.values[self.good])
 
     @cached_property
@@ -165,7 +165,7 @@ class StudyRuns:
 
     @property
     def count(self) -> int:
-        """Number of runs."""
+        """Number of runs of the study."""
         return len(self.failed)
 
     @property
@@ -175,12 +175,12 @@ class StudyRuns:
 
     @property
     def sampled(self) -> bool:
-        """True if the runs are a sample of distributions; those of a grid are not."""
+        """True if the runs are a random sample of the factors' distributions; those of a grid are not."""
         return self.kind != GRID
 
     @property
     def everything(self) -> tuple[Response, ...]:
-        """All responses, followed by the standard deviations that runs report for them."""
+        """All responses, followed by the standard deviations that the runs report for them."""
         return (*self.responses, *self.sigmas)
 
     @cached_property
@@ -196,7 +196,10 @@ class StudyRuns:
 
 
 def _factor_values(values: np.ndarray) -> np.ndarray:
-    """Return numbers as float64, texts as text, and switches, which are 8-bit in the data set, as no and yes."""
+    """Return a factor's values from the data set: numbers as float64, texts as text, and switches as "no" and "yes".
+
+    Switches are 8-bit integers in the data set.
+    """
     if values.dtype.kind in "OUS":
         return np.array([str(value) for value in values.tolist()], np.str_)
     if values.dtype.itemsize == 1:
@@ -207,11 +210,11 @@ def _factor_values(values: np.ndarray) -> np.ndarray:
 CONFIDENCE = 0.95
 """Two-sided confidence level of all intervals in the report."""
 LEAST = 20
-"""Smallest number of runs from which distributions are tested and sensitivity indices computed."""
+"""Smallest number of runs for which distributions are tested and sensitivity indices computed."""
 UNLIKELY = 0.01
 """p-value below which the test of normality rejects a normal distribution."""
 TAILS = (0.00135, 0.99865)
-"""Probabilities of a normal distribution at -3 and +3 sigma."""
+"""Probabilities of the two reported extreme quantiles: those of a normal distribution at -3 and +3 sigma."""
 
 Interval = tuple[float | None, float | None]
 
@@ -266,7 +269,7 @@ class Description:
     count : int
         Number of runs with a finite value.
     mean, std, median, p95, p997 : Estimate or None
-        Estimates, with intervals where the runs were drawn; std with n - 1; None without runs.
+        Estimates, with confidence intervals if the runs are a random sample; std with n - 1; None without runs.
     low, high : float or None
         Smallest and largest value.
     normality : Normality or None
@@ -330,10 +333,7 @@ def describe(values: np.ndarray, sampled: bool) -> Description:
 
 
 def mean_interval(values: np.ndarray) -> Interval:
-    """Return Student's interval of the mean of (n,) values; open for a single value.
-
-    Array dimensions: n runs.
-    """
+    """Return Student's confidence interval of the mean of n values; its ends are unknown (None) for a single value."""
     n = len(values)
     if n < 2:
         return None, None
@@ -343,12 +343,10 @@ def mean_interval(values: np.ndarray) -> Interval:
 
 
 def std_interval(values: np.ndarray) -> Interval:
-    """Return the interval of the standard deviation (n - 1) of (n,) values; open below four values.
+    """Return the confidence interval of the standard deviation of n values; None at both ends for n below four.
 
-    It is symmetric in the logarithm, whose variance (k - (n-3)/(n-1)) / (4n) follows from the kurtosis k (3 for a
-    normal distribution) of n values; for a normal distribution it equals the chi-square interval for large n.
-
-    Array dimensions: n runs.
+    The interval is symmetric in the logarithm, whose variance (k - (n-3)/(n-1)) / (4n) follows from the kurtosis k (3
+    for a normal distribution) of the values; for a normal distribution it equals the chi-square interval for large n.
     """
     n = len(values)
     if n < 4:
@@ -363,7 +361,7 @@ def std_interval(values: np.ndarray) -> Interval:
 
 
 def quantile_interval(values: np.ndarray, q: float) -> Interval:
-    """Return the interval of the quantile ``q`` of any continuous distribution from order statistics of (n,) values.
+    """Return the distribution-free confidence interval of the quantile ``q``, from order statistics.
 
     Each end is exceeded with a probability of at most (1 - CONFIDENCE)/2; an end that n values do not reach is None.
 
@@ -388,10 +386,7 @@ def runs_for_quantile(q: float) -> int:
 
 
 def normality(values: np.ndarray) -> Normality | None:
-    """Test (n,) values for normality; None for fewer than 20 values and for constant ones.
-
-    Array dimensions: n runs.
-    """
+    """Test n values for normality; None for fewer than 20 values and for constant ones."""
     if len(values) < LEAST or np.ptp(values) == 0.0:
         return None
     p = float(stats.normaltest(values).pvalue)
@@ -399,25 +394,26 @@ def normality(values: np.ndarray) -> Normality | None:
 
 
 FALSE_ALARM = 1e-6
-"""Probability, for each response, that a correctly reported noise is called impossible.
+"""Probability, for each response, that a correctly reported noise is rejected as impossibly large.
 
-It holds where noise causes all of the variance.
+It is valid where noise causes all of the variance.
 """
 
 
 @dataclass(frozen=True)
 class NoiseShare:
-    """Reported noise relative to the variance of a response.
+    """Reported noise of a response relative to its variance over the runs.
 
     Attributes
     ----------
     response : str
         Name of the response.
     share : float
-        Mean of the reported noise variances over the variance of the runs; slightly above 1 by chance if only noise
-        varies.
+        Mean of the reported noise variances divided by the variance of the runs; slightly above 1 by chance if only
+        noise varies.
     chance : float
-        Probability of so small a variance of the runs, or a smaller one, if the reported noise were all that varies.
+        p-value: probability of a variance over the runs as small as this one or smaller, if nothing but the reported
+        noise varied.
     """
 
     response: str
@@ -431,9 +427,9 @@ class NoiseShare:
 
 
 def noise_share(response: Response, study: StudySpec) -> NoiseShare | None:
-    """Return the share of a response's variance that its reported noise explains; None if that is not defined.
+    """Return the fraction of a response's variance that its reported noise explains; None if that is not defined.
 
-    It is not defined if no noise is reported, all runs share their noise, or nothing varies. The sum of squares of
+    It is not defined if no noise is reported, all runs share the same noise, or nothing varies. The sum of squares of
     independent normal noise has a chi-square distribution; where the noise differs between runs, its degrees of freedom
     are those of Satterthwaite, Biometrics Bulletin 2, 110 (1946).
 
@@ -489,11 +485,11 @@ class Effect:
         the largest minus the smallest mean of its values, at equal other factors. The quantiles are those of the
         factor's distribution where runs are drawn from it.
     coefficient : Estimate or None
-        Standardised regression coefficient, sigmas of the response per sigma of the factor; None for texts.
+        Standardised regression coefficient, in sigmas of the response per sigma of the factor; None for texts.
     rank : Estimate or None
         Spearman's rank correlation; None for texts.
     span : tuple
-        Quantiles of the factor, or for a text its values with the smallest and the largest mean.
+        The two quantiles of the factor, or for a text its values with the smallest and the largest mean.
     """
 
     factor: str
@@ -587,9 +583,9 @@ def linear_model(factors: Sequence[Factor], response: Response) -> LinearModel |
 
 
 def _columns(factor: Factor, good: np.ndarray) -> np.ndarray:
-    """Return a factor's columns of the design matrix, (n, m): standardised numbers, or indicators of text values.
+    """Return a factor's columns of the design matrix, (n, m) for n runs: standardised numbers, or text indicators.
 
-    A factor with texts has one column of 0 and 1 for each value but the first. Array dimensions: n runs, m columns.
+    A factor with texts has one column of 0 and 1 for each value but the first; one with numbers has a single column.
     """
     values = factor.values[good]
     if factor.numeric:
@@ -605,10 +601,20 @@ def _effect(
 ) -> Effect:
     """Return the effect of a factor on a response from its coefficients in the linear model.
 
-    ``moved`` (m, n) is the influence of each run on each coefficient, and ``t`` the quantile of Student's distribution
-    for the confidence interval.
-
-    Array dimensions: m coefficients, n runs.
+    Parameters
+    ----------
+    factor : Factor
+        Factor.
+    good : (runs,) ndarray of bool
+        True for the n runs that are used.
+    y : (n,) ndarray
+        Response.
+    coefficient : (m,) ndarray
+        Coefficients of the factor's m columns of the design matrix.
+    moved : (m, n) ndarray
+        Influence of each run on each coefficient.
+    t : float
+        Quantile of Student's distribution for the confidence interval.
     """
     values = factor.values[good]
     if not factor.numeric:
@@ -633,7 +639,7 @@ def _effect(
 
 
 def _span(factor: Factor, values: np.ndarray) -> tuple[float, float]:
-    """Return the 5 % and 95 % quantiles of a factor: of its distribution if drawn, else of its values."""
+    """Return the 5 % and 95 % quantiles of a factor: of its distribution if it is random, else of its values."""
     if factor.drawn:
         low, high = quantiles(factor.spec, np.array([0.05, 0.95]))
     else:
@@ -642,11 +648,10 @@ def _span(factor: Factor, values: np.ndarray) -> tuple[float, float]:
 
 
 def _largest_difference(means: np.ndarray, moved: np.ndarray, t: float) -> Estimate:
-    """Return the largest difference between two of m means (m,), with its interval; the first mean is 0.
+    """Return the largest difference between two of m means, with its confidence interval; the first mean is 0.
 
-    The interval covers all pairs simultaneously (Bonferroni), so that it remains valid for the largest.
-
-    Array dimensions: m means.
+    ``means`` has the shape (m,). The interval covers all pairs simultaneously (Bonferroni), so that it remains valid
+    for the largest.
     """
     moved = np.concatenate([np.zeros((1, moved.shape[1])), moved])
     first, last = np.triu_indices(len(means), 1)
@@ -678,9 +683,7 @@ def _rank_interval(rank: float, n: int) -> Interval:
 
 @dataclass(frozen=True, eq=False)
 class MainEffect:
-    """Means of a response over the runs of a grid, for each value of a factor.
-
-    Array dimensions: m values of the factor.
+    """Mean of a response over the runs of a grid, for each of the m values of one factor.
 
     Attributes
     ----------

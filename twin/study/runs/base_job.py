@@ -1,4 +1,4 @@
-"""Base job of a study: the data that runs change, the evaluation of runs, and the responses that are kept."""
+"""Base job of a study: the data that runs change, the evaluation of runs, and the responses that are recorded."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from twin.framework.procedure import silent
 
 @dataclass(frozen=True)
 class Run:
-    """One run of a study.
+    """One run of a study: the values that it sets in the base job, and its seed.
 
     Attributes
     ----------
@@ -58,11 +58,11 @@ class Failure:
 
 
 Outcome = Mapping[str, Any] | Failure
-"""Results by file, as in the run folder's JSON files without the suffix .json; or the reason why there are none."""
+"""Result of a run: name of a result file without the suffix .json -> its contents; or a `Failure` with the reason."""
 
 
 class BaseJob(Protocol):
-    """Command that a study can vary: how its file is read, and how its runs are evaluated."""
+    """Interface of a command that a study can vary: how its input file is read, and how its runs are evaluated."""
 
     @property
     def model(self) -> type[Spec]:
@@ -73,13 +73,16 @@ class BaseJob(Protocol):
         """Number of consecutive runs that are always evaluated together, on any worker."""
 
     def resolve(self, file: Path | str) -> Spec:
-        """Read the job's file, or a name in the library, with everything it refers to; raise InputError."""
+        """Read the job's file, or a job named in the library, with all its files; raise InputError if invalid."""
 
     def check(self, tree: Tree, backend: Backend) -> None:
-        """Check what needs the built instrument; called once, in a worker, before the study; raise InputError."""
+        """Check what needs the built instrument, and raise InputError if it fails.
+
+        It is called once, in a worker process, before the study.
+        """
 
     def evaluate(self, tree: Tree, runs: Sequence[Run], backend: Backend) -> list[Outcome]:
-        """Return the outcome of every run.
+        """Return the results of every run, or the reason of its failure.
 
         The numbers may depend on which runs are evaluated together, but on nothing else.
         """
@@ -106,7 +109,7 @@ class ProcedureBase:
 
     @property
     def model(self) -> type[Spec]:
-        """Class (data model) of the test's set-up."""
+        """Class (data model) of the test's set-up in its input file."""
         return self.procedure.model
 
     @property
@@ -115,7 +118,7 @@ class ProcedureBase:
         return 1
 
     def resolve(self, file: Path | str) -> Spec:
-        """Read the test with everything it refers to; raise InputError."""
+        """Read the test's file with all files it refers to; raise InputError if one is invalid."""
         setup: Any = self.procedure.resolve(file)
         if not isinstance(setup, self.model):
             text = "measurements cannot be varied; a study needs a simulated bench"
@@ -126,7 +129,7 @@ class ProcedureBase:
         """Do nothing, since nothing can be checked before a run."""
 
     def evaluate(self, tree: Tree, runs: Sequence[Run], backend: Backend) -> list[Outcome]:
-        """Return the outcome of every run, evaluated one after the other."""
+        """Return the results of every run, or the reason of its failure; runs are evaluated one after the other."""
         return [self._one(tree, run, backend) for run in runs]
 
     def _one(self, tree: Tree, run: Run, backend: Backend) -> Outcome:
@@ -140,7 +143,10 @@ class ProcedureBase:
 
 
 def one_line(error: Exception) -> str:
-    """Return the error's text on one line; an input error without its file, which does not exist."""
+    """Return an error's text on one line, without the file name of an input error.
+
+    The inputs of a run are made in memory, so there is no such file.
+    """
     if not str(error).strip():
         return type(error).__name__
     return "; ".join(line.strip().removeprefix("input: ") for line in str(error).splitlines() if line.strip())
@@ -151,7 +157,7 @@ Tree = dict[str, Any]
 
 
 def with_place(tree: Tree, model: type[Spec], key: KeyPath, neutral: bool = False) -> Tree:
-    """Return a job's plain data in which ``key`` leads to a value; missing optional parts get their defaults.
+    """Return a job's plain data in which the key path ``key`` exists; missing optional parts get their defaults.
 
     Parameters
     ----------
@@ -191,7 +197,7 @@ def with_place(tree: Tree, model: type[Spec], key: KeyPath, neutral: bool = Fals
 
 
 def is_neutral(tree: Tree, model: type[Spec], key: KeyPath) -> bool:
-    """Return True if what ``with_place`` adds to reach ``key`` has the same effect as its absence.
+    """Return True if the entries that ``with_place`` adds to reach ``key`` do not change the job's results.
 
     Parameters
     ----------
@@ -217,7 +223,10 @@ def is_neutral(tree: Tree, model: type[Spec], key: KeyPath) -> bool:
 
 
 def _entry(node: Tree, model: type[Spec], key: KeyPath, k: int, last: bool) -> Any:
-    """Return the entry at ``key[k]`` of a mapping, created if the model allows it."""
+    """Return the value at element ``k`` of a key path in a mapping; it is created if the data model allows it.
+
+    ``node`` is the mapping in which that key is looked up, ``model`` its data model.
+    """
     part = key[k]
     if part in node:
         return node[part]
@@ -241,7 +250,7 @@ def _fields(annotation: Any) -> tuple[str, ...]:
 
 
 def _default(annotation: Any) -> Any:
-    """Return the plain data of a value's default; None if it has none."""
+    """Return the default of a field of a data model as plain data; None if it has no default."""
     if not _is_model(annotation):
         return {} if typing.get_origin(annotation) is dict else None
     try:
@@ -310,14 +319,14 @@ def leaf(tree: Any, key: KeyPath) -> Any:
 
 @dataclass(frozen=True, eq=False)
 class BlockResult:
-    """Responses of n consecutive runs.
+    """Responses of a block of n consecutive runs.
 
-    Array dimensions: R responses.
+    Array dimensions: n runs, R responses.
 
     Attributes
     ----------
     values : (n, R) ndarray
-        Responses in the study's order, NaN in failed runs and where there is no number.
+        Responses in the study's order, NaN in failed runs and where the results have no number.
     sigmas : (n, R) ndarray
         Total standard deviations of the responses, NaN where none is requested.
     noises : (n, R) ndarray
@@ -338,7 +347,7 @@ class BlockResult:
     doubts: tuple[str, ...]
 
     def fits(self, shape: tuple[int, int]) -> bool:
-        """Return True if these are results of the given numbers of runs and responses; a file may hold anything."""
+        """Return True if the arrays have the shape (runs, responses); data read from a file may not."""
         arrays = all(
             isinstance(item, np.ndarray) and item.shape == shape and item.dtype == float
             for item in (self.values, self.sigmas, self.noises)
@@ -348,17 +357,14 @@ class BlockResult:
 
     @property
     def failed(self) -> np.ndarray:
-        """True for failed runs, (n,).
-
-        Array dimensions: n runs.
-        """
+        """True for each of the n runs that failed, (n,)."""
         return np.array([bool(message) for message in self.messages], bool)
 
     @classmethod
     def of(
         cls, outcomes: Sequence[Outcome], responses: Mapping[str, ResponseSpec], seconds: float = 0.0
     ) -> BlockResult:
-        """Return the block's responses, taken from the outcomes of its runs."""
+        """Return the responses of a block of runs, taken from the results of its runs."""
         values = np.full((len(outcomes), len(responses)), np.nan)
         sigmas, noises = (np.full(values.shape, np.nan) for _ in range(2))
         messages: list[str] = []
@@ -398,11 +404,11 @@ class BlockResult:
 
 
 CONTRADICTED = "the shifts of the spots contradict the prior on disturbances"
-"""Reason why a run's sigma is not valid although the fits of its spots are good."""
+"""Reason, as text, why a run's sigma is not valid although the fits of its spots are good."""
 
 
 def _doubt(outcome: Mapping[str, Any]) -> str:
-    """Return the reason why the sigmas of a run are not valid, without its numbers; empty where they are."""
+    """Return the reason why the sigmas of a run are not valid, without numbers; an empty text if they are valid."""
     recovered = outcome.get("recovered", {})
     course = outcome.get("course", {}).get("sigma_holds", [])
     if not isinstance(recovered, Mapping) or (recovered.get("sigma_holds", True) and all(course)):
@@ -413,7 +419,7 @@ def _doubt(outcome: Mapping[str, Any]) -> str:
 
 
 def _number(outcome: Mapping[str, Any], key: Any, name: str) -> float:
-    """Return the number at a key of the results; NaN where they have none."""
+    """Return the number at a key path of the results, or NaN if there is none."""
     try:
         value = leaf(outcome, key)
     except Problem as problem:

@@ -1,6 +1,8 @@
-"""Computation of the missing blocks of a study by worker processes; a first block is timed for an estimate.
+"""Computation of the missing blocks of a study (groups of consecutive runs) by worker processes.
 
-A worker evaluates whole blocks on one thread. A finished block is written to the study's journal before it counts.
+The first block is timed to estimate the duration of the study. A worker evaluates whole blocks on one thread. A block
+counts as finished only when it has been written to the study's journal, a file from which an interrupted study is
+continued.
 """
 
 from __future__ import annotations
@@ -31,11 +33,11 @@ from twin.study.runs.setup import StudySetup, study_from_text
 BLOCKS = "blocks.journal"
 """File name of the journal (finished blocks of runs) in the folder of a study."""
 LONGEST_REPEAT = 4.0
-"""Time, seconds, beyond which the first block is not evaluated a second time for a better estimate."""
+"""Duration of the first block, in seconds, above which it is not evaluated a second time for a better time estimate."""
 _ALONE = threading.Lock()
-"""Lock by which a worker with several threads evaluates one block at a time.
+"""Lock that makes a worker with several threads evaluate one block at a time.
 
-The state of the library Dr.Jit belongs to the process.
+The library Dr.Jit has one state for the whole process.
 """
 
 
@@ -67,7 +69,7 @@ class Task:
 
 @dataclass(frozen=True, eq=False)
 class Pilot:
-    """First block of a study.
+    """First block of a study, evaluated to estimate time and memory and to check the study.
 
     Attributes
     ----------
@@ -76,7 +78,7 @@ class Pilot:
     sample : dict or None
         All results of the first run that did not fail; None if all runs failed.
     start_seconds : float
-        Time that the first evaluation took longer than the second.
+        Time by which the first evaluation took longer than the second.
     memory : float
         Peak memory of the worker's process, bytes.
     refusal : InputError or None
@@ -91,7 +93,7 @@ class Pilot:
 
 
 def evaluate(task: Task) -> BlockResult:
-    """Return the results of a block; a fault of the program is raised with the runs' numbers in its notes."""
+    """Return the results of a block of runs; an error of the program itself gets the runs' numbers as a note."""
     with _ALONE:
         return _block(*_prepared(task), task.runs)[0]
 
@@ -139,10 +141,10 @@ def _setup(config: str) -> StudySetup:
 
 
 def _one_thread() -> None:
-    """Limit this process to the calling thread; there are as many workers as cores.
+    """Limit the numerical libraries of this process to one thread, since there are as many workers as cores.
 
-    For workers started by somebody else the environment variables come too late, so the libraries are limited directly,
-    again for every block, since some are loaded only when they are needed.
+    For workers started outside this program the environment variables come too late, so the libraries are limited
+    directly, and again for every block, since some are loaded only when they are needed.
     """
     from threadpoolctl import ThreadpoolController
 
@@ -159,14 +161,14 @@ def _one_thread() -> None:
 
 
 def journal_of(setup: StudySetup, file: Path | None, noun: str = "study") -> Journal:
-    """Return the journal of a study's blocks.
+    """Return the journal of a study, the file that holds its finished blocks of runs.
 
     Parameters
     ----------
     setup : StudySetup
         Study with its base job, factors and responses.
     file : Path or None
-        File of the journal, None to keep nothing.
+        File of the journal, None to store nothing.
     noun : str
         Word for the study in messages.
     """
@@ -175,14 +177,14 @@ def journal_of(setup: StudySetup, file: Path | None, noun: str = "study") -> Jou
 
 @dataclass(eq=False)
 class Engine:
-    """Engine that computes the blocks of a study that are missing in its journal.
+    """Computation of the blocks (groups of consecutive runs) of a study that its journal does not hold yet.
 
     Attributes
     ----------
     plan : Plan
         All runs.
     journal : Journal
-        Open journal of the study's blocks.
+        Open journal of the study's finished blocks.
     backend : str
         Array backend of the ray trace.
     advance : callable
@@ -213,7 +215,7 @@ class Engine:
             self.warn(f"{self.journal.file}: {lines} corrupt; what it held is computed again")
 
     def _known(self, block: int) -> BlockResult | None:
-        """Return the results of a block if they are in the journal."""
+        """Return the results of a block of runs if the journal of finished blocks holds them, else None."""
         result = self.journal.known.get(str(block))
         shape = len(self.plan.block(block)), len(self.plan.setup.study.responses)
         return result if isinstance(result, BlockResult) and result.fits(shape) else None
@@ -240,7 +242,7 @@ class Engine:
         Raises
         ------
         InputError
-            The base cannot be run as it is, or the key of a response does not exist in its results.
+            The base job cannot be run as it is, or the key of a response does not exist in its results.
         Incomplete
             Workers died repeatedly in some runs, or the program failed; finished blocks are kept.
         ClusterError
@@ -284,7 +286,7 @@ class Engine:
         )
 
     def _first(self, workers: cluster.Workers, block: int) -> Pilot:
-        """Compute the first block and check that its results hold all responses."""
+        """Compute the first block of runs and check that its results contain all responses."""
         ((_, future),) = next(workers.each(pilot, [self.task(block)]))
         if future.status != "finished":
             if cluster.killed(future.exception()):
@@ -319,13 +321,13 @@ class Engine:
         self.computed += self._runs([*results])
 
     def task(self, block: int) -> Task:
-        """Return what a worker needs to compute a block."""
+        """Return the block of runs with that number, and everything that a worker needs to compute it."""
         runs = tuple(self.plan.run(number) for number in self.plan.block(block))
         return Task(self.plan.config, source_digest(), self.backend, runs)
 
 
 def _fault(future: Any) -> Incomplete:
-    """Return the error to raise for a task that failed otherwise than by the death of its worker."""
+    """Return the error to raise for a task that failed for another reason than the death of its worker."""
     error = future.exception()
     notes = " ".join(getattr(error, "__notes__", ()))
     text = f"{type(error).__name__}: {error} {notes}".strip()
@@ -367,7 +369,7 @@ def check_responses(setup: StudySetup, sample: Any) -> None:
 
 
 def _check_noise(setup: StudySetup, sample: Any, name: str, path: KeyPath) -> None:
-    """Raise InputError if a response's ``noise`` names a total sigma although the results have one due to noise.
+    """Raise InputError if a response's ``noise`` key names a total sigma although the results hold the noise's own.
 
     Raises
     ------

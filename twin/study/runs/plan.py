@@ -1,4 +1,4 @@
-"""Plan of a study: values of its factors in every run, values that scale with them, memory needed."""
+"""Plan of a study: the value of each factor in every run, the values that scale with factors, and the memory needed."""
 
 from __future__ import annotations
 
@@ -20,7 +20,10 @@ from twin.study.runs.setup import StudySetup
 
 
 def axes_of(study: StudySpec) -> list[tuple[str, ...]]:
-    """Return the groups of factors that vary independently: single factors, or the columns of one table, row by row."""
+    """Return the groups of factors that vary independently of one another.
+
+    A group is a single factor, or the columns of one table, whose values vary together row by row.
+    """
     groups: dict[str, list[str]] = {}
     for name, factor in study.factors.items():
         key = f"table {factor.table.file}" if factor.table is not None else f"factor {name}"
@@ -29,16 +32,16 @@ def axes_of(study: StudySpec) -> list[tuple[str, ...]]:
 
 
 def levels(factor: FactorSpec) -> int:
-    """Return the number of values of a factor; 0 for a continuous distribution."""
+    """Return the number of values in a factor's list or equidistant range; 0 for a continuous distribution."""
     return (factor.count or 0) if factor.kind == "range" else len(factor.scalars()) if factor.kind in _LISTS else 0
 
 
 _LISTS = ("values", "table")
-"""Kinds of factors with a list of values."""
+"""Kinds of factors whose values are given as a list."""
 
 
 def run_count(study: StudySpec) -> int:
-    """Return the number of runs that a study's design specifies."""
+    """Return the number of runs that follows from a study's design."""
     if study.design.runs is not None:
         return study.design.runs
     count = 1
@@ -50,8 +53,8 @@ def run_count(study: StudySpec) -> int:
 def draw(study: StudySpec) -> dict[str, np.ndarray]:
     """Return each factor's value in every run, (runs,): numbers in the factor's unit, or indices into its list.
 
-    The last axis of a grid changes fastest. Distributions are sampled by the inverse of their distribution function, so
-    that low-discrepancy designs keep their uniformity.
+    In a grid, the values of the last group of factors change fastest. Distributions are sampled by the inverse of their
+    distribution function, so that low-discrepancy designs keep their uniformity.
     """
     axes = axes_of(study)
     if study.design.kind == GRID:
@@ -74,7 +77,7 @@ def _level(factor: FactorSpec, place: np.ndarray) -> np.ndarray:
 
 
 def _quantile(factor: FactorSpec, u: np.ndarray) -> np.ndarray:
-    """Return the quantiles of a factor at probabilities ``u``."""
+    """Return the quantiles of a factor's distribution at probabilities ``u``."""
     # scipy is imported late, so that errors in a study's file are reported quickly
     from scipy.special import ndtr, ndtri
 
@@ -107,7 +110,10 @@ Beyond it the probability between the limits loses its digits in ordinary arithm
 
 
 def _far(a: float, b: float, u: np.ndarray) -> np.ndarray:
-    """Return quantiles of a standard normal distribution truncated far in one of its tails."""
+    """Return quantiles of a standard normal distribution whose truncation limits are both far in one tail.
+
+    ``a`` and ``b`` are the limits in sigmas, ``u`` the probabilities.
+    """
     # as in ``_quantile``
     from scipy.special import log_ndtr, ndtri_exp
 
@@ -119,9 +125,9 @@ def _far(a: float, b: float, u: np.ndarray) -> np.ndarray:
 
 
 def quantiles(factor: FactorSpec, u: np.ndarray) -> np.ndarray:
-    """Return the quantiles of a factor of numbers at probabilities ``u``.
+    """Return the quantiles of a factor with numerical values at probabilities ``u``.
 
-    For a list each is the smallest value that reaches the probability.
+    For a list of values, a quantile is the smallest value whose cumulative probability reaches ``u``.
 
     Parameters
     ----------
@@ -136,19 +142,19 @@ def quantiles(factor: FactorSpec, u: np.ndarray) -> np.ndarray:
 
 
 def extremes(factor: FactorSpec) -> list[float]:
-    """Return the limits of a bounded distribution, which are validated beside the plan's own values."""
+    """Return the limits of a bounded distribution; they are validated in addition to the values of the runs."""
     numbers = factor.numbers().values
     return list(numbers[-2:]) if factor.kind in ("range", "uniform", "truncated") else []
 
 
 @dataclass(frozen=True, eq=False)
 class Scaling:
-    """Values of the base job that scale with factors; several factors may scale one of them.
+    """Values of the base job that scale with factors; several factors may scale the same value.
 
     Attributes
     ----------
     base : dict
-        Key path -> number and unit in the base job; an integer where the base has one.
+        Key path -> number and unit in the base job; an integer where it has one there.
     ratio : dict
         Key path -> multiplier of the number in every run, (runs,).
     """
@@ -157,14 +163,17 @@ class Scaling:
     ratio: Mapping[KeyPath, np.ndarray]
 
     def apply(self, values: dict[KeyPath, Any], run: int) -> None:
-        """Scale the values that factors have set in a run, and add scaled values of the base for the others."""
+        """Multiply values of a run by their ratios: those that factors have set, and else those of the base job.
+
+        ``values`` maps key paths to values and is changed in place.
+        """
         for place, ratio in self.ratio.items():
             number = number_of(values[place]) if place in values else self.base[place]
             values[place] = scaled(number, float(ratio[run]))
 
 
 def scaled(number: tuple[float | int, str], ratio: float) -> Any:
-    """Return a quantity times a ratio, as a job's file writes it.
+    """Return a quantity times a ratio, in the notation of a job's file.
 
     Parameters
     ----------
@@ -181,7 +190,7 @@ def scaled(number: tuple[float | int, str], ratio: float) -> Any:
 
 
 def ratios(factor: FactorSpec, tree: Tree, values: np.ndarray, unit: str) -> dict[KeyPath, np.ndarray]:
-    """Return the multipliers of the values that scale with a factor, by key path, each of the shape of ``values``.
+    """Return the multipliers of the values that scale with a factor, by key path, each with the shape of ``values``.
 
     Parameters
     ----------
@@ -197,7 +206,7 @@ def ratios(factor: FactorSpec, tree: Tree, values: np.ndarray, unit: str) -> dic
     Raises
     ------
     Problem
-        The factor's value in the base is zero or no number, or a power does not exist.
+        The factor's value in the base job is zero or no number, or a power is undefined.
     """
     out = {}
     for k, scale in enumerate(factor.scales):
@@ -211,7 +220,7 @@ def ratios(factor: FactorSpec, tree: Tree, values: np.ndarray, unit: str) -> dic
 
 
 def _nominal(factor: FactorSpec, tree: Tree, unit: str) -> float:
-    """Return the factor's value in the base, in its own unit; 1 for a factor that is itself the ratio."""
+    """Return the factor's value in the base job, in its own unit; 1 for a factor that is itself a multiplier."""
     if not factor.places:
         return 1.0
     number = number_at(tree, factor.places[0], unit)
@@ -235,7 +244,7 @@ def number_at(base: Tree, place: KeyPath, unit: str) -> float:
     Raises
     ------
     Problem
-        The base has no value there, or one of a different kind.
+        The base job has no value there, or one of a different kind.
     """
     try:
         value = leaf(base, place)
@@ -250,7 +259,7 @@ def number_at(base: Tree, place: KeyPath, unit: str) -> float:
 
 
 def number_in(value: Any, unit: str) -> float | None:
-    """Return the number of a value in a unit; None if it is not a number of that dimension.
+    """Return a value of a job's plain data as a number in a unit; None if it is not a number of that dimension.
 
     Parameters
     ----------
@@ -300,7 +309,7 @@ class Column:
     values: np.ndarray
 
     def cell(self, run: int) -> Any:
-        """Return the factor's value in a run as a job's file writes it."""
+        """Return the factor's value in a run in the notation of a job's file."""
         value = self.values[run].item()
         return with_unit(value, self.unit) if self.unit else value
 
@@ -327,7 +336,7 @@ class Plan:
         Raises
         ------
         InputError
-            A factor takes a value that the base's schema does not allow.
+            A factor takes a value that the base job's schema does not allow.
         """
         sampled = draw(setup.study)
         plan = cls(setup, tuple(_column(setup, name, values) for name, values in sampled.items()))
@@ -341,7 +350,7 @@ class Plan:
 
     @property
     def runs(self) -> int:
-        """Number of runs."""
+        """Number of runs of the study."""
         return run_count(self.setup.study)
 
     @property
@@ -356,12 +365,12 @@ class Plan:
 
     @cached_property
     def scaling(self) -> Scaling:
-        """Values of the base that scale with factors.
+        """Values of the base job that scale with factors, and their multipliers in every run.
 
         Raises
         ------
         InputError
-            A value is not a number, or a power does not exist.
+            A value is not a number, or a power is undefined.
         """
         base: dict[KeyPath, tuple[float | int, str]] = {}
         ratio: dict[KeyPath, np.ndarray] = {}
@@ -400,7 +409,7 @@ class Plan:
         return Run(number, tuple(values.items()), None if self.seeds is None else int(self.seeds[number]))
 
     def check(self) -> None:
-        """Validate each factor's smallest and largest value, and every text, in the base, one factor at a time.
+        """Validate each factor's smallest and largest value, and every text, in the base job, one factor at a time.
 
         The schema's limits are intervals, so that values between two valid ones are valid. Combinations that are
         impossible are found when they are run, and fail individually.
@@ -450,7 +459,7 @@ def _column(setup: StudySetup, name: str, sampled: np.ndarray) -> Column:
 
 
 def _like(setup: StudySetup, name: str, sampled: np.ndarray) -> np.ndarray:
-    """Return a factor's pure numbers as integers if the base job has an integer there and all are whole."""
+    """Return a factor's pure numbers as integers if all are whole and the base job has an integer there."""
     factor = setup.study.factors[name]
     node = leaf(setup.tree, factor.places[0]) if factor.places else None
     whole = isinstance(node, int) and not isinstance(node, bool) and factor.unit is None
@@ -458,7 +467,10 @@ def _like(setup: StudySetup, name: str, sampled: np.ndarray) -> np.ndarray:
 
 
 def _telling(column: Column, limits: list[float]) -> list[Any]:
-    """Return the values of a factor that have to be validated: all texts and switches, smallest and largest number."""
+    """Return the values of a factor that must be validated: all texts and switches, smallest and largest number.
+
+    ``limits`` are the limits of a bounded distribution.
+    """
     if column.values.dtype.kind in "US":
         return list(dict.fromkeys(column.values.tolist()))
     if column.values.dtype.kind == "b":
@@ -478,7 +490,7 @@ _KEPT = 5
 
 
 def study_bytes(setup: StudySetup, runs: int) -> float:
-    """Return the memory of the process that keeps the results, beside the imported program, bytes.
+    """Return the memory of the process that collects the results, in addition to the imported program, in bytes.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Main job as the base of a study: states of one instrument are evaluated together, everything else run by run.
+"""Main job as the base job of a study: states of one instrument are evaluated together, other jobs run by run.
 
 The last bits of a state's numbers depend on the states it is traced with, so a block always holds the same runs. Most
 studies change only numbers under ``perturb``, for which the job of a run is built quickly (`JobMaker`).
@@ -42,13 +42,13 @@ def run_results(
     Parameters
     ----------
     resolved : ResolvedJob
-        Resolved job with everything that it refers to.
+        Job with the contents of all files that it refers to.
     experiment : MonitorExperiment
         Instrument of the job.
     state : State
         Perturbed state.
     truth : Truth
-        Exact trace of this state.
+        True changes of this state, by exact ray trace.
     recovery : Recovery, optional
         Estimates from its images or spots, None without a monitor.
     """
@@ -62,15 +62,13 @@ def run_results(
 
 
 MonitorRun = tuple[ResolvedJob, State]
-"""Job and its perturbed state."""
+"""Run of an instrument with a monitor: its job and the perturbed state that the job describes."""
 
 
 def _run_together(
     experiment: MonitorExperiment, runs: Sequence[MonitorRun], before: Callable[[int, int], np.ndarray]
 ) -> list[Outcome]:
-    """Return the results of runs of one instrument with one number of frames, as in truth.json and recovered.json.
-
-    Array dimensions: C area CCDs.
+    """Return the results of runs of one instrument, all with the same number of frames.
 
     Parameters
     ----------
@@ -79,13 +77,14 @@ def _run_together(
     runs : sequence of MonitorRun
         Runs to be evaluated together.
     before : callable
-        Takes number of frames and seed, and returns the frames of the nominal state, (C, frames, rows, columns).
+        Function of the number of frames and the seed that returns the frames of the nominal state, (C, frames, rows,
+        columns) for C area CCDs.
 
     Returns
     -------
     list of Outcome
-        Results of each run, or the reason of its failure. If one run's light is lost, all runs of the group are tried
-        alone, and the others are then evaluated together.
+        Results of each run, as in truth.json and recovered.json, or the reason of its failure. If one run's light is
+        lost, all runs of the group are tried alone, and the others are then evaluated together.
     """
     out: list[Outcome] = [Failure("not done")] * len(runs)
     frames, seeds = runs[0][0].frames, [resolved.job.render.seed for resolved, _ in runs]
@@ -117,11 +116,11 @@ def _run_together(
 
 
 _PATTERN_FRAMES = 8
-"""Number of frames that need as much memory as the fixed pattern (pixel offsets and gains) of their CCDs."""
+"""Memory of the fixed pattern (pixel offsets and gains) of the CCDs, in units of the memory of one frame of each."""
 
 
 def _traced_together(experiment: MonitorExperiment, runs: Sequence[MonitorRun]) -> list[Outcome]:
-    """Return the truth of runs of one instrument without a monitor, as in truth.json.
+    """Return the true changes of runs of one instrument without a monitor, as in truth.json.
 
     If one run's light is lost, all are evaluated alone.
     """
@@ -139,14 +138,18 @@ def _traced_together(experiment: MonitorExperiment, runs: Sequence[MonitorRun]) 
 BLOCK = 25
 """Number of runs in a block, which are evaluated together.
 
-A run's last digits depend on the runs of its block, and so neither on the number of workers nor on interruptions.
+A run's last digits depend on the other runs of its block. Since blocks are fixed, they depend neither on the number of
+workers nor on interruptions.
 """
 KEPT = 4
-"""Number of calibrated instruments that a worker keeps."""
+"""Number of calibrated instruments that a worker keeps in memory."""
 
 
 class RenderBase:
-    """Base job ``python -m twin.render``, without the crosstalk tables; it keeps instruments between blocks."""
+    """Base job ``python -m twin.render`` without the crosstalk tables.
+
+    It keeps calibrated instruments between blocks of runs.
+    """
 
     model: type[Spec] = ResolvedJob
     block = BLOCK
@@ -157,11 +160,11 @@ class RenderBase:
         self._maker: JobMaker | None = None
 
     def resolve(self, file: Path | str) -> Spec:
-        """Read a job with everything it refers to; raise InputError."""
+        """Read a job's file with all files it refers to; raise InputError if one is invalid."""
         return resolve(file)
 
     def check(self, tree: Tree, backend: Backend) -> None:
-        """Raise InputError if a perturbed node does not exist or does not allow its perturbation."""
+        """Raise InputError if a perturbed body does not exist or does not allow its perturbation."""
         resolved = read_job(tree)
         experiment = self._experiment(resolved, backend)[1]
         checked_nodes(resolved.job, experiment.instrument.nodes)
@@ -169,9 +172,10 @@ class RenderBase:
             experiment.stated  # noqa: B018 - raises where the instrument does not have what is stated
 
     def evaluate(self, tree: Tree, runs: Sequence[Run], backend: Backend) -> list[Outcome]:
-        """Return the outcome of every run: ``truth`` and ``recovered``, and further results on request.
+        """Return the results of every run: ``truth`` and ``recovered``, and further results on request.
 
-        The further results are ``quality`` (image quality), and those of a series of states, stray light or targets.
+        The further results are ``quality`` (image quality), and those of a time series of states, stray light or
+        targets.
         """
         if self._maker is None or self._maker.tree is not tree:  # the same object from block to block
             self._maker = JobMaker(tree)
@@ -235,7 +239,7 @@ class RenderBase:
         return name, self._experiments[name]
 
     def _frames_before(self, name: str, experiment: MonitorExperiment, frames: int, seed: int) -> np.ndarray:
-        """Return the frames before the perturbation, cached because runs with common noise share them."""
+        """Return the frames before the perturbation; they are cached, because runs with the same noise share them."""
         key = (name, frames, seed)
         if key not in self._before:
             self._before[key] = experiment.frames_before(frames, seed)
@@ -256,7 +260,7 @@ def _qualities(
 
 
 def _alone(resolved: ResolvedJob, backend: Backend) -> Outcome:
-    """Return the outcome of a job with several states, or with results other than monitor spots."""
+    """Return the results of a job with several states, or with results other than monitor spots."""
     from twin.main_job.render_job import render_job
 
     run = render_job(resolved, backend)
@@ -299,7 +303,7 @@ class JobMaker:
         self.tree, self.base = tree, read_job(tree)
 
     def job(self, values: tuple[tuple[KeyPath, Any], ...]) -> ResolvedJob:
-        """Return the job with these values.
+        """Return the job of a run in which these key paths have these values.
 
         Raises
         ------
@@ -323,11 +327,11 @@ class JobMaker:
 
 
 def read_job(tree: Tree) -> ResolvedJob:
-    """Return the job of plain data; raise InputError if it is invalid."""
+    """Return the job that plain data describe; raise InputError if they are invalid."""
     resolved: ResolvedJob = validate(ResolvedJob, YamlFile("", tree, {}))
     return resolved
 
 
 def _needs_more(job: JobSpec) -> bool:
-    """Return True if a job has a series of states, stray light or targets, which are computed run by run."""
+    """Return True if a job has a time series, stray light or targets, which are computed run by run."""
     return job.course is not None or job.render.stray is not None or bool(job.render.target_images)

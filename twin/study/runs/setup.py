@@ -1,4 +1,4 @@
-"""Setup of a study: specification, resolved data of its base job and tables of its factors."""
+"""Setup of a study: its specification, the complete data of its base job, and the tables of its factors."""
 
 from __future__ import annotations
 
@@ -34,26 +34,26 @@ BY_NAME = ("instrument", "disturbances")
 Changing such a name would have no effect.
 """
 WORDS = ("name", "description", "limits", "report")
-"""Keys of a study that affect no number.
+"""Keys of a study that affect no computed number.
 
-They, names and units of responses may be changed when a study is resumed.
+These keys, and the names and units of responses, may be changed when a study is resumed.
 """
 
 
 @dataclass(frozen=True, eq=False)
 class StudySetup:
-    """Study with everything it refers to.
+    """Study with the contents of all files it refers to.
 
     Attributes
     ----------
     study : StudySpec
         Specification in the study's file, with the values of the tables.
     tree : dict
-        Plain data of the resolved base job with an entry at the key of every factor. If the base has no value there and
-        absence has the same effect as a value, that value is used; else one of the factor's.
+        Plain data of the base job with an entry at the key of every factor. If the base job has no value there and some
+        value has the same effect as its absence, that value is used; else one of the factor's values.
     base : dict
-        Plain data of the resolved base job without values of factors: an entry exists only if the base has one, or one
-        with the same effect as its absence.
+        Plain data of the base job without values of factors: an entry exists only if the base job has one, or one with
+        the same effect as its absence.
     """
 
     study: StudySpec
@@ -91,19 +91,19 @@ class StudySetup:
         return hashlib.sha256(json.dumps([self.content, versions(), source_digest()]).encode()).hexdigest()
 
     def error(self, problem: Problem | str, key: KeyPath, allowed: str | None = None) -> InputError:
-        """Return an InputError placed at ``key`` of the study's file."""
+        """Return an InputError whose position is ``key`` in the study's file."""
         if isinstance(problem, str):
             return self.study.error(problem, key, allowed=allowed)
         issue = Issue(problem.problem, "", None, (), problem.found, problem.allowed, problem.suggestion)
         return InputError(self._placed(issue, (*key, *problem.within)))
 
     def _placed(self, issue: Issue, key: KeyPath) -> Issue:
-        """Return an issue of the base job placed at ``key`` of the study's file."""
+        """Return an issue of the base job with its position at ``key`` in the study's file."""
         source = self.study.source
         return replace(issue, file=source.file, line=source.line(key), key=(*source.prefix, *key))
 
     def factor_at(self, place: KeyPath) -> tuple[str, KeyPath] | None:
-        """Return name and key of the factor that sets the base job's value at ``place``, or one above or below it."""
+        """Return name and key of the factor that sets the base job's value at ``place``, or above or below it."""
         for name, factor in self.study.factors.items():
             scaled = [(scale.key, ("scales", k)) for k, scale in enumerate(factor.scales)]
             for changed, where in (*((p, factor.key_of(k)) for k, p in enumerate(factor.places)), *scaled):
@@ -113,7 +113,7 @@ class StudySetup:
         return None
 
     def blamed(self, error: InputError, prefix: KeyPath = ()) -> InputError:
-        """Return an error in the base job's data placed at the factor that caused it; other errors unchanged."""
+        """Return an error in the base job's data with its position at the factor that caused it, if there is one."""
         issues = []
         for issue in error.issues:
             factor = self.factor_at((*prefix, *issue.key))
@@ -125,18 +125,18 @@ class StudySetup:
 
 
 def resolve_study(path: str | Path) -> StudySetup:
-    """Read a study and everything it refers to; the config.yaml of an earlier study is also accepted.
+    """Read a study and all files it refers to; the config.yaml of an earlier study is also accepted.
 
     Raises
     ------
     InputError
-        A file cannot be read or is invalid, or a factor's key does not exist in the base.
+        A file cannot be read or is invalid, or a factor's key does not exist in the base job.
     """
     return _resolved(yaml_file.read_yaml(path))
 
 
 def base_of(setup: StudySetup) -> Spec:
-    """Return the study's base as in its own file, without the factors.
+    """Return the specification of the study's base job as in its own file, without the factors.
 
     Raises
     ------
@@ -151,7 +151,7 @@ def base_of(setup: StudySetup) -> Spec:
 
 
 def study_from_text(text: str) -> StudySetup:
-    """Return the study in the text of a config.yaml, for a worker without access to its files."""
+    """Return the study that the text of a config.yaml describes, for a worker without access to the study's files."""
     return _resolved(yaml_file.parse_yaml(text))
 
 
@@ -176,7 +176,7 @@ def _resolved(yaml: yaml_file.YamlFile) -> StudySetup:
 
 
 def _again(yaml: yaml_file.YamlFile) -> StudySetup:
-    """Return the study that a config.yaml of an earlier study holds."""
+    """Return the study that a config.yaml of an earlier study describes."""
     known = ("study", "base")
     for key in yaml.data:
         if key not in known:
@@ -199,13 +199,13 @@ def _again(yaml: yaml_file.YamlFile) -> StudySetup:
 
 
 def _base_file(study: StudySpec) -> Path:
-    """Return the base's file: a path relative to the study's, or a name in the library."""
+    """Return the base job's file: a path relative to the study's, or a name in the library."""
     kind = study.base.command.split()[0]
     return find_named("examples" if kind == "render" else kind, study.base.file, study, ("base", "file"))
 
 
 def _placed(study: StudySpec, tree: Tree) -> StudySetup:
-    """Return the study with an entry in its base for every factor, and validate extreme values of the factors."""
+    """Return the study with an entry in its base job for every factor; validate the factors' extreme values."""
     setup, base = StudySetup(study, tree, tree), tree
     model = setup.job.model
     changed: list[tuple[KeyPath, KeyPath, bool]] = []
@@ -227,7 +227,7 @@ def _placed(study: StudySpec, tree: Tree) -> StudySetup:
 
 
 def _inherited(base: Tree, place: KeyPath) -> bool:
-    """Return whether a key belongs to a temperature that a body takes from the warmed body that carries it."""
+    """Return True for a key of a body's temperature if the body inherits it from the heated body that carries it."""
     if place[:2] != ("job", "perturb") or place[3:4] != ("temperature",):
         return False
     perturb, node = base["job"].get("perturb", {}), str(place[2])
@@ -292,18 +292,19 @@ def _with_tables(study: StudySpec) -> StudySpec:
 
 
 LARGEST_TABLE = 100_000_000
-"""Largest size of a table's file, bytes."""
+"""Largest size of the file of a table with factor values, bytes."""
 MOST_CELLS = 90_000
-"""Largest number of cells of all tables together.
+"""Largest number of cells of all tables with factor values together.
 
 The config.yaml of the study holds them, with at most 100 000 keys and values.
 """
 
 
 def _read_table(study: StudySpec, path: Path, key: KeyPath, named: Mapping[str, KeyPath]) -> dict[str, list[Any]]:
-    """Return the named columns of a CSV file, each with the key at which it is named.
+    """Return the named columns of a CSV file: column -> its values.
 
-    The file is read row by row, so that only its text and these columns are held in memory.
+    ``named`` gives for each column the key of the study's file that names it, for error messages. The file is read row
+    by row, so that only its text and these columns are held in memory.
     """
 
     def wrong(text: str, allowed: str) -> InputError:
@@ -347,11 +348,11 @@ def _read_table(study: StudySpec, path: Path, key: KeyPath, named: Mapping[str, 
 
 _SCALAR: TypeAdapter[Any] = TypeAdapter(Scalar)
 _PLAIN = re.compile(r"[-+]?\.?[0-9A-Za-z][-+0-9A-Za-z._/^() ]*")
-"""Pattern of most cells that YAML reads as a plain scalar."""
+"""Regular expression for most of the table cells that YAML reads as a plain scalar."""
 
 
 def _cell(text: str) -> Any:
-    """Return a cell as YAML would read it: number, true, false or text."""
+    """Return a text from a table's cell as YAML would read it: number, true, false or text."""
     try:
         if _PLAIN.fullmatch(text):
             return _SCALAR.validate_python(yaml_file.plain_scalar(text.strip()))
@@ -362,12 +363,12 @@ def _cell(text: str) -> Any:
 
 
 def _job(command: str) -> BaseJob:
-    """Return the job of that name: one of `BASES`, or a test of `PROCEDURES` that can be varied.
+    """Return the base job for a command's name: one of `BASES`, or a test of `PROCEDURES` that can be varied.
 
     Raises
     ------
     InputError
-        This version of the twin does not have it.
+        This version of the program does not have it.
     """
     if command in BASES:
         job: BaseJob = BASES[command]()

@@ -1,8 +1,9 @@
-"""Checks of the method of paper 000: passes over ground points, the equations, the assumptions and the uses.
+"""Checks of the method of paper 000 (Liu and Huang 2014): passes, equations, assumptions and applications.
 
+A pass is a flight of the satellite over ground control points, from which the angles between its cameras are measured.
 The passes are the tests of the library (scenes/orbit/angle*.yaml). The assumptions concern the light, the projection
-centres of the cameras, and the camera itself, whose traced change has to be observable from the ground. The uses are
-the height error of one arc second (sections 0 and 3) and the off-axis angles of other cameras.
+centres of the cameras, and the camera itself, whose traced change has to be observable from the ground. The
+applications are the height error due to one arc second (sections 0 and 3) and the off-axis angles of other cameras.
 """
 
 from __future__ import annotations
@@ -54,14 +55,14 @@ PAIRS = (("forward", "nadir"), ("nadir", "backward"))
 
 @dataclass(frozen=True, eq=False)
 class Passes:
-    """Simulated pass over ground points with its repeated measurements.
+    """Simulated pass of the satellite over ground points, with repeated measurements of it.
 
     Attributes
     ----------
     flight : AnglePass
         True pass.
     measured : tuple of Measurement
-        Measurements with errors drawn anew each time; the effects of the light are in the points and are corrected.
+        Measurements, each with new random errors; the effects of the light are in the points and are corrected.
     """
 
     flight: AnglePass
@@ -78,9 +79,10 @@ class Passes:
         return tuple(resect_measurement(m) for m in self.measured)
 
     def normal(self, line: str) -> np.ndarray:
-        """Return the true unit normal of a line's plane, (3,), ITRS, with negative z like the paper's (a0, a1, -1).
+        """Return the true unit normal of the plane that a camera line spans, (3,), in the ITRS.
 
-        It follows from the exact directions of the camera's pixels at the points, not from the points.
+        Its z is negative like that of the paper's (a0, a1, -1). It follows from the exact directions of the camera's
+        pixels at the points, not from the points.
         """
         looks = self.flight.cameras[line].look(self.flight.pixel[line])
         body = np.linalg.svd(looks)[2][2]
@@ -89,7 +91,7 @@ class Passes:
         return np.asarray(-np.copysign(1.0, normal[2]) * normal)
 
     def ahead(self, line: str) -> np.ndarray:
-        """Return the true line of sight of a line's centre, orthogonalised to the line's true normal, (3,).
+        """Return the true line of sight of a camera line's centre, orthogonalised to the line's true normal, (3,).
 
         The normal moves along this direction when the plane is pitched.
         """
@@ -101,9 +103,9 @@ class Passes:
         return np.asarray(look / np.linalg.norm(look))
 
     def pitch_error(self, normals: Mapping[str, np.ndarray]) -> dict[str, tuple[float, float]]:
-        """Return line -> mean error of fitted unit normals toward the line of sight, and its sigma, in arcsec.
+        """Return line -> mean error of fitted plane normals toward the line of sight, and its sigma, in arcsec.
 
-        ``normals`` has line -> (passes, 3).
+        ``normals`` has for each line the unit normals of all measurements, (passes, 3).
         """
         out = {}
         for line, normal in normals.items():
@@ -113,12 +115,12 @@ class Passes:
 
 
 def planes_of(measured: Measurement, method: Method, lines: Iterable[str] = LINES) -> list[PlaneFit]:
-    """Fit planes through the measured station and the ground points of each line."""
+    """Fit a plane for each camera line, through the measured projection centre and the line's ground points."""
     return [fit_plane(measured.station, measured.strips[line], method) for line in lines]
 
 
 def setup_of(name: str, **changes: object) -> AngleSetup:
-    """Return a test of the library with changed errors or another pass.
+    """Return a test of the library with changed errors or a changed pass.
 
     Changes are fields of its `errors`, or the latitude, longitude and direction of its pass.
     """
@@ -142,7 +144,7 @@ def repeated(
     turns: Mapping[str, tuple[float, float, float]] = FrozenMap(),
     corrected: bool = True,
 ) -> Passes:
-    """Simulate a pass and ``count`` measurements of it.
+    """Simulate a pass of the satellite over ground points and ``count`` measurements of it.
 
     Parameters
     ----------
@@ -155,7 +157,7 @@ def repeated(
     backend : Backend | None
         Backend that traces an instrument's lines; None for lines without an instrument.
     turns : Mapping[str, tuple[float, float, float]]
-        Line -> rotation vector in body axes since the laboratory calibration, radians.
+        Line -> its rotation vector in body axes since the laboratory calibration, radians.
     corrected : bool
         True if the analysis removes aberration, light time and refraction from the points.
     """
@@ -181,7 +183,7 @@ TWIST = np.radians(10.0 / 60.0)
 def sum_of_squares(slopes: Array, points: Array, station: Array) -> float:
     """Return the sum of squares S of eq. (2), in square metres, for the slopes a0 and a1 of a plane, (2,).
 
-    The third coefficient a2 follows from eq. (1). Points, (n, 3), and station, (3,), are in metres.
+    The third coefficient a2 follows from eq. (1). The n points, (n, 3), and the projection centre, (3,), are in metres.
     """
     x, y, z = points.T
     x0, y0, z0 = station
@@ -190,7 +192,10 @@ def sum_of_squares(slopes: Array, points: Array, station: Array) -> float:
 
 
 def derivatives(slopes: Array, points: Array, station: Array) -> Array:
-    """Return the left sides of eq. (4), the printed derivatives of S with respect to a0 and a1, (2,), m^2."""
+    """Return the left sides of eq. (4), (2,), m^2: the derivatives of the sum of squares S as printed.
+
+    They are with respect to the slopes a0 and a1 of the plane.
+    """
     x, y, z = points.T
     x0, y0, z0 = station
     a0, a1 = slopes
@@ -199,9 +204,9 @@ def derivatives(slopes: Array, points: Array, station: Array) -> Array:
 
 
 def numerical_derivatives(slopes: Array, points: Array, station: Array) -> Array:
-    """Return the derivatives of the sum of squares S with respect to a0 and a1 by central differences, (2,), m^2.
+    """Return the derivatives of the sum of squares S by central differences, (2,), m^2.
 
-    For a quadratic form they are exact except for rounding.
+    They are with respect to the slopes a0 and a1 of the plane. For a quadratic form they are exact except for rounding.
     """
     out = []
     for step in _STEP * np.eye(2):
@@ -213,8 +218,8 @@ def numerical_derivatives(slopes: Array, points: Array, station: Array) -> Array
 def least_slopes(points: Array, station: Array) -> Array:
     """Return the slopes a0, a1 of the plane that minimise the sum of squares S, (2,).
 
-    They are the vertex of a parabola through its values, computed twice: from nearby values the second one keeps more
-    digits.
+    They are the vertex of a parabola through values of S. It is computed twice, the second time from values nearer to
+    the vertex, which keep more digits.
     """
     place, size = np.zeros(2), 1.0
     for _ in range(3):
@@ -274,7 +279,7 @@ def twisted_passes(context: Context) -> tuple[Passes, Passes]:
 
 @one_blas_thread()
 def run(context: Context) -> Iterator[CheckResult]:
-    """Yield the results of all checks of the equations."""
+    """Yield the results of all checks of the equations of paper 000 (Liu and Huang 2014)."""
     context.progress(0.0, "measure ground points")
     planes = Planes(context, make_passes(context))
     checks: Mapping[str, Callable[[Planes], CheckResult]] = {
@@ -404,7 +409,7 @@ def _arccos(planes: Planes) -> CheckResult:
 
 
 def _exact(a: PlaneFit, b: PlaneFit) -> float:
-    """Return the acute angle between two planes, radians, computed with 18 digits."""
+    """Return the acute angle between two planes, radians, computed with 18 significant digits."""
     first, second = (np.array([*fit.coefficients[:2], -1.0], np.longdouble) for fit in (a, b))
     cross = np.cross(first, second)
     return float(np.arctan2(np.sqrt(np.sum(cross * cross)), abs(np.sum(first * second))))
@@ -429,7 +434,7 @@ SCALE_HEIGHT = 8435.0
 
 @one_blas_thread()
 def run_suppositions(context: Context) -> Iterator[CheckResult]:
-    """Yield the results of all checks of what the method neglects: light effects and changes of the camera."""
+    """Yield the results of all checks of what the method neglects: effects of the light and changes of the camera."""
     if context.wants("000.light"):
         context.progress(0.0, "true ground points with each effect on the light")
         # only the true points are used
@@ -463,7 +468,7 @@ def _light(context: Context, passes: Passes) -> Iterator[CheckResult]:
 
 
 def _refraction(passes: Passes, line: str) -> float:
-    """Return the first-order change of a look angle due to a thin atmosphere below the station, radians (negative)."""
+    """Return the first-order change of a look angle due to refraction in a thin atmosphere, radians (negative)."""
     flight = passes.flight
     point = passes.points[line]
     arm = flight.station - point[len(point) // 2]
@@ -477,7 +482,7 @@ def _refraction(passes: Passes, line: str) -> float:
 
 
 def _traced(context: Context, passes: Passes) -> Iterator[CheckResult]:
-    """Check measurements of a traced instrument that has changed since the laboratory."""
+    """Check measurements of a ray-traced instrument that has changed since its laboratory calibration."""
     flight = passes.flight
     first, second = flight.pairs["alpha"]
     lab = dihedral_angle(
@@ -499,7 +504,10 @@ def _traced(context: Context, passes: Passes) -> Iterator[CheckResult]:
 
 
 def _seen(passes: Passes, line: str) -> float:
-    """Return the rotation of a line's plane due to shifts of the projection centre, seen from the ground, radians."""
+    """Return the apparent rotation of a line's plane due to shifts of the projection centre, radians.
+
+    It is the rotation that the ground points show.
+    """
     flight = passes.flight
     camera = flight.laboratory[line]
     origin, look = camera.origin(flight.pixel[line]), camera.look(flight.pixel[line])
@@ -512,7 +520,7 @@ def _seen(passes: Passes, line: str) -> float:
 
 
 def height_passes(context: Context) -> Passes:
-    """Simulate one pass of the camera ``th1`` for the checks of heights."""
+    """Simulate one pass of the example camera ``th1`` for the checks of height errors."""
     return repeated(setup_of(TEST), np.random.SeedSequence([context.seed, 6]), 2)
 
 
@@ -524,7 +532,7 @@ def off_axis_passes(context: Context) -> Passes:
 
 @one_blas_thread()
 def run_uses(context: Context) -> Iterator[CheckResult]:
-    """Yield the results of all checks of the method's uses: height errors and off-axis angles."""
+    """Yield the results of all checks of the method's applications: height errors and off-axis angles."""
     if context.wants("000.height"):
         context.progress(0.0, "intersect with a turned line")
         yield from _height(context, height_passes(context).flight)

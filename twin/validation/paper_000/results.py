@@ -1,7 +1,9 @@
-"""Checks of the results of paper 000: Table 1, planes against resection, and the statements about Figs. 3 to 5.
+"""Checks of the results of paper 000 (Liu and Huang 2014).
 
-Each statement of the text is decided by a number. The words on the figures have no numbers: "far more" is taken as at
-least twice, "very near" as within a quarter, "little" as at most a quarter of the largest, and a slope that grows as
+They are Table 1, planes against resection, and the statements about Figs. 3 to 5.
+
+Each statement of the text is decided by a number. The paper describes the figures in words only: "far more" is taken as
+at least twice, "very near" as within a quarter, "little" as at most a quarter of the largest, and a slope that grows as
 one that grows by 5 %, the smallest change that is visible in a figure.
 """
 
@@ -29,13 +31,16 @@ from twin.validation.paper_000.method import PAIRS, TEST, Passes, planes_of, rep
 PRINTED_ARCSEC = load_printed("000").numbers("table1.difference_arcsec")
 ALPHA, BETA = PRINTED_ARCSEC["alpha"], PRINTED_ARCSEC["beta"]
 POINT_SIGMA = float(np.hypot(2.0, 5.0 / 3.0))
-"""Standard deviation of a ground point, metres: control points of 2 m, matched to a third of a pixel of 5 m."""
+"""Standard deviation of a ground point, metres.
+
+It combines a control point's error of 2 m with a matching error of a third of a pixel of 5 m.
+"""
 
 POINTS = float(setup_of(TEST).test.strips.points)
 """Number of ground points on each line."""
 
 LIMIT = 3.44
-"""Distance from the centre of a two-dimensional normal distribution within which 99.7 % lie, in sigmas.
+"""Radius, in sigmas, that contains 99.7 % of a two-dimensional normal distribution.
 
 It corresponds to three standard deviations in one dimension.
 """
@@ -62,9 +67,10 @@ def differences_svg(figure: Figure, same: Array, independent: Array, printed: tu
 
 @dataclass(frozen=True, eq=False)
 class Differences:
-    """Angles alpha and beta by resection minus those by planes, and the sigma that each method claims.
+    """Angles alpha and beta by resection minus those by planes, and the sigma that each method reports.
 
-    The differences are a (passes, 2) array and the sigmas (2,), in arcsec.
+    The angles are those between the cameras' lines. The differences are a (passes, 2) array and the sigmas (2,), in
+    arcsec.
     """
 
     values: Array
@@ -78,7 +84,7 @@ class Differences:
 
 
 def differences(planes: Passes, resection: Passes) -> Differences:
-    """Return the differences of the two methods, each on its measurements, which may be the same."""
+    """Return the differences of the angles by the two methods, each from its measurements, which may be the same."""
     by_planes = [intersection_angles(*planes_of(m, "tls")) for m in planes.measured]
     resected = np.array([section.angles(PAIRS) for section in resection.sections])
     claimed = [section.angle_covariance(PAIRS) for section in resection.sections]
@@ -91,7 +97,7 @@ def differences(planes: Passes, resection: Passes) -> Differences:
 
 @dataclass(frozen=True, eq=False)
 class Data:
-    """Simulated measurements for Table 1.
+    """Simulated measurements for Table 1, which compares planes and resection.
 
     Attributes
     ----------
@@ -100,7 +106,7 @@ class Data:
     own : Passes
         Measurements of ground points with an error of `POINT_SIGMA`, light effects removed, for the resection.
     light : Passes
-        Further measurements with the same stations and the light effects left in, for the planes.
+        Further measurements with the same projection centres and the light effects left in, for the planes.
     """
 
     same: Passes
@@ -126,7 +132,7 @@ def _at(measured: Measurement, position: Array) -> Measurement:
 
 @one_blas_thread()
 def run_table_1(context: Context) -> Iterator[CheckResult]:
-    """Yield the results of all checks of Table 1."""
+    """Yield the results of all checks of Table 1 of paper 000 (Liu and Huang 2014)."""
     context.progress(0.1, "measure ground points for both methods")
     data = make_data(context)
     same, independent = differences(data.same, data.same), differences(data.light, data.own)
@@ -166,7 +172,10 @@ def _rms(bias: float, spread: float, factor: float) -> float:
 
 
 def _points(response: Callable[[float], float]) -> list[Chosen]:
-    """Return the error of the ground points as an input on which the scatter of an angle depends."""
+    """Return the error of the ground points as an input that the paper does not print.
+
+    The scatter of an angle depends on it.
+    """
     return [
         Chosen("error of a point", POINT_SIGMA, "m", response),
         Chosen("points on a line", POINTS, "1", lambda factor: response(factor**-0.5)),
@@ -199,7 +208,7 @@ def _pair(context: Context, data: Data, independent: Differences) -> CheckResult
 
 
 def _pitch_variance(passes: Passes, line: str) -> float:
-    """Return the variance of the pitch of a line's plane through its ground points, arcsec^2.
+    """Return the variance of the pitch of a line's plane due to errors of its ground points, arcsec^2.
 
     It follows from the number of points, their error and their distance.
     """
@@ -233,15 +242,15 @@ Angle = Literal["alpha", "beta"]
 Place = tuple[float, float]
 """Latitude and longitude of a simulated pass, degrees."""
 Rises = Mapping[tuple[str, Angle, str], float]
-"""(moved object, angle, axis) -> change of the angle for a move of 10 m, arcsec."""
+"""(moved object, angle, axis) -> change of the angle for a displacement of 10 m, arcsec."""
 AXES = ("x", "y", "z")
 FAR, ALIKE, LITTLE, GROWS = 2.0, 1.25, 0.25, 0.05
 GREEK: Mapping[str, str] = {"alpha": "α", "beta": "β"}
 _STYLES = {"x": (BLUE, "o"), "y": (GREEN, "s"), "z": (VERMILION, "^")}
 REACH = 10.0
-"""Largest displacement of a station or of ground points in the figures, metres."""
+"""Largest displacement of the projection centre (station) or of ground points in the figures, metres."""
 ELSEWHERE = (45.0, 120.0)
-"""Latitude and longitude, degrees, of a pass for which the paper's statements on position-dependent sizes hold."""
+"""Latitude and longitude, degrees, of another pass, at which the paper's position-dependent statements are true."""
 PANELS = {
     "fig3": (("station", "alpha"), ("station", "beta")),
     "fig4": (("forward", "alpha"), ("nadir", "alpha")),
@@ -251,16 +260,18 @@ PANELS = {
 
 @dataclass(frozen=True)
 class Sentence:
-    """Statement of the paper's text about the response of an angle when station or ground points are moved.
+    """Statement of the paper about the change of an angle due to a displacement.
+
+    The projection centre or the ground points are displaced.
 
     Attributes
     ----------
     name : str
-        Name of the row, without the paper.
+        Name of the check, without the paper.
     kind : Kind
         Kind of statement.
     what : str
-        "station", or the line whose points move.
+        "station" for the projection centre, or the line whose points are displaced.
     angle : Angle
         Angle that the statement is about.
     axes : tuple of str
@@ -278,12 +289,12 @@ class Sentence:
 
     @property
     def row(self) -> Check:
-        """Row of the validation for this statement."""
+        """Check of the validation for this statement."""
         return load_printed("000").groups["000.figures"].rows[f"000.{self.name}"]
 
     @property
     def implied(self) -> float:
-        """Value of `measure` that the statement implies."""
+        """Value of the number that `measure` returns, as the statement implies it."""
         return {
             "signs": 0.0, "largest": 1.0, "far": FAR, "alike": ALIKE, "little": LITTLE, "grows": GROWS, "opposite": 1.0,
         }[self.kind]  # fmt: skip
@@ -291,8 +302,12 @@ class Sentence:
     def measure(self, rises: Rises, growth: Rises) -> float:
         """Return the number that decides the statement.
 
-        It is computed from the changes of the angles (``rises``) and the relative increase of their slopes
-        (``growth``).
+        Parameters
+        ----------
+        rises : Rises
+            Changes of the angles at the largest displacement, arcsec.
+        growth : Rises
+            Relative increase of the slope of each curve from its first to its last step.
         """
 
         def rise(axis: str, angle: Angle = self.angle) -> float:
@@ -312,7 +327,7 @@ class Sentence:
         return max((-rise(axis, "beta") / rise(axis, "alpha") for axis in AXES), key=lambda ratio: abs(ratio - 1.0))
 
     def holds(self, rises: Rises, growth: Rises) -> bool:
-        """Return True if the number confirms the statement, as the row compares it."""
+        """Return True if the number confirms the statement, with the tolerance of its check."""
         return self.row.outside(self.measure(rises, growth), self.implied) <= self.row.tolerance
 
 
@@ -368,7 +383,7 @@ def sensitivity_svg(
 
 @drawing("places-000", 3.6)
 def places_svg(figure: Figure, held: Mapping[Place, int], total: int, marked: Sequence[Place]) -> None:
-    """Draw the number of confirmed statements by geographic position."""
+    """Draw a map of the number of statements that are confirmed at each position of the pass."""
     axes = figure.subplots()
     lat, lon = (np.unique([place[k] for place in held]) for k in (0, 1))
     grid = np.array([[held[a, b] for b in lon] for a in lat])
@@ -385,7 +400,9 @@ def places_svg(figure: Figure, held: Mapping[Place, int], total: int, marked: Se
 
 @dataclass(frozen=True, eq=False)
 class Answers:
-    """Changes of the angles over the displacement of station or ground points, with planes fitted anew.
+    """Changes of the angles as functions of the displacement of projection centre or ground points.
+
+    The planes are fitted again after each displacement.
 
     Attributes
     ----------
@@ -400,7 +417,10 @@ class Answers:
 
     @classmethod
     def of(cls, table: Sequence[Sensitivity]) -> Answers:
-        """Return the curves from a table of sensitivities, for every moved object along every axis."""
+        """Return the curves of the angles' changes from a table of sensitivities.
+
+        They are given for every moved object along every axis.
+        """
         change = {
             (row.what, angle, row.axis): row.change[k] / ARCSEC for row in table for k, angle in enumerate(row.angles)
         }
@@ -413,7 +433,7 @@ class Answers:
 
     @property
     def growth(self) -> Rises:
-        """(moved object, angle, axis) -> relative increase of the slope from the first to the last step."""
+        """(moved object, angle, axis) -> relative increase of the curve's slope from the first to the last step."""
         out = {}
         for key, change in self.change.items():
             slope = np.abs(np.diff(change))
@@ -424,7 +444,7 @@ class Answers:
 def make_passes(
     context: Context, place: Place | None = None, count: int | None = None, direction: str = "descending"
 ) -> Passes:
-    """Simulate measurements at the position of the library's test, or at another (latitude, longitude), degrees."""
+    """Simulate measurements at the position of the library's test, or at ``place``: latitude and longitude, degrees."""
     at: dict[str, Any] = {"direction": direction}
     if place is not None:
         at |= {"latitude": np.radians(place[0]), "longitude": np.radians(place[1])}
@@ -433,14 +453,17 @@ def make_passes(
 
 
 def answers(measured: Measurement, flight: AnglePass, steps: int = 10, method: Method = "corrected") -> Answers:
-    """Return how the angles change when station or ground points are displaced; planes are fitted anew each time."""
+    """Return the changes of the angles for displacements of projection centre or ground points.
+
+    The planes are fitted again for each displacement; ``steps`` is the number of displacements.
+    """
     amount = np.linspace(0.0, REACH, steps + 1)
     return Answers.of(sensitivity(measured.station, measured.strips, flight.pairs, method=method, amounts=amount))
 
 
 @one_blas_thread()
 def run_figures(context: Context) -> Iterator[CheckResult]:
-    """Yield the results of all checks of the statements about Figs. 3 to 5."""
+    """Yield the results of all checks of the statements about Figs. 3 to 5 of paper 000 (Liu and Huang 2014)."""
     context.progress(0.0, "move station and points")
     passes = make_passes(context)
     all_answers = [answers(m, passes.flight) for m in passes.measured]
@@ -480,14 +503,17 @@ def _row(
 
 
 def _place(sentences: Sequence[Sentence], places: Mapping[Place, Answers]) -> Supposed:
-    """Return the position of the pass as a chosen input, with the positions where some statements are all confirmed."""
+    """Return the position of the pass as an input that the paper does not print.
+
+    It comes with other positions where the statements are confirmed.
+    """
     held = sum(all(s.holds(a.rises, a.growth) for s in sentences) for a in places.values())
     text = f"holds at {held} of {len(places)} places from 25° to 50° N and 80° to 130° E"
     return Supposed("a descending pass over 40° N 116° E", text)
 
 
 def _explained(sentence: Sentence, passes: Passes, other: Answers) -> list[float]:
-    """Return the values that the explanations of a statement's row would give; empty if it has none."""
+    """Return the values that the explanations of a statement's check would give; empty if it has none."""
     if sentence.kind == "grows":
         return [REACH / float(np.linalg.norm(passes.flight.station - passes.flight.middle_point))]
     if sentence.kind == "alike" and sentence.holds(other.rises, other.growth):
@@ -531,7 +557,7 @@ def _single(context: Context, passes: Passes) -> CheckResult:
 
 
 def _places(context: Context) -> dict[Place, Answers]:
-    """Return position of the pass -> response of the angles in one measurement there."""
+    """Return position of the pass -> changes of the angles over the displacements, for one measurement there."""
     step = 5.0 if context.fast else 2.5
     out = {}
     grid = [(lat, lon) for lat in np.arange(25.0, 50.1, step) for lon in np.arange(80.0, 130.1, 2.0 * step)]
@@ -546,8 +572,8 @@ def _places(context: Context) -> dict[Place, Answers]:
 def _readings(context: Context) -> list[tuple[str, str, int, int]]:
     """Return, for each frame and flight direction, how many statements are confirmed.
 
-    The first count interprets the statements as about the angle, the second about the ordinate of the figures, which
-    has the opposite sign.
+    The first count takes the statements to be about the angle, the second about the ordinate of the figures, which has
+    the opposite sign.
     """
     rows = []
     for direction in ("descending", "ascending"):

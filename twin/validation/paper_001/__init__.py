@@ -1,1 +1,1 @@
-"""Checks of paper 001: on-board monitoring by optical autocollimation."""
+"""Checks of paper 001 (Wang et al. 2018): on-board monitoring by optical autocollimation."""

@@ -1,4 +1,8 @@
-"""Checks of paper 001's error budget: Tables 3 to 5, eq. (12) and section 3.2.3, with a figure."""
+"""Checks of the error budget of paper 001 (Wang et al. 2018): Tables 3 to 5, eq. (12), section 3.2.3; a figure.
+
+The budget converts errors of the monitor's spots, due to its thermal and mechanical causes, to errors of the cameras'
+parameters.
+"""
 
 from __future__ import annotations
 
@@ -33,11 +37,14 @@ BUDGET = "monitor_pair"
 TABLE_3 = load_printed("001").numbers("table3.spot_arcsec")
 TABLE_4 = load_printed("001").number("table4.spot_arcsec")
 FOCAL_PLANE, LONG_PRISM = "coordinate_thermal", "prism_180_thermal"
-"""Causes whose inputs are also applied by themselves."""
+"""Names of two causes of the error budget whose inputs are also applied by themselves, at three sigmas.
+
+They are the temperatures of the focal planes and of the long prisms.
+"""
 FEW_DRAWS = (FOCAL_PLANE, "central_prism_thermal")
 """Causes with only two or three random numbers per state.
 
-They need more states than those of a prism in every channel.
+They need more random states than the causes that act on a prism in every channel.
 """
 ROLL = load_printed("001").number("table5.d_gamma_arcsec") * ARCSEC
 """Error of the roll d_gamma that Table 5 prints, radians."""
@@ -48,7 +55,7 @@ FROM_ALL_CAUSES = frozenset(
         *(f"table5.{parameter}" for parameter in ("d_beta", "d_alpha", "d_gamma", "d_f")),
     )
 )
-"""Ids of the checks that need a simulation with all causes at once."""
+"""Ids of the checks that need a simulation in which all causes act together."""
 _CHUNK = 40
 _LARGEST = ("prism_180_thermal", "prism_0_rotation")
 """The two causes that contribute most to the total of eq. (12)."""
@@ -61,7 +68,10 @@ _INPUT_OF = {
     "prism_0_rotation": "rotation of the 0° prism",
     "central_prism_thermal": "gradient in the central prism",
 }
-"""Cause -> its main input. Rotations act through the residual angle errors of the prisms, which are chosen too."""
+"""Cause of the error budget -> its main input.
+
+Rotations act through the residual angle errors of the prisms, which are chosen here too.
+"""
 _ANGLE, _LENGTH = ("arcsec", ARCSEC), ("mm", 1e-3)
 _PARAMETERS = {
     "d_beta": ("d_beta_rad", "Δβ, 3σ", *_ANGLE),
@@ -73,14 +83,14 @@ _PARAMETERS = {
 
 
 def frame_mean(error: float, frames: int = FRAMES) -> float:
-    """Return the random error of the mean of several frames from that of one frame, the first term of eq. (12)."""
+    """Return the random error of the mean of ``frames`` frames from that of one, the first term of eq. (12)."""
     return error / sqrt(frames)
 
 
 def root_sum(errors: Mapping[str, float]) -> float:
     """Return the total error of eq. (12) from the errors of Table 3, in their unit.
 
-    It is the root of the sum of their squares, with the centroid's error divided by the root of the number of frames.
+    It is the root of the sum of squares, with the centroid's error divided by the root of the number of frames.
     """
     return sqrt(sum((frame_mean(e) if name == "centroid" else e) ** 2 for name, e in errors.items()))
 
@@ -94,7 +104,7 @@ def root_sum_of_squares(lines: Mapping[str, BudgetLine]) -> tuple[float, float]:
 
 
 def propagated(spot: float, geometry: MonitorGeometry, estimator: str = "paper_single") -> dict[str, float]:
-    """Return the errors of Table 5 from the error of one coordinate of one spot (Table 4), all independent.
+    """Return the errors of Table 5 from the error of one spot coordinate (Table 4); all coordinates are independent.
 
     Parameters
     ----------
@@ -123,21 +133,21 @@ class BudgetImages:
     Attributes
     ----------
     geometry : MonitorGeometry
-        Geometry of the first camera; both are alike.
+        Geometry of the first camera; the second has the same.
     inputs : (int, int, int)
         Trials per cause (twice as many for FEW_DRAWS), trials with all causes, and groups of frames.
     lines : dict of str to BudgetLine
         Cause of Table 3 -> its simulated error.
     focal_plane : (float, float) or None
-        True and measured change of d_f due to the focal plane's temperature, metres.
+        True and estimated change of d_f due to the focal plane's temperature, metres.
     halved : (float, float, float) or None
         Glass path of the 180-deg prism before and after halving, metres, and the ratio of its errors.
     together : CombinedErrors or None
         Errors with all causes at once.
     scatter : pair of (float, float) or None
-        Scatter of the centroid in single frames and in means of FRAMES, radians, with standard deviations.
+        Scatter of the centroid in single frames and in means of FRAMES, radians, each with its standard deviation.
     line_pixel : float
-        Pixel of the line CCD, metres.
+        Pixel pitch of the line CCD, metres.
     roll_pixels : float or None
         Displacement of the line of sight at the line's end due to a rotation by ROLL, in pixels of the line CCD.
     """
@@ -154,7 +164,7 @@ class BudgetImages:
 
 
 def measured(context: Context) -> BudgetImages:
-    """Simulate what the selected checks need."""
+    """Simulate the errors that the selected checks of the budget need."""
     spec = load_error_budget(BUDGET)
     trials, together, groups = context.count(400, 60), context.count(1500, 80), context.count(400, 80)
     spec = spec.model_copy(update={"trials": trials, "all_together": together})
@@ -186,21 +196,21 @@ def measured(context: Context) -> BudgetImages:
 
 
 def three_sigma(budget: ErrorBudget, cause: str) -> float:
-    """Return the three-sigma input of a cause whose components are alike, in SI units."""
+    """Return three standard deviations of a cause whose components have equal sigmas, in SI units."""
     return 3.0 * budget.prior.of_causes((cause,)).components[0].sigma
 
 
 def more_trials(budget: ErrorBudget, factor: int) -> ErrorBudget:
-    """Return an error budget with ``factor`` times the trials for each cause."""
+    """Return an error budget with ``factor`` times as many random states for each cause."""
     other = copy(budget)
     other.spec = budget.spec.model_copy(update={"trials": factor * budget.spec.trials})
     return other
 
 
 def centroid_scatter(budget: ErrorBudget, groups: int) -> tuple[tuple[float, float], tuple[float, float]]:
-    """Return three sigma of the energy centroid in single frames and in means of FRAMES of them.
+    """Return three sigma of the energy centroid in single frames, and in means of FRAMES frames.
 
-    Both are in radians, each with its standard deviation; the same frames serve both.
+    Both are in radians, each with its standard deviation; they are computed from the same frames.
     """
     setup = budget.experiment
     pattern = setup.pattern(budget.seed)
@@ -293,7 +303,10 @@ def run(context: Context) -> Iterator[CheckResult]:
 
 
 def _in_sum(images: BudgetImages, name: str, value: float) -> Chosen:
-    """Return the input of one cause, with the response of a root of a sum of squares to it."""
+    """Return the main input of one cause as an input of a total error, which the paper does not print.
+
+    The total, a root of a sum of squares, depends on it through one term.
+    """
     line = images.lines[name]
     share = (frame_mean(1.0) if name == "centroid" else 1.0) * line.three_sigma / ARCSEC
 
@@ -346,7 +359,10 @@ def _show(context: Context, lines: Mapping[str, BudgetLine]) -> None:
 
 
 def _all_causes(value: float) -> list[Chosen]:
-    """Return all inputs together as a choice, to which every error is proportional."""
+    """Return the inputs of all causes, multiplied by one factor, as an input that the paper does not print.
+
+    Every error is proportional to that factor.
+    """
     return [Chosen.power("errors by all inputs of scenes/library/budgets/monitor_pair.yaml, times", 1.0, "1", value)]
 
 

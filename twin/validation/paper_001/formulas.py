@@ -1,9 +1,10 @@
-"""Checks of the formulas of paper 001 on rendered images.
+"""Checks of the formulas of paper 001 (Wang et al. 2018) on rendered images.
 
-Single changes test (1) to (7). The joint form tests superposition (8), symmetry (9), separation (10) and (11), the last
-column of Table 1 for all four changes at once, and the angle of Fig. 4.
+Single changes of a camera test (1) to (7). The joint form tests superposition (8), symmetry (9), separation (10) and
+(11), the last column of Table 1 for all four changes at once, and the angle of Fig. 4.
 
-A displacement is before - after, in any unit of length; X is across the line, Y along it, L at its +Y end.
+A displacement of a spot is before - after, in any unit of length; X is across the line CCD, Y along it, L is at its +Y
+end.
 """
 
 from __future__ import annotations
@@ -38,24 +39,28 @@ from twin.validation.group import Context, drawing, group_of
 
 Value = TypeVar("Value", float, np.ndarray)
 Measured = tuple[float, float]
-"""A measured value and its standard deviation, in the same unit."""
+"""Pair of a measured value and its standard deviation, in the same unit."""
 MIRROR_TURNS = tuple(math.radians(angle) for angle in (1 / 3600, 1 / 60, 0.5, 2.0, 10.0))
 INSTRUMENT = "monitor_pair"
 """Name of the instrument with the camera that Table 5 implies: f = 7.7 m, area CCDs 0.73 m apart."""
 FRAMES = 9
 PARAMETERS = ("d_alpha", "d_beta", "d_gamma", "d_f")
 SHIFT, TURN, SCALE, PISTON, FACE = 50e-6, 20 * ARCSEC, 20e-6, 50e-6, 4 * ARCSEC
-"""Motions, SI: of the line CCD along X or Y, about Z; growth of the camera; line CCD along Z; turn of a return face."""
-AMOUNTS = {"d_alpha": SHIFT, "d_beta": SHIFT, "d_gamma": TURN, "d_f": SCALE}
-"""Parameter -> size of the motion that changes it.
+"""Sizes of the motions that test the formulas, in metres, radians, and as a fraction.
 
-The line CCD moves along X (d_alpha) and Y (d_beta), in metres, and rotates about Z (d_gamma), in radians; the camera
-scales (d_f), relative.
+They are shifts of the line CCD along X or Y, its rotation about Z, the expansion of the camera, the shift of the line
+CCD along Z, and the rotation of a reflecting face.
+"""
+AMOUNTS = {"d_alpha": SHIFT, "d_beta": SHIFT, "d_gamma": TURN, "d_f": SCALE}
+"""Parameter of a camera -> size of the motion that changes it in the simulated states.
+
+The line CCD moves along X (d_alpha) and Y (d_beta), in metres, and rotates about Z (d_gamma), in radians; the camera is
+scaled (d_f), relative.
 """
 SMALLEST = 0.5
-"""Smallest size of a random motion, as a share of its AMOUNTS."""
+"""Smallest size of a random motion, as a fraction of its value in AMOUNTS."""
 UNITS = np.array([ARCSEC, ARCSEC, ARCSEC, 1e-6])
-"""Units of the response matrix in SI: arcsec for the three angles, micrometres for d_f."""
+"""Units of the four camera parameters in SI: arcsec for the three angles, micrometres for d_f."""
 _FACTS: dict[str, Any] = {
     "frames": FRAMES,
     "instrument": INSTRUMENT,
@@ -84,7 +89,7 @@ def superposed(first: Value, second: Value) -> Value:
 
 
 def right_of_focal_length(left: Value) -> Value:
-    """Return Y of the right spot from that of the left one for a change of focal length, eq. (9).
+    """Return the displacement Y of the right spot from that of the left one for a focal length change, eq. (9).
 
     For a rotation of the line of sight about X both are equal.
     """
@@ -92,17 +97,17 @@ def right_of_focal_length(left: Value) -> Value:
 
 
 def parts_along(left: Value, right: Value) -> tuple[Value, Value]:
-    """Return the parts of the spots' Y due to the focal length and to the rotation about X, by eq. (10)."""
+    """Return the parts of the spots' displacement along the line due to focal length and rotation about X, eq. (10)."""
     return (left - right) / 2.0, (left + right) / 2.0
 
 
 def parts_across(left: Value, right: Value) -> tuple[Value, Value]:
-    """Return the parts of the spots' X due to the rotation about Y and to the roll, by eq. (11)."""
+    """Return the parts of the spots' displacement across the line due to rotation about Y and to roll, eq. (11)."""
     return (left + right) / 2.0, (left - right) / 2.0
 
 
 def focal_lengths(geometry: MonitorGeometry) -> tuple[float, float]:
-    """Focal lengths along and across the line, metres."""
+    """Return the focal lengths of a camera along and across the line, metres."""
     f = geometry.principal_distance_m
     return f, geometry.principal_distance_across_m or f
 
@@ -114,11 +119,11 @@ class Ratio:
     Attributes
     ----------
     value : float
-        Mean of the cameras.
+        Mean over the cameras.
     sigma : float
         Standard deviation of ``value``.
     cameras : Mapping[str, Measured]
-        Camera -> (value, sigma).
+        Camera -> (ratio, its sigma).
     """
 
     value: float
@@ -138,7 +143,7 @@ def quotient(above: Measured, below: Measured) -> Measured:
 
 
 class MonitorImages:
-    """Spots measured in nine rendered frames before and after every state, with the estimates by the formulas.
+    """Spots measured in nine rendered frames before and after every change, with the estimates by the formulas.
 
     Parameters
     ----------
@@ -147,7 +152,7 @@ class MonitorImages:
     experiment
         Monitoring experiment with the instrument.
     states
-        Name -> state; both cameras' bodies may move in it.
+        Name -> state after the change; the bodies of both cameras may move in it.
     """
 
     def __init__(self, context: Context, experiment: MonitorExperiment, states: Mapping[str, State]) -> None:
@@ -165,7 +170,10 @@ class MonitorImages:
         self.covariance = np.concatenate([p.shift_covariance for p in pieces])
 
     def geometry(self, camera: str) -> MonitorGeometry:
-        """Return the geometry of a camera that the formulas use."""
+        """Return a camera's geometry for the formulas of paper 001 (Wang et al. 2018).
+
+        It contains principal distance, field angles and distances.
+        """
         return self.experiment.calibration.cameras[camera].geometry
 
     @property
@@ -174,7 +182,12 @@ class MonitorImages:
         return self.geometry(self.cameras[0])
 
     def local(self, camera: str) -> float:
-        """Return the focal length along the line at its centre, where d_beta is defined, divided by the formulas' f."""
+        """Return a camera's focal length along the line at its centre, divided by the formulas' f.
+
+        d_beta is defined at the centre; the formulas use one focal length f for the whole line.
+
+        The formulas use one focal length f for the whole line.
+        """
         model = self.experiment.instrument.cameras[camera]
         return model.line_principal_distance / self.geometry(camera).principal_distance_m
 
@@ -188,7 +201,7 @@ class MonitorImages:
         return recovery.estimates(self.before, self.after, self.covariance, self.experiment.calibration.cameras)
 
     def reading(self, camera: str, motion: str, parameter: str) -> Measured:
-        """Return the estimate in one state by the printed formula for a single change, in SI units."""
+        """Return the estimate in one state by the paper's formula for a single change, and its sigma, SI units."""
         estimate = self.estimates().parameters[camera]["paper_single"]
         state, k = self.motions.index(motion), PARAMETERS.index(parameter)
         return float(estimate.vector[state, k]), float(estimate.sigma[state, k])
@@ -215,7 +228,7 @@ class MonitorImages:
         return Ratio(float(values.mean()), float(np.sqrt(np.sum(sigmas**2)) / len(values)), cameras)
 
     def over(self, motion: str, parameter: str, amount: float | None = None) -> Ratio:
-        """Return the estimate divided by the amount of the motion, by default by the traced change."""
+        """Return the estimate of a parameter divided by ``amount``, by default by the traced change."""
         return self.ratio(
             lambda camera: quotient(
                 self.reading(camera, motion, parameter),
@@ -225,7 +238,7 @@ class MonitorImages:
 
 
 class SingleMotions(MonitorImages):
-    """Images of the single motions for which the formulas were derived, made with both cameras at once."""
+    """Images of states with one of the motions for which the formulas were derived, made by both cameras at once."""
 
     def __init__(self, context: Context, experiment: MonitorExperiment) -> None:
         cameras = [f"{BASE}/{name}" for name in experiment.instrument.cameras]
@@ -246,9 +259,8 @@ class SingleMotions(MonitorImages):
     def needed_factor(self, parameter: str) -> Ratio:
         """Return the correct factor to use instead of cos² in eq. (2) or (3).
 
-        It is the true change times 2f over the mean spot shift.
-
-        Along the line f is the focal length at its centre, where d_beta is defined; across it, that of the formula.
+        It is the true change times 2 f divided by the mean spot shift. Along the line f is the focal length at its
+        centre, where d_beta is defined; across it, that of the formula.
         """
         motion = {"d_beta": "along Y", "d_alpha": "along X"}[parameter]
 
@@ -265,9 +277,10 @@ class SingleMotions(MonitorImages):
         return self.ratio(factor)
 
     def displacement(self, direction: str) -> Ratio:
-        """Return the rotation of a return face by eq. (1) over the true rotation, ``along`` or ``across`` the line.
+        """Return the rotation of a return face by eq. (1) divided by the true rotation.
 
-        Eq. (1) uses the mean displacement of the spots; f is the focal length in that direction.
+        ``direction`` is ``along`` or ``across`` the line. Eq. (1) uses the mean displacement of the spots, and the
+        focal length in that direction.
         """
 
         def turn(camera: str) -> Measured:
@@ -280,7 +293,10 @@ class SingleMotions(MonitorImages):
         return self.ratio(turn)
 
     def roll(self) -> Ratio:
-        """Return the spots' displacement across the line over that of the line CCD's ends, for a roll, eq. (4)."""
+        """Return the spots' displacement across the line divided by that of the line CCD's ends, eq. (4).
+
+        The camera has a roll.
+        """
 
         def moved(camera: str) -> Measured:
             left, right, sigma = self.spots(camera, "about Z", "X")
@@ -290,9 +306,9 @@ class SingleMotions(MonitorImages):
         return self.ratio(moved)
 
     def growth(self) -> Ratio:
-        """Return the mean spot displacement by eq. (6) over L Δf / f, that of eq. (7) with the traced change Δf.
+        """Return the mean spot displacement by eq. (6) divided by L Δf / f of eq. (7).
 
-        L is the position of the spot along the line.
+        Δf is the traced change of the focal length f, L the position of the spot along the line.
         """
 
         def moved(camera: str) -> Measured:
@@ -304,7 +320,7 @@ class SingleMotions(MonitorImages):
         return self.ratio(moved)
 
     def growth_by_side(self) -> float:
-        """Return the largest relative difference between one side's displacement and the mean of eq. (6)."""
+        """Return the largest relative difference of one side's spot displacement from the mean of eq. (6)."""
         worst = 0.0
         for camera in self.cameras:
             left, right, _ = self.spots(camera, "scale", "Y")
@@ -339,9 +355,9 @@ def _show_ratios(context: Context, name: str, ratios: Mapping[str, float]) -> No
 
 
 def mirror_turns(backend: Backend, turns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return rotation and displacement of a reflected ray for rotations of a mirror, in radians.
+    """Return rotation and displacement of a reflected ray for small rotations of a mirror, in radians.
 
-    The displacement is on a screen at unit distance.
+    The displacement is on a screen at unit distance. ``turns`` holds the rotations.
     """
     mirror = Element("mirror", "mirror", plane(), Interaction.REFLECT)
     assembly = Assembly(RigidTree((Body("mirror"),)), {"mirror": mirror}, {"path": ("mirror",)})
@@ -383,7 +399,7 @@ def single_images(context: Context) -> SingleMotions:
 
 
 def without_cos2(geometry: MonitorGeometry, local: float) -> float:
-    """Return the rotation about X by eq. (2) or Table 1 without cos²β, relative to the true rotation.
+    """Return the rotation about X by eq. (2) or Table 1 without the factor cos²β, over the true rotation.
 
     ``local`` is the focal length at the line's centre divided by f.
     """
@@ -391,7 +407,7 @@ def without_cos2(geometry: MonitorGeometry, local: float) -> float:
 
 
 def _singles(context: Context, images: SingleMotions, shown: dict[str, Ratio]) -> Iterator[CheckResult]:
-    """Check eqs. (1) to (7) for single changes; equations with the same content share a row."""
+    """Check eqs. (1) to (7) for single changes; equations with the same content share a check."""
 
     def row(identifier: str, ratio: Ratio, *explained: float | None, **facts: object) -> CheckResult:
         shown.setdefault(identifier, ratio)
@@ -429,7 +445,7 @@ def _singles(context: Context, images: SingleMotions, shown: dict[str, Ratio]) -
 
 
 def state_of(cameras: tuple[str, ...], shares: Mapping[str, np.ndarray]) -> State:
-    """Return the state in which each camera makes given shares of the four AMOUNTS, in the order of PARAMETERS."""
+    """Return the state in which each camera makes given fractions of the four AMOUNTS, in the order of PARAMETERS."""
     state: dict[str, Motion] = {}
     for camera in cameras:
         along_x, along_y, turn, growth = (
@@ -460,16 +476,20 @@ def states_of(cameras: tuple[str, ...], rounds: int, seed: int) -> dict[str, Sta
 
 
 class JointMotions(MonitorImages):
-    """Images of single and combined changes, and of ``rounds`` of 16 random mixtures."""
+    """Images of single and combined changes, and of random mixtures of all four changes.
+
+    There are ``rounds`` sets of 16 mixtures, one mixture for each combination of signs.
+    """
 
     def __init__(self, context: Context, experiment: MonitorExperiment, rounds: int) -> None:
         super().__init__(context, experiment, states_of(tuple(experiment.instrument.cameras), rounds, context.seed))
         self.mixtures = [k for k, name in enumerate(self.motions) if name.startswith("mixture")]
 
     def superposition(self, one: str, other: str, axis: str) -> Ratio:
-        """Return a spot's displacement by both changes over that of eq. (8) from the displacements by each.
+        """Return a spot's displacement due to two changes divided by the prediction of eq. (8).
 
-        For each camera it is that of the side farther from 1.
+        The prediction is from the displacements due to each change. Of a camera's two spots, the one farther from a
+        ratio of 1 counts.
         """
 
         def worse(camera: str) -> Measured:
@@ -482,7 +502,7 @@ class JointMotions(MonitorImages):
         return self.ratio(worse)
 
     def symmetry(self, motion: str, right_from_left: Callable[[float], float]) -> Ratio:
-        """Return the right spot's displacement along Y over its prediction from the left spot's displacement.
+        """Return the right spot's displacement along Y divided by its prediction from the left spot's displacement.
 
         ``right_from_left`` computes the prediction.
         """
@@ -494,7 +514,7 @@ class JointMotions(MonitorImages):
         return self.ratio(sides)
 
     def stray(self, motion: str, wrong: str, right: str) -> Ratio:
-        """Return the spots' common displacement along axis ``wrong`` over the size of that along axis ``right``.
+        """Return the spots' common displacement along axis ``wrong`` divided by the size of that along axis ``right``.
 
         The motion should move the spots along ``right`` only.
         """
@@ -509,9 +529,10 @@ class JointMotions(MonitorImages):
     def separated(
         self, single: str, axis: str, part: int, parts: Callable[[float, float], tuple[float, float]]
     ) -> Ratio:
-        """Return the part that a formula separates from all four changes, relative to that of the single change.
+        """Return the part of the displacement that a formula separates, divided by that due to the single change.
 
-        The displacement is the mean size over the spots, with the sign of the left spot.
+        The part is separated from a displacement due to all four changes. The displacement is the mean size over the
+        spots, with the sign of the left spot.
         """
 
         def share(camera: str) -> Measured:
@@ -526,13 +547,13 @@ class JointMotions(MonitorImages):
     def response(self, estimator: str) -> tuple[np.ndarray, np.ndarray]:
         """Return the response of an estimator to true changes when all four change at once, and its sigma.
 
-        It is a least-squares fit of the readings of the mixtures to the traced changes and a constant, as a mean of the
-        cameras.
+        It is a least-squares fit of the estimates in the mixtures to the traced changes and a constant, as a mean of
+        the cameras.
 
         Returns
         -------
         tuple of (4, 4) ndarray
-            Readings by changes, in the order of PARAMETERS, in arcsec and micrometres; and sigma.
+            Response, estimates by changes, in the order of PARAMETERS, in arcsec and micrometres; and its sigma.
         """
         parameters = self.estimates().parameters
         matrices, variances = [], []
@@ -549,9 +570,9 @@ class JointMotions(MonitorImages):
         return np.mean(matrices, axis=0), sigma
 
     def angle(self, estimator: str) -> tuple[float, float, float]:
-        """Return the slope of measured over traced change of the intersection angle, its sigma, and the rms residual.
+        """Return the slope of the measured against the traced change of the intersection angle, with two accuracies.
 
-        The slope is over all mixtures; the residual is in radians.
+        They are the slope's sigma and the rms residual, in radians. The slope is over all mixtures.
         """
         estimate = self.estimates().angle[estimator]
         true, read = self.truth.angle_change[self.mixtures], estimate.change_rad[self.mixtures]
@@ -591,7 +612,7 @@ def run_joint(context: Context) -> Iterator[CheckResult]:
 
 
 def _table_1(context: Context, images: JointMotions) -> Iterator[CheckResult]:
-    """Check the diagonal of Table 1 and its two couplings that are not zero."""
+    """Check the diagonal elements of Table 1 and its two off-diagonal ones that are not zero."""
     matrix, sigma = images.response("paper_joint")
     right, _ = images.response("derived")
     g, (f, f_x) = images.first, focal_lengths(images.first)

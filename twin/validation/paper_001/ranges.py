@@ -1,7 +1,7 @@
-"""Ranges of validity of the formulas of paper 001.
+"""Ranges of validity of the formulas of paper 001 (Wang et al. 2018).
 
-Estimates from noise-free images are followed along single and joint changes, under defocus, and for other pupil
-offsets, fields and kinds of return reflector, up to where their errors exceed a tolerance.
+The errors of estimates from noise-free images are computed for increasing single and joint changes, under defocus, and
+for other pupil offsets, fields and kinds of return reflector, up to where they exceed a tolerance.
 """
 
 from __future__ import annotations
@@ -41,17 +41,21 @@ PRINTED, JOINT, CORRECTED, CALIBRATED = "printed", "Table 1", "corrected", "cali
 FORMS = (PRINTED, JOINT, CORRECTED, CALIBRATED)
 """Names of the four sets of formulas that are compared.
 
-They are eqs. (2), (3), (5), (7) with the arctangent; Table 1's joint forms; the same with f_x for d_alpha, half of
-d_gamma times f/f_x, no cos^2, and (7); those with the two calibrated gradients over the field as well. f and f_x are
-the focal lengths along and across the line.
+They are eqs. (2), (3), (5), (7) with the arctangent; Table 1's joint forms; the joint forms corrected: with f_x for
+d_alpha, half of d_gamma times f/f_x, no cos^2, and (7) for d_f; and the corrected forms with the two calibrated
+gradients over the field as well. f and f_x are the focal lengths along and across the line.
 """
 SHARE = 24
 """Number of images of 96 x 96 pixels that are rendered at once, to limit memory."""
 ROUNDS, NEAR = 3, 1e-3
-"""Refinement steps at most; and how near a point to a limit, relative to the size, makes another one needless."""
+"""Refinement of the crossings of an error curve with its limit.
+
+The first is the largest number of refinement steps; the second the relative distance in size within which an existing
+point makes another one unnecessary.
+"""
 
 Sample = Callable[[np.ndarray], Mapping[str, np.ndarray]]
-"""Function from N sizes of a change, (N,), to name -> (N,) errors as shares of the allowed one.
+"""Function from N sizes of a change, (N,), to name -> (N,) errors divided by the allowed error.
 
 The values are not negative; at 1 the limit is reached.
 """
@@ -65,10 +69,10 @@ class Bench:
     experiment
         Monitoring experiment with the instrument.
     like
-        Another bench with the same cameras whose geometry is used.
+        Another bench with the same cameras, whose geometry is used.
     shapes
-        True to use its spot shapes as well; needed for larger CCDs, of which only a window around each spot is read
-        out, as large as the CCDs of ``like``.
+        True to use the spot shapes of ``like`` as well; needed for larger CCDs, of which only a window around each spot
+        is read out, as large as the CCDs of ``like``.
     """
 
     def __init__(self, experiment: MonitorExperiment, like: Bench | None = None, shapes: bool = False) -> None:
@@ -81,7 +85,10 @@ class Bench:
         self.frames = experiment.instrument.spec.autocollimator.frames
 
     def geometry(self, camera: str) -> MonitorGeometry:
-        """Return the geometry of a camera that the formulas use."""
+        """Return a camera's geometry for the formulas of paper 001 (Wang et al. 2018).
+
+        It contains principal distance, field angles and distances.
+        """
         if camera not in self._geometry:
             self._geometry[camera] = self.experiment.geometry(camera)
         return self._geometry[camera]
@@ -108,9 +115,9 @@ class Bench:
         return out
 
     def traced(self, states: Sequence[State]) -> np.ndarray:
-        """Return the means of the traced rays over the return face, also for spots outside the CCD.
+        """Return the mean of each spot's traced rays, also for spots outside the CCD.
 
-        They are (S, C, 2) (row, column) for S states and C channels, in pixels from the CCD's middle.
+        The positions are (S, C, 2) (row, column) for S states and C channels, in pixels from the CCD's middle.
 
         Raises
         ------
@@ -128,9 +135,10 @@ class Bench:
         return np.moveaxis(known.centre, 0, 1)
 
     def readings(self, start: np.ndarray, end: np.ndarray) -> dict[str, dict[str, np.ndarray]]:
-        """Return camera -> set of formulas -> (S, 4) estimated changes for S states, from spot positions (S, C, 2).
+        """Return camera -> set of formulas -> estimated changes in S states, (S, 4), in arcsec and um.
 
-        The units are those of ``monitoring.PARAMETERS``; C is the number of channels.
+        The estimates of the four parameters are computed from spot positions before and after the change, (S, C, 2) for
+        C channels.
         """
         start = np.broadcast_to(start, end.shape)
         nothing = np.zeros((4, 4))
@@ -150,7 +158,7 @@ class Bench:
         return out
 
     def truth(self, states: Sequence[State]) -> dict[str, np.ndarray]:
-        """Return camera -> (S, 4) traced changes of S states in the units of ``monitoring.PARAMETERS``."""
+        """Return camera -> traced changes of its four parameters in S states, (S, 4), in arcsec and um."""
         changes = self.experiment.sight.truth(states)
         return {
             name: np.stack([c.d_alpha, c.d_beta, c.d_gamma, c.d_f], axis=-1) * PER_SI
@@ -174,28 +182,31 @@ def _windows(images: np.ndarray, shape: tuple[int, int]) -> tuple[np.ndarray, np
 
 @dataclass(frozen=True, eq=False)
 class Curves:
-    """Errors over the size of a change.
+    """Errors as functions of the size of a change.
 
     Attributes
     ----------
     size : np.ndarray
         The N sizes, (N,), ascending, > 0.
     value : Mapping[str, np.ndarray]
-        Name -> (N,) errors as shares of what is allowed.
+        Name -> (N,) errors divided by the allowed error.
     """
 
     size: np.ndarray
     value: Mapping[str, np.ndarray]
 
     def bracket(self, name: str) -> int | None:
-        """Return the index of the first size at which the limit is exceeded, None if it never is."""
+        """Return the index of the first size at which the limit is exceeded, None if it never is.
+
+        The limit is a value of 1.
+        """
         beyond = np.flatnonzero(self.value[name] > 1.0)
         return int(beyond[0]) if len(beyond) else None
 
     def crossing(self, name: str) -> float | None:
-        """Return the size at which the limit is first exceeded, interpolated on logarithmic axes.
+        """Return the size at which the limit (a value of 1) is first exceeded, interpolated on logarithmic axes.
 
-        None if it never is, 0 if it is exceeded at the smallest size already.
+        It is None if the limit is never exceeded, 0 if it is exceeded at the smallest size already.
         """
         k = self.bracket(name)
         if k is None:
@@ -207,7 +218,7 @@ class Curves:
         return math.exp(low - start * (high - low) / (end - start))
 
     def merged(self, size: np.ndarray, value: Mapping[str, np.ndarray]) -> Curves:
-        """Return the curves with further points, sorted by size."""
+        """Return the error curves with further points added, sorted by the size of the change."""
         sizes = np.concatenate([self.size, size])
         order = np.argsort(sizes)
         return Curves(sizes[order], {n: np.concatenate([v, value[n]])[order] for n, v in self.value.items()})
@@ -215,12 +226,14 @@ class Curves:
 
 @dataclass(frozen=True, eq=False)
 class Domain:
-    """Domain of validity: errors from rendered images as far as possible, then traced until the beam is lost.
+    """Range of sizes of a change over which formulas are valid, from images and, for larger sizes, from ray traces.
+
+    The traces go on until the beam is lost.
 
     Attributes
     ----------
     images, traced : Curves
-        Curves over the size; both have the same names.
+        Errors over the size; both have the same names.
     lost : float
         Size beyond which the beam is lost or not followed.
     lost_why : str
@@ -233,7 +246,10 @@ class Domain:
     lost_why: str
 
     def limit(self, name: str) -> tuple[float, str]:
-        """Return the largest size within a limit, and its source: "images", "trace" or why there is no limit."""
+        """Return the largest size with an error within its limit, and the source of this size as text.
+
+        The source is "images", "trace", or the reason why there is no limit.
+        """
         for curves, whence in ((self.images, "images"), (self.traced, "trace")):
             crossing = curves.crossing(name)
             if crossing is not None:
@@ -242,12 +258,12 @@ class Domain:
 
 
 def sampled(sample: Sample, sizes: Sequence[float], names: Sequence[str] | None = None) -> Curves:
-    """Sample curves at given sizes, and add points where they cross the limit.
+    """Evaluate error curves at given sizes of a change, and add points where they cross the limit.
 
     Parameters
     ----------
     sample : Sample
-        Function that is sampled.
+        Function that computes the errors.
     sizes : sequence of float
         Initial sizes, ascending.
     names : sequence of str or None
@@ -276,13 +292,13 @@ CLAIMED = {
     "d_gamma": _TABLE.number("table5.d_gamma_arcsec"),
     "d_f": 1e3 * _TABLE.number("table5.d_f_mm"),
 }
-"""Parameter -> error claimed by section 3.3 and Table 5, in arcsec and um."""
+"""Parameter -> error that section 3.3 and Table 5 of the paper claim, in arcsec and um."""
 FINE = {"d_alpha": 0.1, "d_beta": 0.1, "d_gamma": 0.1, "d_f": 40.0}
 """Parameter -> tighter tolerance: 0.1 arcsec for all angles, and Table 5's 0.04 mm for d_f."""
 RELATIVE = 0.01
 WINDOW, CUT = "leaves the area CCD", "an aperture cuts the beam"
 EDGE_PX = 11.0
-"""Smallest distance of a spot from the outermost pixel centres, pixels.
+"""Smallest allowed distance of a spot from the outermost pixel centres, pixels.
 
 Half a pixel nearer, the fit's template ends on one side; one pixel nearer, the centroid refuses the spot.
 """
@@ -290,7 +306,7 @@ WIDE_PX = 384
 """Rows and columns of the larger CCD with which errors are followed beyond the edge of the instrument's own CCD."""
 _START = {"d_alpha": 0.02, "d_beta": 0.02, "d_gamma": 0.02, "d_f": 8.0}
 _FAR = {"d_alpha": 3600.0, "d_beta": 3600.0, "d_gamma": 36000.0, "d_f": 600e3}
-"""Parameter -> largest change up to which the trace follows it, table units."""
+"""Parameter -> largest change that the ray trace is extended to, in arcsec and um."""
 _WIDE_SHARE = 0.76
 _Raw = dict[str, list[np.ndarray]]
 KINDS = ("1 %", "fine", "claimed")
@@ -306,16 +322,18 @@ _FAR_BOX = 200.0
 
 @dataclass(frozen=True, eq=False)
 class Range(Domain):
-    """Range of one parameter changed in one direction; sizes are true changes in table units.
+    """Range of validity of the formulas for one parameter changed in one direction.
 
-    The names of the curves are those of ``criterion`` and WINDOW.
+    The size of a change is its true value in arcsec (angles) or um (principal distance). There is an error curve for
+    each set of formulas and kind of limit (``criterion``), and one for the distance of the spots from the edge of the
+    area CCD (WINDOW).
 
     Attributes
     ----------
     parameter : str
         One of NAMES.
     sign : int
-        +1 or -1.
+        Sign of the change, +1 or -1.
     raw : mapping of str to ndarray
         Set of formulas -> N pairs of true change and error from images, (N, 2), for the figure.
     raw_traced : mapping of str to ndarray
@@ -332,17 +350,20 @@ class Range(Domain):
 
     @property
     def window(self) -> float:
-        """True change at which the first spot comes too near the area CCD's edge, table units."""
+        """True change at which the first spot comes too near the area CCD's edge, in arcsec or um."""
         return self.limit(WINDOW)[0]
 
 
 def criterion(form: str, kind: str) -> str:
-    """Return the name of the error of a set of formulas as a share of "1 %", "0.1" or "claimed"."""
+    """Return the name of the error curve of a set of formulas for one kind of limit: "1 %", "0.1" or "claimed".
+
+    The error is divided by that limit.
+    """
     return f"{form} {kind}"
 
 
 def motion_of(camera: str, parameter: str, geometry: MonitorGeometry) -> tuple[ElementaryMotion, float]:
-    """Return the single motion of a parameter, and its amount (SI) for one table unit of change."""
+    """Return the motion that changes one parameter alone, and its amount (SI units) per arcsec or um of change."""
     k = NAMES.index(parameter)
     f, f_x = focal_lengths(geometry)
     amount = (-f_x * ARCSEC, f * ARCSEC, ARCSEC * f_x / f, 1e-6 / f)[k]
@@ -350,7 +371,7 @@ def motion_of(camera: str, parameter: str, geometry: MonitorGeometry) -> tuple[E
 
 
 def single_range(bench: Bench, wide: Bench, parameter: str, sign: int, count: int) -> Range:
-    """Follow one parameter in one direction, up to where the beam is lost.
+    """Compute errors for increasing changes of one parameter in one direction, up to where the beam is lost.
 
     Parameters
     ----------
@@ -424,7 +445,7 @@ def single_range(bench: Bench, wide: Bench, parameter: str, sign: int, count: in
 
 
 def _joined(parts: Mapping[str, list[np.ndarray]]) -> dict[str, np.ndarray]:
-    """Return set of formulas -> N pairs of true change and error, (N, 2), ascending in the change."""
+    """Return set of formulas -> N pairs of true change and error, (N, 2), in ascending order of the change."""
     out = {}
     for form, pieces in parts.items():
         joined = np.concatenate(pieces)
@@ -433,7 +454,10 @@ def _joined(parts: Mapping[str, list[np.ndarray]]) -> dict[str, np.ndarray]:
 
 
 def beam_end(bench: Bench, states: Callable[[np.ndarray], list[State]], start: float, far: float) -> tuple[float, str]:
-    """Return the largest size with whole beams, from ``start`` up to ``far``, to 1 %, and the reason of the limit."""
+    """Return the largest size of a change at which no part of a beam is lost, to 1 %, and the reason of the limit.
+
+    The size is searched between ``start`` and ``far``.
+    """
 
     def fault(size: float) -> str:
         try:
@@ -456,7 +480,7 @@ def beam_end(bench: Bench, states: Callable[[np.ndarray], list[State]], start: f
 
 
 def joint_states(bench: Bench, changes: Mapping[str, np.ndarray]) -> list[State]:
-    """Return S states in which every camera has given changes, (S, 4), in table units, as exactly as motions can."""
+    """Return S states in which every camera has given changes, (S, 4), in arcsec and um, to the motions' accuracy."""
     states: list[dict[str, Motion]] = [{} for _ in next(iter(changes.values()))]
     for camera, wanted in changes.items():
         units = [motion_of(camera, name, bench.geometry(camera))[1] for name in NAMES]
@@ -468,25 +492,28 @@ def joint_states(bench: Bench, changes: Mapping[str, np.ndarray]) -> list[State]
 
 @dataclass(frozen=True, eq=False)
 class Corners(Domain):
-    """Largest errors at the 16 corners of the box of joint changes, over the size as a share of the box.
+    """Largest errors at the 16 corners of the box of joint changes, for boxes of increasing size.
 
-    The names of the curves consist of set of formulas and parameter; the values are the largest error of all corners
-    and cameras as a share of what is claimed.
+    The size is a fraction of the full box. The names of the curves consist of set of formulas and parameter; the values
+    are the largest error of all corners and cameras divided by the error that the paper claims.
     """
 
     def text(self, name: str) -> str:
-        """Return the limit of an error, as a share of the box, as text."""
+        """Return the size of the box at which an error reaches its limit, as a fraction of the full box, as text."""
         share, whence = self.limit(name)
         return f"{share:.3g}" + (" (beam cut)" if whence == self.lost_why else "")
 
 
 def key(form: str, parameter: str, fine: bool = False) -> str:
-    """Return the name of an error as a share of what Table 5 claims or, if ``fine``, of 0.1 arcsec and 0.04 mm."""
+    """Return the name of the error curve of a set of formulas and a parameter.
+
+    The error is divided by what Table 5 claims or, if ``fine``, by 0.1 arcsec or 0.04 mm.
+    """
     return f"{form} {parameter}{' fine' if fine else ''}"
 
 
 def corners(bench: Bench, count: int) -> Corners:
-    """Follow the errors at the corners of the box, from a thousandth of its size until beams are vignetted."""
+    """Compute the errors at the corners of boxes, from a thousandth of the full size until beams are vignetted."""
     origin, traced_origin = bench.positions([{}]), bench.traced([{}])
 
     def states(share: np.ndarray) -> list[State]:
@@ -526,7 +553,7 @@ class Separation:
     sigma : Mapping[str, Mapping[str, np.ndarray]]
         Standard deviations of ``gain``.
     scatter : Mapping[str, np.ndarray]
-        Set of formulas -> (4,) rms residual of the regression, table units, all cameras.
+        Set of formulas -> (4,) rms residual of the regression over all cameras, in arcsec and um.
     trials : int
         Number of states.
     """
@@ -537,7 +564,10 @@ class Separation:
     trials: int
 
     def mean(self, form: str, read: str, changed: str) -> tuple[float, float]:
-        """Return the regression coefficient of one parameter on another, mean of the cameras, and its sigma."""
+        """Return the change of one estimated parameter per unit of true change of another, and its sigma.
+
+        It is the regression coefficient for a set of formulas, averaged over the cameras.
+        """
         p, q = NAMES.index(read), NAMES.index(changed)
         values = [self.gain[form][c][p, q] for c in self.gain[form]]
         sigmas = [self.sigma[form][c][p, q] for c in self.sigma[form]]
@@ -582,7 +612,7 @@ RETURNS: Mapping[str, tuple[tuple[float, float] | None, str]] = {
     "roof along": ((0.0, 3e-3), "the ridge lies along the line; the area CCD stands beside its pinhole along the line"),
     "corner": ((0.0, 0.0), "the spot falls on its own pinhole: the area CCD must see it through a beam splitter"),
 }
-"""Kind of return reflector -> position of the area CCD and a remark.
+"""Kind of return reflector -> position of the area CCD for it, and a remark.
 
 The kinds are a mirror facet; a roof whose ridge lies across the line, or along it; a corner cube. The position is
 relative to the pinhole, in metres; None if the one in the instrument's file can be used.
@@ -590,9 +620,9 @@ relative to the pinhole, in metres; None if the one in the instrument's file can
 SHIFT = 60e-6
 """Shift of the line CCD for the comparison of return reflectors, metres."""
 CONFOCAL = load_printed("004").number("alignment.confocal_mm") / 1e3
-"""Accuracy with which paper 004 sets the line CCD to the focus, metres."""
+"""Accuracy with which paper 004 (Li et al. 2020) sets the line CCD to the focus, metres."""
 SMALL = {"d_alpha": 2.0, "d_beta": 2.0, "d_gamma": 40.0, "d_f": 1500.0}
-"""Parameter -> single change for the comparison of defocused cameras and other fields, table units.
+"""Parameter -> single change for the comparison of defocused cameras and other fields, in arcsec and um.
 
 The spots move by a third of the area CCD.
 """
@@ -607,12 +637,12 @@ def variant(
     field: float | None = None,
     ccd_offset: tuple[float, float] | None = None,
 ) -> MonitorExperiment:
-    """Build the experiment anew with one camera of an instrument, changed.
+    """Return a new experiment with one camera of an instrument, in which the given properties are changed.
 
     Parameters
     ----------
     resolved : ResolvedJob
-        Instrument as its file gives it.
+        Instrument as specified in its file.
     backend : Backend
         Backend of the ray trace.
     camera : str
@@ -676,7 +706,7 @@ def with_return(experiment: MonitorExperiment, kind: str) -> MonitorExperiment:
 
 
 def _returning(instrument: Instrument, kind: str) -> Assembly:
-    """Return the assembly with mutually perpendicular mirrors behind every facet's opening."""
+    """Return the instrument's assembly with mutually perpendicular mirrors behind the opening of every return facet."""
     old = instrument.assembly
     bodies, elements, sequences = list(old.tree.bodies), dict(old.elements), dict(old.sequences)
     for channel in instrument.channels:
@@ -712,9 +742,9 @@ class Response:
     kind : str
         One of RETURNS.
     across, along : (2,) ndarray
-        Motion of the spots (left, right) over the motion of the line CCD across and along the line.
+        Motion of the spots (left, right) divided by the motion of the line CCD, across and along the line.
     gain : (4,) ndarray
-        Corrected estimate over truth for single changes.
+        Estimate by the corrected formulas divided by the true change, for single changes of the four parameters.
     """
 
     kind: str
@@ -753,9 +783,11 @@ def piston(camera: str, amount: float, *, along: tuple[float, float] = (0.0, 0.0
 
 
 def false_slopes(bench: Bench, form: str, pistons: Sequence[float]) -> np.ndarray:
-    """Return the false change per metre of piston between before and after, (4,), table units per metre.
+    """Return the false change of each parameter per metre of piston of the line CCD, (4,).
 
-    It is the estimate minus the truth, from rendered images.
+    The unit is arcsec or um per metre.
+
+    It is the estimate minus the true change, from rendered images before and after the piston.
     """
     camera = bench.cameras[0]
     states = [piston(camera, z) for z in pistons]
@@ -767,18 +799,20 @@ def false_slopes(bench: Bench, form: str, pistons: Sequence[float]) -> np.ndarra
 
 @dataclass(frozen=True, eq=False)
 class PupilStudy:
-    """False changes due to piston, over the position of the monitor's sub-aperture in the pupil.
+    """False changes due to piston of the line CCD, over the position of the monitor's sub-aperture in the pupil.
+
+    A false change is an estimate minus the true change, in arcsec or um.
 
     Attributes
     ----------
     offset : np.ndarray
         (N, 2) X and Y of the N sub-apertures, metres.
     slope : np.ndarray
-        (N, 4) false change of each parameter per metre of piston, table units, corrected form.
+        (N, 4) false change of each parameter per metre of piston, by the corrected formulas.
     gradient : np.ndarray
-        (4, 2) change of the slope with X and Y, table units per m^2.
+        (4, 2) derivatives of the slope with respect to X and Y, arcsec or um per m^2.
     rest : np.ndarray
-        (4,) rms of the slopes about that plane, table units per metre.
+        (4,) rms of the slopes about that plane, arcsec or um per metre.
     """
 
     offset: np.ndarray
@@ -790,7 +824,10 @@ class PupilStudy:
 def pupil_study(
     resolved: ResolvedJob, backend: Backend, like: Bench, offsets: Sequence[tuple[float, float]], depth: float
 ) -> PupilStudy:
-    """Return the false changes due to piston, with the instrument built anew for each position of the sub-aperture."""
+    """Return the false changes due to piston for several positions of the monitor's sub-aperture.
+
+    The instrument is built again for each position.
+    """
     slopes = []
     for offset in offsets:
         bench = Bench(variant(resolved, backend, like.cameras[0], pupil_offset=offset), like)
@@ -803,9 +840,9 @@ def pupil_study(
 
 
 def piston_curves(bench: Bench, count: int) -> Curves:
-    """Return the false changes by the corrected form over the piston, in metres, as shares of FINE and CLAIMED.
+    """Return the false changes by the corrected formulas over the piston (m), divided by FINE and by CLAIMED.
 
-    They are those of the worse of the two directions.
+    Of the two directions of the piston, the one with the larger error counts.
     """
     camera, origin = bench.cameras[0], bench.positions([{}])
 
@@ -823,7 +860,7 @@ def piston_curves(bench: Bench, count: int) -> Curves:
 
 
 def gains(bench: Bench, constant: float = 0.0) -> dict[str, np.ndarray]:
-    """Return set of formulas -> (4,) estimate over truth of the SMALL single changes.
+    """Return set of formulas -> estimate divided by true change, (4,), for the four single changes SMALL.
 
     The same piston, ``constant`` metres, is present before and after.
     """
@@ -856,9 +893,9 @@ class FieldPoint:
     separation : float
         Distance between the area CCDs, metres.
     gains : dict[str, np.ndarray]
-        Set of formulas -> (4,) estimate over truth.
+        Set of formulas -> (4,) estimate divided by true change.
     slope : np.ndarray
-        (4,) false change per metre of piston, corrected form, table units.
+        (4,) false change per metre of piston by the corrected formulas, in arcsec or um.
     """
 
     field: float
@@ -870,7 +907,10 @@ class FieldPoint:
 def field_study(
     resolved: ResolvedJob, backend: Backend, camera: str, fields: Sequence[float], depth: float
 ) -> list[FieldPoint]:
-    """Return the formulas' accuracy with the instrument built anew for area CCDs at each field angle, radians."""
+    """Return the accuracy of the formulas for area CCDs at several field angles, radians.
+
+    The instrument is built again for each field angle.
+    """
     out = []
     for field in fields:
         bench = Bench(variant(resolved, backend, camera, field=field))

@@ -1,4 +1,4 @@
-"""Checks of the ranges of validity of paper 001's formulas, with their figures, tables and data."""
+"""Checks of the validity ranges of the formulas of paper 001 (Wang et al. 2018), with figures, tables and data."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from twin.validation.paper_001.formulas import PARAMETERS as NAMES
 from twin.validation.paper_001.ranges import CALIBRATED, CLAIMED, CORRECTED, FINE, FORMS, JOINT, PRINTED
 
 OTHER = "gf7_pair"
-"""Name of an instrument whose focal length differs from that which Table 5 implies; it is used in full runs."""
+"""Name of an instrument whose focal length differs from that implied by Table 5; it is used in full runs only."""
 FIELDS = (1.0, 1.5, 2.0, 2.4, 2.72, 2.8)
 """Field angles of the area CCDs, degrees; at smaller ones the left and right prisms overlap."""
 OFFSETS_X = (-0.28, -0.24, -0.12, 0.0, 0.12, 0.24, 0.28)
@@ -40,12 +40,12 @@ Data = dict[str, Any]
 
 
 def _shown(name: str) -> tuple[float, str, str]:
-    """Return factor from table units, unit and name with which sizes of a parameter are shown."""
+    """Return factor, unit and name with which changes of a parameter (arcsec or um) are shown."""
     return (1e-3, "mm", " mm") if name == "d_f" else (1.0, "arcsec", "″")
 
 
 def _size(value: float, name: str) -> str:
-    """Return a size in table units as text, with four digits and no exponent."""
+    """Return a change in arcsec or um as text, with four digits and no exponent."""
     per, _, unit = _shown(name)
     value *= per
     return (f"{value:.4g}" if value < 1e4 else f"{value:.0f}") + unit
@@ -102,12 +102,12 @@ def _singles(context: Context, resolved: ResolvedJob, bench: ranges.Bench, data:
 
 
 def limit_of(both: Sequence[ranges.Range], form: str, kind: str) -> tuple[float, str]:
-    """Return the limit in the worse of the two directions, table units, and its source or what ends it, as text."""
+    """Return the smaller limit of the two directions, in arcsec or um, and its source or what ends it, as text."""
     return min(r.limit(ranges.criterion(form, kind)) for r in both)
 
 
 def limit_text(both: Sequence[ranges.Range], form: str, kind: str) -> str:
-    """Return the limit of a set of formulas in the worse of the two directions, with its source, as text."""
+    """Return the smaller limit of the two directions for a set of formulas, with its source, as text."""
     size, whence = limit_of(both, form, kind)
     if size == 0.0:
         return "nowhere"
@@ -116,7 +116,7 @@ def limit_text(both: Sequence[ranges.Range], form: str, kind: str) -> str:
 
 
 def _range(context: Context, identifier: str, both: list[ranges.Range], geometry: MonitorGeometry) -> CheckResult:
-    """Check the range of the printed formula of one parameter."""
+    """Check the range of validity of the paper's formula for one parameter."""
     name = both[0].parameter
     per, _, unit = _shown(name)
     limit, whence = limit_of(both, PRINTED, "claimed")
@@ -207,7 +207,10 @@ def _joint(context: Context, data: Data) -> Iterator[CheckResult]:
 
 
 def _box_limits(geometry: MonitorGeometry) -> dict[str, list[float]]:
-    """Return the box in which Table 1 stays within the claims, to first order, from the factors that it lacks."""
+    """Return the box of joint changes in which Table 1 keeps the claimed accuracy, to first order.
+
+    It follows from the factors that the formulas of Table 1 lack.
+    """
     f, f_x = focal_lengths(geometry)
     anamorphism = f_x / f
     alpha, beta, gamma, d_f = ranges.BOX
@@ -294,7 +297,7 @@ def _returns(context: Context, resolved: ResolvedJob, bench: ranges.Bench, data:
 
 
 def _four(value: float) -> str:
-    """Return a number with four decimals as text, without a minus sign before zero."""
+    """Return a number as text with four decimals, without a minus sign before zero."""
     return f"{round(float(value), 4) + 0.0:.4f}"
 
 
@@ -302,7 +305,7 @@ def _four(value: float) -> str:
 
 
 def _thinned(points: np.ndarray) -> np.ndarray:
-    """Remove those of N points, (N, 2), that nearly coincide with the previous one."""
+    """Return N points, (N, 2), without those that nearly coincide with the previous one."""
     indices = [0]
     for i in range(1, len(points)):
         if points[i, 0] > 1.25 * points[indices[-1], 0]:
@@ -345,7 +348,10 @@ def singles_svg(figure: Figure, reference_ranges: Mapping[str, Sequence[ranges.R
 
 @drawing("ranges-001-joint", 6.2)
 def joint_svg(figure: Figure, corners: ranges.Corners) -> None:
-    """Draw a panel per parameter: the largest error at a corner as a share of the claim, over the share of the box."""
+    """Draw a panel per parameter: the largest error at a corner over the size of the box.
+
+    The error is divided by the one that the paper claims.
+    """
     panels = figure.subplots(2, 2, sharex=True).ravel()
     for axes, name in zip(panels, _ORDER, strict=True):
         axes.axhline(1.0, color=INK, lw=1.0, ls=":")
@@ -367,7 +373,7 @@ def joint_svg(figure: Figure, corners: ranges.Corners) -> None:
 
 @drawing("ranges-001-defocus", 3.9)
 def defocus_svg(figure: Figure, pupil: ranges.PupilStudy, curves: ranges.Curves, focal: tuple[float, float]) -> None:
-    """Draw false changes per metre of piston over the pupil, and false changes over the piston."""
+    """Draw the false changes due to piston of the line CCD: per metre over the pupil, and over the piston."""
     left, right = figure.subplots(1, 2)
     grid = np.array([-0.3, 0.3])
     for axis, name, length, sign in ((0, "d_alpha", focal[0], -1.0), (1, "d_beta", focal[1], 1.0)):
@@ -427,9 +433,9 @@ def _show_causes(
     local: float,
     data: Data,
 ) -> None:
-    """Add the limits of every single formula to the report.
+    """Add the limits of every single formula, and their causes, to the report.
 
-    The local focal length is along the line at its centre, metres.
+    ``local`` is the focal length along the line at its centre, metres.
     """
     f, f_x = focal_lengths(geometry)
     cos2 = math.cos(geometry.field_beta_rad) ** 2
@@ -461,7 +467,7 @@ def _show_causes(
 def _show_singles(
     context: Context, ranges_by_instrument: Mapping[str, Mapping[str, list[ranges.Range]]], data: Data
 ) -> None:
-    """Add the domains of validity of every single formula to the report."""
+    """Add the ranges of validity of every single formula to the report."""
     rows: list[list[Cell]] = []
     listed: dict[str, dict[str, Any]] = {instrument: {} for instrument in ranges_by_instrument}
     for instrument, name in ((instrument, name) for instrument in ranges_by_instrument for name in NAMES):
@@ -519,7 +525,8 @@ def _show_defocus(
 ) -> None:
     """Add the false changes due to defocus to the report.
 
-    ``change`` is that of the gain; the focal lengths are across and along the line, in metres.
+    ``change`` is the change of the ratio of estimate to true change; the focal lengths are across and along the line,
+    in metres.
     """
     theory = {name: 1.0 / f**2 / ARCSEC for name, f in zip(("d_alpha", "d_beta"), focal, strict=True)}
     rows: list[list[Cell]] = []

@@ -1,12 +1,15 @@
-"""Checks of paper 001's principle experiment (section 3.1), Table 2: two autocollimators, two mirrors on a turntable.
+"""Checks of Table 2 of paper 001 (Wang et al. 2018), its principle experiment (section 3.1).
+
+The experiment has two autocollimators and two mirrors on a turntable.
 
 The rotation "about Z" has to be interpreted. X is up and Y horizontal, so Z is the view of autocollimator 1, along the
 normal of mirror 1: autocollimator 1 cannot observe a rotation about it, and reads its own noise. Mirror 2 rotates about
-Z1 = Y2 sin b + Z2 cos b, with the angle b between the mirrors' normals; of a rotation d_gamma its autocollimator
-observes d_gamma sin b, about Y2. The printed column of mirror 1 grows by 0.8657 of the table's angle and not by 1 or 0:
-it is d_gamma sin 60 deg, and times 2/sqrt(3) it is the column of mirror 2 in all digits. It is therefore the unscaled
-reading of autocollimator 2. A stand with both mirrors at an angle theta = b/2 from Z would read d_gamma sin(theta) =
-0.5 d_gamma on both, and a rotation about the vertical d_gamma; neither is printed.
+Z1 = Y2 sin b + Z2 cos b, with the angle b between the mirrors' normals (indices 1 and 2 name the autocollimators); of a
+rotation d_gamma its autocollimator observes d_gamma sin b, about Y2. The printed column of mirror 1 grows by 0.8657 of
+the table's angle and not by 1 or 0: it is d_gamma sin 60 deg, and times 2/sqrt(3) it is the column of mirror 2 in all
+digits. It is therefore the unscaled reading of autocollimator 2. An arrangement with both mirrors at an angle theta =
+b/2 from Z would read d_gamma sin(theta) = 0.5 d_gamma on both, and a rotation about the vertical d_gamma; neither is
+printed.
 """
 
 from __future__ import annotations
@@ -53,7 +56,7 @@ class Measured:
 
 
 def measured(context: Context) -> Measured:
-    """Render and read the ideal bench and benches with the specified errors."""
+    """Simulate the readings of the ideal bench and of benches with the specified errors."""
     setup = load_autocollimator_test()
     context.progress(0.0, "calibrate the autocollimators")
     reader = laboratory.Reader(setup, context.backend)
@@ -99,7 +102,7 @@ def run(context: Context) -> Iterator[CheckResult]:
 def printed_mean_difference(axis: str) -> float:
     """Return the mean absolute difference computed from the rows of Table 2, arcsec, to compare with its last line.
 
-    It is mirror 1 - mirror 2 (X, Y) or turntable - mirror 2 (Z).
+    The difference is mirror 1 - mirror 2 for the axes X and Y, and turntable - mirror 2 for Z.
     """
     return mean_difference(ANGLES if axis == "Z" else MIRROR_1[axis], MIRROR_2[axis])
 
@@ -156,7 +159,10 @@ def _z_columns(context: Context, measurement: Measured) -> CheckResult:
 
 
 def _errors(measured: float) -> Chosen:
-    """Return all errors of the bench together as a chosen input, to which mean differences are proportional."""
+    """Return all errors of the bench, multiplied by one factor, as an input that the paper does not print.
+
+    Mean differences are proportional to that factor.
+    """
     return Chosen.power("errors of the bench (scenes/lab/principle_experiment.yaml), times", 1.0, "1", measured)
 
 
@@ -215,7 +221,7 @@ def bench_png(reader: laboratory.Reader, tables: Sequence[laboratory.ReadingTabl
 
 
 def _plan(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Project points of the bench, (..., 3), onto the drawing, in millimetres.
+    """Project points of the bench, (..., 3), metres, onto the plan view: two coordinates in millimetres.
 
     They are seen from above (X up): Z to the right, Y down.
     """

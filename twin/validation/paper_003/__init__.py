@@ -1,1 +1,1 @@
-"""Checks of paper 003: calibration of a three-line camera in orbit."""
+"""Checks of paper 003 (Mo et al. 2015): calibration of a three-line camera in orbit."""

@@ -1,7 +1,8 @@
-"""Checks of paper 003 over campaigns of seven test fields, with figures and tables.
+"""Checks of paper 003 (Mo et al. 2015) over simulated campaigns with seven test fields, with figures and tables.
 
-They cover the quality of orbit and attitude, the stability of the calibration, Tables 6 and 7, the schemes of
-parameters, and the accuracy for maps of 1:50 000.
+A campaign calibrates the camera in orbit from passes over the fields. The checks cover the quality of orbit and
+attitude, the stability of the calibration, Tables 6 and 7, the schemes of parameters (which fields share parameters),
+and the accuracy for maps of 1:50 000.
 """
 
 from __future__ import annotations
@@ -33,7 +34,7 @@ from twin.validation.group import Context, drawing, group_of
 from twin.validation.paper_003.model import FIELDS, all_errors, changed, setup_of, without_light
 
 FULL, FAST = 150, 24
-"""Campaigns."""
+"""Numbers of simulated campaigns in a full and in a fast run of the checks."""
 SCHEMES = {
     1: "Beijing",
     2: "Beijing and Anhui",
@@ -44,13 +45,13 @@ SCHEMES = {
 INNER = tuple(f"{line} {part}" for line in LINES for part in INTERIOR)
 """Names of the unknowns of the interior orientation, ordered by line."""
 MEDIAN = float(np.sqrt(np.pi / 2.0))
-"""Ratio of the standard deviations of a median and a mean, for normal noise and many samples."""
+"""Ratio of a median's standard deviation to that of a mean, for normal noise and many samples."""
 SLOW = 1.5 * ARCSEC, 10.0
-"""Slow attitude errors for a test of third differences: sigma of a value, radians, and seconds between values."""
+"""Slow attitude errors for a test of third differences: sigma of a value, radians, and time between values, seconds."""
 _EDGE = 1e-9
 _SIGNIFICANT = 3.0
 _QUARTILE = 0.6745
-"""Distance of the quartiles of normal noise from its median, in sigmas."""
+"""Distance between the median and a quartile of a normal distribution, in sigmas."""
 _COLOURS = (BLUE, ORANGE, GREEN, VERMILION, PURPLE, SKY, INK)
 _MARKERS = "osD^vPX"
 _CURVES = 40
@@ -58,9 +59,9 @@ _CURVES = 40
 
 @dataclass(frozen=True, eq=False)
 class Flights:
-    """Results of N campaigns over K fields by S schemes of parameters.
+    """Results of N campaigns over K fields with S schemes of calibration parameters.
 
-    The last scheme lets each field use its own parameters.
+    A scheme says from which fields a field's parameters come. The last scheme lets each field use its own parameters.
 
     Attributes
     ----------
@@ -69,17 +70,17 @@ class Flights:
     latitude : np.ndarray
         (K,) latitudes of the fields, radians.
     bias, bias_sigma, true_bias : np.ndarray
-        (N, K, 3) attitude bias of each field calibrated by itself, radians; roll, pitch, yaw.
+        (N, K, 3) attitude bias of each field calibrated by itself, its sigma and true value, radians; roll, pitch, yaw.
     interior, interior_sigma : np.ndarray
-        (N, K, 9) elements of the interior orientation in the order of INNER, metres; sigma 0 where held.
+        (N, K, 9) elements of the interior orientation in the order of INNER, metres; sigma 0 where held fixed.
     plan, height : np.ndarray
         (N, S, K) RMS at check points without ground control, metres.
     plan_before, height_before : np.ndarray
-        (N, K) RMS at check points with the laboratory's camera, metres.
+        (N, K) RMS at check points with the laboratory calibration of the camera, metres.
     plan_floor, height_floor : np.ndarray
         (N, K) RMS with the true camera and the true bias, metres: the check points' own noise.
     expected : np.ndarray
-        (N, S, K) RMS in plan that the true biases of fields and scheme imply, metres.
+        (N, S, K) RMS in plan that follows from the true biases of the fields in each scheme, metres.
     fits : tuple[tuple[LatitudeFit, ...], ...]
         Campaign -> fits of roll, pitch, yaw against latitude, from the estimated biases.
     true_amplitude, true_significance : np.ndarray
@@ -114,9 +115,9 @@ class Flights:
 def flown(
     setup: CalibrationSetup, seeds: Sequence[np.random.SeedSequence], step: Callable[[int], None]
 ) -> list[Campaign]:
-    """Simulate campaigns for an adjustment that treats the noise of each exposure as independent.
+    """Simulate campaigns whose adjustment treats the noise of each exposure as independent.
 
-    This hardly changes the estimates.
+    This simplification hardly changes the estimates.
     """
     out = []
     for k, seed in enumerate(seeds):
@@ -126,7 +127,7 @@ def flown(
 
 
 def flights_of(campaigns: Sequence[Campaign]) -> Flights:
-    """Calibrate and test all campaigns, and return their results as arrays."""
+    """Calibrate the camera in all campaigns and test it at check points; return the results as arrays."""
     first = campaigns[0]
     names = tuple(p.name for p in first.passes)
     latitude = np.array([p.latitude for p in first.passes])
@@ -163,7 +164,7 @@ def flights_of(campaigns: Sequence[Campaign]) -> Flights:
 
 
 def _expected(campaign: Campaign, names: tuple[str, ...], floor: np.ndarray) -> np.ndarray:
-    """Return the (S, K) RMS in plan at K fields that the true biases imply for S schemes of parameters, metres.
+    """Return the RMS in plan that follows from the true biases, (S, K) for S schemes and K fields, metres.
 
     It is a field's roll and pitch minus the scheme's mean, times the height of flight, and the noise of the check
     points. Yaw moves the ends of the swath by 0.2 m for 1 arcsec.
@@ -179,9 +180,9 @@ def _expected(campaign: Campaign, names: tuple[str, ...], floor: np.ndarray) -> 
 
 
 def _slopes(latitude: np.ndarray, true: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return amplitudes of sin(latitude - middle) in the true biases of K fields, (3,), and their ratios to sigma.
+    """Return the amplitudes of sin(latitude - middle) in the true biases, and their ratios to sigma, (3,) each.
 
-    The biases ``true`` are (K, 3): roll, pitch, yaw, radians.
+    The biases ``true`` of K fields are (K, 3): roll, pitch, yaw, radians; the amplitudes are in radians.
     """
     reference = 0.5 * (latitude.min() + latitude.max())
     design = np.column_stack([np.sin(latitude - reference), np.ones_like(latitude)])
@@ -204,22 +205,22 @@ def lines_of(part: str) -> list[int]:
 
 @dataclass(frozen=True, eq=False)
 class Quality:
-    """Quality of orbit and attitude of the passes of all campaigns.
+    """Quality of orbit and attitude data of the passes of all campaigns.
 
     All arrays are (N, K, 3) for N campaigns and K fields: metres for the orbit's x, y, z in the Earth-fixed frame,
-    radians for roll, pitch, yaw of the attitude against the orbital frame.
+    radians for roll, pitch, yaw of the attitude relative to the orbital frame.
 
     Attributes
     ----------
     orbit, attitude : (N, K, 3) ndarray
         RMS of the third differences of the measurements.
     orbit_sigma, attitude_sigma : (N, K, 3) ndarray
-        Standard deviation of a reading that they imply.
+        Standard deviation of one measured value that follows from it.
     orbit_error, attitude_error : (N, K, 3) ndarray
-        RMS of measured minus true values; of the attitude without its mean over the pass.
+        RMS of measured minus true values; for the attitude without its mean over the pass.
     attitude_jump : (N, K, 3) ndarray
-        Standard deviation of the independent error of a reading, from measured minus true values of neighbouring
-        readings.
+        Standard deviation of the independent error of a measured value, from measured minus true values of neighbouring
+        times.
     """
 
     orbit: np.ndarray
@@ -256,7 +257,7 @@ def _pass(setup: CalibrationSetup, field_pass: FieldPass) -> tuple[np.ndarray, .
 
 
 def _readings(first: float, last: float, interval: float) -> np.ndarray:
-    """Return the times, in seconds, of the orbit's or attitude's readings inside a time span."""
+    """Return the times, in seconds, of orbit or attitude measurements inside a time span."""
     return interval * np.arange(np.ceil(first / interval - _EDGE), np.floor(last / interval + _EDGE) + 1.0)
 
 
@@ -341,9 +342,9 @@ def _interior(context: Context, flights: Flights, number: int, parts: tuple[str,
 
 @drawing("paper-003-schemes", 4.6)
 def schemes_svg(figure: Figure, flights: Flights, plan: float, height: float) -> None:
-    """Draw the RMS in plan and height by scheme on logarithmic axes, with the limits of the map scale.
+    """Draw the RMS in plan and height for each scheme of parameters on logarithmic axes.
 
-    Scheme 0 is before calibration.
+    The limits of the map scale are drawn too. Scheme 0 is before calibration.
     """
     panels = figure.subplots(1, 2)
     names = ["0\nlaboratory", "1\n1 field", "2\n2 fields", "3\n4 fields", "4\n6 fields", "5\nits own"]
@@ -393,7 +394,7 @@ def latitude_svg(figure: Figure, flights: Flights) -> None:
 def run(context: Context) -> Iterator[CheckResult]:
     """Yield the results of the checks over campaigns: simulate, calibrate and test.
 
-    Image points are drawn at random, with a noise that the check 003.model.points justifies.
+    Image points get random errors, whose size the check 003.model.points justifies.
     """
     setup = without_light(setup_of(FIELDS))
     count = context.count(FULL, FAST)
@@ -459,7 +460,7 @@ def _schemes(context: Context, flights: Flights, setup: CalibrationSetup) -> Ite
 
 
 def _per_shift(setup: CalibrationSetup) -> float:
-    """Return the error of a height per shift of the forward line along the track in the image, metres per metre.
+    """Return the error of a height per shift of the forward line's image along the track, metres per metre.
 
     Points on flat ground are intersected from the forward and the backward line.
     """
@@ -469,9 +470,9 @@ def _per_shift(setup: CalibrationSetup) -> float:
 
 
 def _varied(measured: float, flights: Flights, statistic: Callable[[np.ndarray], np.ndarray]) -> Chosen:
-    """Return the variation of the biases between the fields as a chosen input.
+    """Return the variation of the biases between the fields as an input that the paper does not print.
 
-    A factor on it scales what the true biases imply of the RMS in plan, (N, S, K) for N campaigns, S schemes and K
+    A factor on it scales the RMS in plan that follows from the true biases, (N, S, K) for N campaigns, S schemes and K
     fields; the response is the median of a statistic, (N,).
     """
     floor = flights.plan_floor[:, None, :]
@@ -485,7 +486,7 @@ def _varied(measured: float, flights: Flights, statistic: Callable[[np.ndarray],
 
 
 def _span(values: np.ndarray) -> np.ndarray:
-    """Return the (N,) ratios of the largest to the smallest of K values in each of N campaigns, (N, K)."""
+    """Return the ratio of the largest to the smallest of K values in each of N campaigns, (N,)."""
     return np.asarray(values.max(axis=1) / values.min(axis=1))
 
 

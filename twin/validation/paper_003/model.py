@@ -1,7 +1,7 @@
-"""Checks of the rigorous model of paper 003.
+"""Checks of the rigorous model of paper 003 (Mo et al. 2015).
 
-They use exact points, bright targets on the ground and matched points in rendered images, and points drawn at random. A
-figure shows the combination of parameters that the points cannot determine.
+They use exact points, bright targets on the ground and matched points in rendered images, and points with random
+errors. A figure shows the combination of parameters that the points cannot determine.
 """
 
 from __future__ import annotations
@@ -45,33 +45,36 @@ from twin.validation.check import CheckResult, Chosen, rms
 from twin.validation.group import Context, drawing, group_of
 
 FIELDS, IMAGES = "calibrate.yaml", "calibrate_images.yaml"
-"""Files of scenes/orbit: seven fields of drawn points; fields of rendered images."""
+"""Names of the jobs in scenes/orbit: seven fields with simulated image points, and fields with rendered images."""
 FIELD = "Beijing"
 CAMPAIGNS, FAST_CAMPAIGNS = 9, 5
-"""Campaigns of seven fields, in the full and in the fast run, for the errors of yaw over their sigma."""
+"""Numbers of campaigns over seven fields, in a full and a fast run, that compare errors of yaw with their sigma."""
 FAST_SIDE = 380
-"""Lines and pixels of a rendered patch in the fast run."""
+"""Lines and pixels of a rendered image patch in the fast run."""
 ROUNDS = (1, 3, 10, 30, 100, 300, 1000, 3000)
 UNKNOWNS = len(LINES) * len(INTERIOR) + len(BIAS)
 ROLL_PITCH = BIAS[:2]
 FREE_INTERIOR = tuple(n for n in (f"{line} {k}" for line in LINES for k in INTERIOR) if n not in GAUGE.held)
 TOLERANCE = 1e-3
-"""Largest last step of a round of the stepwise solution, in conditional sigmas."""
+"""Convergence limit of the stepwise solution: largest last step of a round, in conditional sigmas of the unknowns."""
 PLACES = (700.0, 6000.0, 11300.0)
-"""Pixels of the nadir line at the middles of the windows; the line has 12 000 pixels over the swath."""
+"""Positions, in pixels of the nadir line, of the middles of the rendered windows.
+
+The line has 12 000 pixels over the swath.
+"""
 _FOCAL = 0.65
-"""Focal length, metres, with which angles are drawn as image motion."""
+"""Focal length, metres, with which angles are converted to image motion in figures."""
 _NO_LIGHT = EffectsSpec(light_time=False, aberration=False, refraction=False)
 _STEP = {"f": 1e-5, "x": 1e-5, "y": 1e-5}
-"""Change of an element of interior orientation for numerical derivatives, metres, to either side: 1.5 px.
+"""Half step of numerical derivatives with respect to an element of interior orientation, metres (1.5 px).
 
 The error of third order is 1e-9 of the derivative.
 """
 _TURN = 1.5e-5
-"""Change of an attitude angle for numerical derivatives, radians, to either side."""
+"""Half step of numerical derivatives with respect to an attitude angle, radians."""
 _SIDE = 190
 _SIGMA = 2.5
-"""Standard deviation of the brightness of a target on the ground, metres: half a pixel.
+"""Standard deviation of the Gaussian brightness profile of a target on the ground, metres: half a pixel.
 
 The terrain's curvature under it moves its centroid by 0.004 px at most.
 """
@@ -81,7 +84,7 @@ _TERRAIN: dict[str, Any] = {"kind": "fractal", "relief": "30 m", "exponent": 2.4
 
 
 def setup_of(file: str, fields: Sequence[str] = (), **changes: Any) -> CalibrationSetup:
-    """Return a file of the library with some of its fields and with other values of its test's attributes."""
+    """Return a calibration test of the library with only some of its fields, and other values of some attributes."""
     setup = CalibrationSetup.read(SCENES / ORBIT / file)
     if fields:
         chosen = FrozenMap({name: setup.test.fields[name] for name in fields})
@@ -90,7 +93,7 @@ def setup_of(file: str, fields: Sequence[str] = (), **changes: Any) -> Calibrati
 
 
 def changed(setup: CalibrationSetup, **changes: Any) -> CalibrationSetup:
-    """Return a setup with other values of its test's attributes."""
+    """Return a setup in which some attributes of its test have other values."""
     return setup.model_copy(update={"test": setup.test.model_copy(update=changes)})
 
 
@@ -116,9 +119,9 @@ def exact_and_images() -> CalibrationSetup:
 
 
 def all_errors(value: float) -> Chosen:
-    """Return the errors of biases, orbit, attitude and points as one input.
+    """Return the errors of biases, orbit, attitude and points as one input that the paper does not print.
 
-    The errors of a calibration are proportional to it.
+    They have one factor in common, to which the errors of a calibration are proportional.
     """
     return Chosen.power("biases and errors of scenes/orbit/calibrate.yaml, times", 1.0, "1", value)
 
@@ -157,7 +160,7 @@ def true_sensors(
 
 @dataclass(frozen=True, eq=False)
 class Turned:
-    """Platform with its body rotated: attitude -> attitude Rx(roll) Ry(pitch) Rz(yaw).
+    """Platform with its body rotated: its attitude is multiplied by Rx(roll) Ry(pitch) Rz(yaw) from the right.
 
     Attributes
     ----------
@@ -179,12 +182,12 @@ class Turned:
         return self.base.inertial_velocity(seconds)
 
     def body_to_itrs(self, seconds: np.ndarray) -> np.ndarray:
-        """Return the rotated attitude."""
+        """Return the rotated platform's rotation matrices from its body frame to the ITRS at given times."""
         return np.asarray(self.base.body_to_itrs(seconds) @ Rotation.from_euler("XYZ", self.angles).as_matrix())
 
 
 def rays_at(sensor: Sensor, attitude: Platform, pitch: float, line: np.ndarray, pixel: np.ndarray) -> Rays:
-    """Return the rays of image points with the station and the given attitude at their exposure times."""
+    """Return the rays of image points, from the exposure stations and with the given attitude at the exposure times."""
     seconds = sensor.time(line)
     y = pitch * (pixel - 0.5 * (sensor.camera.pixels - 1))
     image = np.column_stack([np.zeros_like(y), y])
@@ -211,7 +214,7 @@ def derivatives(setup: CalibrationSetup, field_pass: FieldPass, bias: np.ndarray
     Returns
     -------
     tuple of (str, str, float)
-        Line and unknown with the largest deviation, and its largest difference relative to the largest coefficient.
+        Line and unknown with the largest deviation, and that deviation relative to the largest coefficient.
     """
     payload = changed_payload(setup.test, setup.camera)
     ground, still = field_pass.check_ground, np.zeros(3)
@@ -238,9 +241,11 @@ def derivatives(setup: CalibrationSetup, field_pass: FieldPass, bias: np.ndarray
 def places_seen(
     setup: CalibrationSetup, field_pass: FieldPass, line: str, interior: np.ndarray, bias: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return lines and pixels of the check points in a line with changed f, x, y (3,) and an attitude bias (3,).
+    """Return image lines and pixels of the check points in a camera line with changed orientation.
 
-    They are those of the rigorous sensor.
+    They are computed by the rigorous sensor model.
+
+    ``interior`` holds the changes of f, x, y, (3,), metres; ``bias`` the attitude bias, (3,), radians.
     """
     turned = Turned(field_pass.trajectory, bias)
     return true_sensors(setup, field_pass, turned, {line: interior})[line].image(field_pass.check_ground)
@@ -252,7 +257,10 @@ def exact_campaign(setup: CalibrationSetup, seed: np.random.SeedSequence) -> Cam
 
 
 def recovered(campaign: Campaign, pitch: float) -> tuple[float, str]:
-    """Return the largest error of a calibration of exact points, in pixels of image motion, and the unknown with it."""
+    """Return the largest error of the unknowns calibrated from exact points, and the unknown with it.
+
+    The error is in pixels of image motion.
+    """
     field_pass = campaign.passes[0]
     adjustment = calibrated_alone(campaign, field_pass)
     worst, which = 0.0, ""
@@ -264,7 +272,7 @@ def recovered(campaign: Campaign, pitch: float) -> tuple[float, str]:
 
 
 def errors_of(campaign: Campaign, field_pass: FieldPass, adjustment: Adjustment | Stepwise) -> dict[str, float]:
-    """Return unknown, without the field's name -> estimated minus true value, metres or radians."""
+    """Return unknown (without the field's name) -> estimated minus true value, metres or radians."""
     value = dict(zip(adjustment.names, adjustment.values, strict=True))
     out = {
         f"{line} {name}": float(value[f"{line} {name}"] - true)
@@ -285,10 +293,10 @@ class Rank:
     open : tuple of Combination
         Undetermined combinations.
     weak_sigma : float
-        Sigma of nadir y, in metres, with nadir x fixed.
+        Sigma of the nadir line's y, in metres, with its x held fixed.
     moved : float
-        RMS displacement of the rigorous sensor's image points, in pixels, due to the undetermined combination with 0.1
-        mm in x of every line.
+        RMS displacement of the rigorous sensor's image points, in pixels, due to the undetermined combination, scaled
+        to 0.1 mm in x of every line.
     alone : float
         RMS displacement due to the changes of x alone, in pixels.
     """
@@ -329,7 +337,7 @@ def rank_of(setup: CalibrationSetup, campaign: Campaign) -> Rank:
 
 @dataclass(frozen=True, eq=False)
 class Walk:
-    """Comparison of the stepwise solution of a field with the simultaneous one.
+    """Comparison of the stepwise solution of a field's calibration with the simultaneous one.
 
     Attributes
     ----------
@@ -338,9 +346,9 @@ class Walk:
     together : Adjustment
         Simultaneous solution.
     distance : float
-        Largest difference between them, in sigmas.
+        Largest difference between the unknowns of both, in sigmas.
     after : Mapping[int, float]
-        Number of rounds -> largest difference after so many, sigmas.
+        Number of rounds of the stepwise solution -> largest difference after these, sigmas.
     """
 
     found: Stepwise
@@ -350,7 +358,7 @@ class Walk:
 
 
 def walked(campaign: Campaign, field_pass: FieldPass, rounds: tuple[int, ...] = (1, 10, 100)) -> Walk:
-    """Compute both solutions of one field, and their difference after some rounds of the stepwise one."""
+    """Compute the stepwise and the simultaneous solution of one field, and their difference after some rounds."""
     observations = [field_pass.control], campaign.laboratory, campaign.noise
     together = adjust(*observations, gauge=GAUGE)
     free = np.array([name not in GAUGE.held for name in together.names])
@@ -366,7 +374,7 @@ def walked(campaign: Campaign, field_pass: FieldPass, rounds: tuple[int, ...] = 
 
 @dataclass(frozen=True, eq=False)
 class FoundMarks:
-    """Bright targets measured in all windows of one line.
+    """Measured image positions of the bright ground targets in all image windows of one camera line.
 
     Attributes
     ----------
@@ -383,7 +391,7 @@ class FoundMarks:
 
 @dataclass(frozen=True, eq=False)
 class _Spots:
-    """Apparent reflectance of bright targets on black ground, as a function of position on the ground."""
+    """Function of the position on the ground that gives the reflectance of bright targets on black ground."""
 
     east: np.ndarray
     north: np.ndarray
@@ -398,7 +406,7 @@ class _Spots:
 
 
 def rendered_marks(setup: CalibrationSetup, campaign: Campaign, seed: np.random.SeedSequence) -> dict[str, FoundMarks]:
-    """Return line -> bright targets measured in it, four in each window over the first field of a campaign.
+    """Return camera line -> bright ground targets measured in it, four in each window over a campaign's first field.
 
     They are located by their centroids.
     """
@@ -433,7 +441,7 @@ def rendered_marks(setup: CalibrationSetup, campaign: Campaign, seed: np.random.
 
 
 def missed(setup: CalibrationSetup, campaign: Campaign, marks: dict[str, FoundMarks]) -> dict[str, np.ndarray]:
-    """Return line -> (n, 2) misclosures of the analysis's model at the line's n bright targets, in pixels.
+    """Return camera line -> misclosures of the analysis's model at the line's n bright targets, (n, 2), in pixels.
 
     The model has the true interior orientation and bias, the measured attitude and the known ground.
     """
@@ -447,7 +455,10 @@ def missed(setup: CalibrationSetup, campaign: Campaign, marks: dict[str, FoundMa
 
 
 def _brightest(image: np.ndarray, count: int) -> list[tuple[int, int]]:
-    """Return the brightest pixels, each farther from the previous ones than the image of a target extends."""
+    """Return the brightest pixels of an image, one for each of ``count`` targets, as (row, column).
+
+    Each is farther from the previous ones than the image of a target extends.
+    """
     rest = image.copy()
     out = []
     for _ in range(count):
@@ -458,7 +469,7 @@ def _brightest(image: np.ndarray, count: int) -> list[tuple[int, int]]:
 
 
 def _centroid(image: np.ndarray, row: int, column: int) -> np.ndarray:
-    """Return the centroid of all pixels that the point spread function reaches from a given pixel, in pixels."""
+    """Return the centroid (line, pixel) of all pixels that the point spread function reaches from a given pixel."""
     part = image[row - _REACH : row + _REACH + 1, column - _REACH : column + _REACH + 1]
     if part.shape != (2 * _REACH + 1,) * 2:
         raise ValueError("a mark lies too near to the window's border")
@@ -493,11 +504,11 @@ class FromImages:
     together : Adjustment
         Simultaneous solution, for sigmas.
     error : dict of str to float
-        Stepwise estimate minus truth of each free unknown, radians and metres.
+        Stepwise estimate minus true value of each free unknown, radians and metres.
     covariance : ndarray
         Covariance of these unknowns, in their order.
     before, after : CheckErrors
-        Errors at check points with the laboratory's camera and with the field's parameters.
+        Errors at check points with the laboratory calibration of the camera and with the field's parameters.
     """
 
     name: str
@@ -522,14 +533,14 @@ class FromImages:
 
 
 def calibrated(campaign: Campaign) -> tuple[FromImages, ...]:
-    """Calibrate every field of a campaign by itself."""
+    """Calibrate the camera from every field of a campaign separately."""
     return tuple(_field(campaign, field_pass) for field_pass in campaign.passes)
 
 
 def matching(campaign: Campaign) -> tuple[float, int, int]:
-    """Return the matching error of control points and the numbers of accepted and of wrong positions.
+    """Return the matching error of control points, and the numbers of accepted and of wrong matches.
 
-    The error is the RMS of correct positions against the truth over lines and pixels, in pixels.
+    The error is the RMS of correctly matched minus true positions over lines and pixels, in pixels.
     """
     assert campaign.images is not None
     patches = [patch.judgements for field in campaign.images for patch in field.patches]
@@ -574,7 +585,7 @@ def _field(campaign: Campaign, field_pass: FieldPass) -> FromImages:
 
 
 def summary(from_images: FromImages, names: tuple[str, ...]) -> str:
-    """Return errors and sigmas of some unknowns of a field as text."""
+    """Return a text with the errors and sigmas of some unknowns of a field's calibration."""
     sigma = dict(zip(from_images.error, np.sqrt(np.diag(from_images.covariance)).tolist(), strict=True))
     parts = []
     for n in names:
@@ -585,7 +596,7 @@ def summary(from_images: FromImages, names: tuple[str, ...]) -> str:
 
 @drawing("paper-003-open", 3.4)
 def open_svg(figure: Figure, rank: Rank, walk: Walk) -> None:
-    """Draw the undetermined combination as bars, and the stepwise solution's difference in sigmas over its rounds."""
+    """Draw the undetermined combination as bars, and how the stepwise solution converges over its rounds, in sigmas."""
     left, right = figure.subplots(1, 2)
     combination = rank.open[0]
     names = [n if n.split()[-1] in "fxy" else n.split()[-1] for n in combination.names]

@@ -1,1 +1,1 @@
-"""Checks of paper 004: integration and test of a bi-linear camera."""
+"""Checks of paper 004 (Li et al. 2020): integration and test of a bi-linear camera."""

@@ -1,9 +1,9 @@
-"""Checks of paper 004, sections 3.1 and 3.3: equations (1) to (4), Table 2 and the sources of error.
+"""Checks of paper 004 (Li et al. 2020), sections 3.1 and 3.3: eqs. (1) to (4), Table 2 and sources of error.
 
-Distortion tests use rendered collimator spots and exact chief rays. Measured: positions of spots in rendered images,
-angles from the readings of a compensated turntable. True: chief rays of the as-built camera traced at the true angles,
-and the nearest camera without distortion. Without noise the equations are solved on chief rays of the camera as
-designed.
+Distortion tests use rendered collimator spots and exact chief rays. Measured values are positions of spots in rendered
+images and angles from the readings of a compensated turntable. True values are chief rays of the as-built camera traced
+at the true angles, and the nearest camera without distortion. Without noise the equations are solved on chief rays of
+the camera as designed.
 """
 
 from __future__ import annotations
@@ -41,13 +41,17 @@ ACCURACY_UM = _PRINTED.number("distortion.accuracy_um")
 POINTS, SETS = (_PRINTED.whole(f"distortion.{name}") for name in ("points", "sets"))
 RAW, COMPENSATED = (np.array(_PRINTED.column(f"table2.{name}_um")) for name in ("raw", "compensated"))
 TESTS, FAST_TESTS = 60, 14
-"""Simulated tests: another turntable, calibration, zero, axis, detector and noise in each."""
+"""Numbers of simulated distortion tests in a full and in a fast run.
+
+Each has another turntable, calibration, zero, axis, detector and noise.
+"""
 FEW = 5
 """Step between the points of a reduced set (every fifth point), to check the effect of the number of points."""
 UNEVEN = slice(0, 44)
 """Points from one end of the line to six tenths of the other half, for the check of uneven spacing.
 
-There f and p of eq. (2) are correlated, and the camera's radial distortion causes a p of 54 mm, which no noise hides.
+For these points the estimates of f and p by eq. (2) are correlated, and the camera's radial distortion causes a
+principal point p of 54 mm, far above the noise.
 """
 _PRINTED_ONLY = {f"004.table2.{name}" for name in ("reduction", "mean", "largest", "bound")}
 
@@ -65,7 +69,7 @@ class Perspective:
     p : float
         Principal point f tan w, metres.
     rest : Array
-        Distortion of the N rays, (N,), metres.
+        Distortion of the N rays: their positions minus this model, (N,), metres.
     """
 
     f: float
@@ -82,7 +86,7 @@ class Perspective:
 
     @classmethod
     def nearest(cls, where: Array, turn: Array, tilted: bool = True) -> Perspective:
-        """Fit the perspective by nonlinear least squares without expansion; p = 0 unless ``tilted``.
+        """Fit the distortion-free camera to chief rays by nonlinear least squares, without series expansion.
 
         Parameters
         ----------
@@ -91,7 +95,7 @@ class Perspective:
         turn : (N,) ndarray
             Angles W of their directions, radians.
         tilted : bool
-            True to estimate p.
+            True to estimate the principal point p; False for p = 0.
         """
         start = (where[-1] - where[0]) / (np.tan(turn[-1]) - np.tan(turn[0]))
 
@@ -106,7 +110,10 @@ class Perspective:
 
 @dataclass(frozen=True, eq=False)
 class SpotTest:
-    """Positions and angles of one rendered test for the equations, with their true values."""
+    """Positions L and angles W of one rendered distortion test, with their true values.
+
+    L is the position of a point along the line CCD, W the angle of its direction.
+    """
 
     run: SimulatedDistortion
 
@@ -142,7 +149,7 @@ class SpotTest:
 
     @cached_property
     def part(self) -> Perspective:
-        """Principal distance, principal point and distortion of the traced camera from the uneven points alone."""
+        """Principal distance, principal point and distortion of the traced camera from unevenly spaced points."""
         return Perspective.nearest(self.true_place[UNEVEN], self.true_turn[UNEVEN])
 
     @property
@@ -151,7 +158,7 @@ class SpotTest:
         return float(np.mean(self.turn - self.true_turn))
 
     def shifted(self, *powers: int) -> tuple[Array, Array]:
-        """Return the effect of the wrong zero alone on a least-squares fit of powers of tan W to the chief rays.
+        """Return the effect of the wrong angle zero alone on a least-squares fit of powers of tan W to the chief rays.
 
         The effect consists of the coefficients of the P powers, (P,), and of the residuals at the N points, (N,), in
         metres.
@@ -163,7 +170,7 @@ class SpotTest:
         return coefficients, np.asarray(moved - columns @ coefficients)
 
     def errors(self, turn: Array, points: slice | NDArray[np.intp]) -> tuple[float, float]:
-        """Return the error of f and the RMS error of the distortion, metres, for some points and angles.
+        """Return the error of f and the RMS error of the distortion, metres, for selected points with given angles.
 
         A constant, f and p are fitted to these points.
         """
@@ -215,7 +222,7 @@ def measured_tests(context: Context) -> list[SimulatedDistortion]:
 
 
 def lower(raw: float | np.floating, compensated: float | np.floating) -> float:
-    """Return the reduction of an error by the compensation, in percent of the raw error."""
+    """Return by how much the compensation reduces an error, in percent of the error with raw angles."""
     return float(100.0 * (1.0 - compensated / raw))
 
 
@@ -243,7 +250,7 @@ def _table2(context: Context) -> Iterator[CheckResult]:
 
 
 Facts = Mapping[str, Any]
-"""Facts that the texts of all rows of rendered tests may name."""
+"""Computed values that the texts of all checks with rendered tests may name."""
 
 
 def _eq1(context: Context, tests: Sequence[SpotTest], facts: Facts) -> Iterator[CheckResult]:
@@ -284,7 +291,7 @@ def _eq2(context: Context, tests: Sequence[SpotTest], facts: Facts) -> Iterator[
         return context.row("004.eq2.f", value, sigma, truth, equation=equation, scatter=scatter, **facts)
 
     def zero(found: Array, predicted: Array, equation: str) -> CheckResult:
-        """Check the principal point by a printed equation, into which the error of the zero of the angles enters."""
+        """Check the principal point by one of the paper's equations, which depends on the error of the angles' zero."""
         error, turn = found - p_true, rms([t.zero for t in tests])
         more: dict[str, Any] = {
             "equation": equation,
@@ -323,7 +330,7 @@ def _uneven(
     identifier: str,
     solve: Callable[[SpotTest, tuple[Array, Array]], Any],
 ) -> CheckResult:
-    """Check the principal point by an equation over unevenly spaced points."""
+    """Check the principal point by one of the paper's equations for unevenly spaced points."""
     points = np.array([solve(t, (t.place[UNEVEN], t.zeroed[UNEVEN])) for t in tests])
     true, turn = np.array([t.part.p for t in tests]), tests[0].true_turn[UNEVEN]
     scatter = MM * float(np.std(points - true, ddof=1))
@@ -333,7 +340,7 @@ def _uneven(
 
 
 def _sensitivity(context: Context, tests: Sequence[SpotTest], facts: Facts) -> Iterator[CheckResult]:
-    """Check the rows of the sources of error."""
+    """Check the paper's statements about the sources of error."""
     if not context.wants("004.sensitivity"):
         return
     half = np.flatnonzero(np.abs(tests[0].run.bench.field_angle) <= 0.5 * tests[0].run.bench.field_angle[-1])
@@ -370,7 +377,7 @@ def _sensitivity(context: Context, tests: Sequence[SpotTest], facts: Facts) -> I
 
 
 def _ratio(over: Array, under: Array, column: int) -> float:
-    """Return the jackknife standard deviation of a ratio of RMS values over tests."""
+    """Return the jackknife standard deviation of a ratio of RMS values over several tests."""
     n = len(over)
     keep = ~np.eye(n, dtype=bool)
     values = np.array([rms(over[k, column]) / rms(under[k, column]) for k in keep])
@@ -413,7 +420,7 @@ def _errors_of_tests(context: Context, tests: Sequence[SpotTest], facts: Facts) 
 def _moved(test: SpotTest) -> Array:
     """Return the change of the distortion at N points due to a correction of the readings, (N,), in metres.
 
-    It is f times the correction, without the part that zero, f and p absorb.
+    It is the principal distance f times the correction, without the part that the fit of zero, f and p absorbs.
     """
     correction = test.camera.f * (test.turn - test.run.raw.fit.angle)
     columns = np.tan(test.turn)[:, None] ** np.arange(3)
@@ -452,7 +459,10 @@ def _show(context: Context, tests: Sequence[SpotTest]) -> None:
 
 
 def _statistics(raw: Array, compensated: Array) -> list[Cell]:
-    """Return RMS, mean and maximum over the N points of T tests, (T, N), with reductions, as medians of the tests."""
+    """Return RMS, mean and maximum of the errors over N points, with the reductions by compensation.
+
+    They are medians over T tests; ``raw`` and ``compensated`` hold the errors, (T, N).
+    """
     out: list[Cell] = []
     for size in (lambda v: np.sqrt(np.mean(v**2, axis=1)), lambda v: np.mean(v, axis=1), lambda v: np.max(v, axis=1)):
         before, after = size(raw), size(compensated)
@@ -463,7 +473,7 @@ def _statistics(raw: Array, compensated: Array) -> list[Cell]:
 
 @drawing("reduction-004", 4.2)
 def reduction_svg(figure: Figure, errors: NDArray[np.float64], paper: tuple[float, float], reduction: float) -> None:
-    """Draw the RMS with compensated over the RMS with raw angles, of each of T tests and of the paper.
+    """Draw the RMS error with compensated angles divided by that with raw angles, for T tests and for the paper.
 
     The errors are (T, 2), raw and compensated, in micrometres; the reduction is the one that the paper claims.
     """
@@ -486,10 +496,10 @@ def reduction_svg(figure: Figure, errors: NDArray[np.float64], paper: tuple[floa
 
 @drawing("principal-point-004", 3.6)
 def points_svg(figure: Figure, by_eq2: NDArray[np.float64], free: NDArray[np.float64]) -> None:
-    """Draw the principal points of T tests.
+    """Draw the principal points p of T tests.
 
-    The first array (T, 3) has the error of the zero in arcsec, p of eq. (2) and the p that the zero explains in mm; the
-    second (T, 2) has p with a constant term and its sigma, in mm.
+    The first array (T, 3) has the error of the angles' zero in arcsec, p by eq. (2) and the p that this error explains,
+    in mm; the second (T, 2) has p from a fit with a constant term and its sigma, in mm.
     """
     left, right = figure.subplots(1, 2)
     zero, estimated, explained = by_eq2[np.argsort(by_eq2[:, 0])].T
@@ -544,12 +554,12 @@ def run_equations(context: Context) -> Iterator[CheckResult]:
 
 
 def _turn_to(places: Callable[[Array], Array], wanted: float, most: float) -> float:
-    """Return the rotation within ±``most`` that is imaged to a given position on the line, in radians."""
+    """Return the rotation of the table, within ±``most``, that is imaged to a given position on the line, radians."""
     return float(brentq(lambda w: float(places(np.array([w]))[0]) - wanted, -most, most, xtol=1e-14))
 
 
 def _ignored(context: Context, places: Callable[[Array], Array], turn: Array, pitch: float) -> CheckResult:
-    """Check eq. (3) with positions and angles counted from a point one pixel beside the middle of the line."""
+    """Check eq. (3) with positions and angles counted from a point one pixel off the middle of the line."""
     where, beside = places(turn), _turn_to(places, pitch, float(turn[-1]))
     shift = float(places(np.array([beside]))[0])
     first = distortion(where, turn, principal_distance(where, turn))
@@ -592,4 +602,4 @@ def _solutions(context: Context, places: Callable[[Array], Array], edge: float) 
 GROUP = group_of("004.distortion", run)
 EQUATIONS = group_of("004.equations", run_equations)
 FIGURES = group_of("004.figures")
-"""Group of the figures that are printed without numbers, so that nothing can be compared."""
+"""Group of checks about the paper's figures without numbers, for which nothing can be compared."""

@@ -1,4 +1,4 @@
-"""Checks of paper 004's focal-plane alignment: coupling of the adjustments, MTF, accuracy and result."""
+"""Checks of the focal-plane alignment of paper 004 (Li et al. 2020): coupling, MTF, accuracy and result."""
 
 from __future__ import annotations
 
@@ -32,24 +32,25 @@ CONFOCAL_MM = load_printed("004").number("alignment.confocal_mm")
 LINE_LEVEL_ARCMIN = load_printed("004").number("alignment.line_level_arcmin")
 PARAMETERS = ("Δα", "Δβ", "Δγ", "Δx", "Δy", "Δz")
 ADJUSTMENTS = ("tilt about the surface's x", "tilt about its y", "turn in it", "slide along x", "slide along y", "lift")
-"""Names of the six adjustments of the mount: tilts and lift are made by shims, the others by hand."""
+"""Names of the six adjustments of the mount: tilts and height are set by shims, the others by hand."""
 LIMITS = np.array([10.0 * ARCSEC, 10.0 * ARCSEC, 10.0 * ARCSEC, 7e-6, 7e-6, 5e-6])
-"""Smallest change of each of the six parameters that counts, radians and metres.
+"""Smallest significant change of each of the six parameters, radians and metres.
 
 They are the theodolite's 10 arcsec, a panchromatic pixel, and a step of the shims.
 """
 TEST = "focus"
 ALIGNMENTS, FAST_ALIGNMENTS = 12, 1
-"""Alignments from random mis-settings."""
+"""Numbers of simulated focal-plane alignments from random initial misalignments, in a full and in a fast run."""
 
 _ALL_LOSSES = "what the scene file assumes beyond the paper, in waves, pixels or line periods, times"
 
 
 def effects(bench: FocusBench, inclined: float = 1.0) -> Array:
-    """Return the change of each of six parameters due to each of six adjustments, (6, 6), radians and metres.
+    """Return the change of each of the focal plane's six parameters due to each of six adjustments, (6, 6).
 
-    The size of each adjustment is the initial error of the assembly. The changes Δα, Δβ and Δz are those of the plane
-    through the traced defocus of all sites; Δγ is the rotation of the line, Δx and Δy the displacement of its middle.
+    The unit is radians or metres. The size of each adjustment is the initial error of the assembly. The changes Δα, Δβ
+    and Δz are those of the plane through the traced defocus of all sites; Δγ is the rotation of the line, Δx and Δy the
+    displacement of its middle.
 
     Parameters
     ----------
@@ -87,7 +88,7 @@ def _parameters(bench: FocusBench, pose: Pose) -> Array:
 
 
 def _coupling(context: Context, bench: FocusBench) -> CheckResult:
-    """Check the number of parameters that the adjustments of the mount couple."""
+    """Check the paper's statement on how many parameters the adjustments of the mount couple."""
     change = effects(bench)
     tilt = float(np.degrees(bench.setup.test.mount.tilt))
     changed = "; ".join(
@@ -108,7 +109,7 @@ def _coupling(context: Context, bench: FocusBench) -> CheckResult:
 def coupled(change: Array) -> float:
     """Return the number of parameters in the largest set that adjustments couple one after the other.
 
-    The changes are those of `effects`.
+    ``change`` is the matrix that `effects` returns.
     """
     seen = np.abs(change) > LIMITS
     _, family = connected_components((seen.T @ seen).astype(float), directed=False)
@@ -117,7 +118,7 @@ def coupled(change: Array) -> float:
 
 @dataclass(frozen=True, eq=False)
 class Plan:
-    """Planned correction from the MTF curves of an alignment's first state."""
+    """Correction of the focal plane planned from the MTF curves of an alignment's first state."""
 
     alignment: SimulatedFocus
 
@@ -148,10 +149,7 @@ class Plan:
 
     @property
     def asked(self) -> Array:
-        """Changes of the shims at H holes that the traced defocus and the line's true rotation require, (H,).
-
-        The unit is metres.
-        """
+        """Changes of the shims at H holes that the true defocus and line rotation require, (H,), metres."""
         alignment = self.alignment
         piston, slope_x, slope_y = alignment.true_plane(0)
         mount = mount_of(alignment.bench.setup.test)
@@ -166,9 +164,9 @@ class Plan:
 
 
 def measured_defocus(state: FocusState) -> tuple[Array, Array]:
-    """Return the distances of the CCDs downstream of best focus at N sites, and their sigmas, (N,), metres.
+    """Return the measured defocus of the CCDs at N sites, downstream of best focus, and its sigma, (N,), metres.
 
-    They are measured by MTF curves through focus.
+    It is measured by MTF curves through focus.
     """
     out = []
     for scan in state.scans:
@@ -180,7 +178,10 @@ def measured_defocus(state: FocusState) -> tuple[Array, Array]:
 
 
 def run(context: Context) -> Iterator[CheckResult]:
-    """Yield the results of the checks, from random misalignments; from one only if nothing but the MTF is selected."""
+    """Yield the results of the checks, from alignments with random misalignments.
+
+    If only checks of the MTF are selected, a single alignment is simulated.
+    """
     context.progress(0.0, "build the bench")
     with one_blas_thread():
         bench = FocusBench(FocusSetup.read(TEST), context.backend)
@@ -200,7 +201,7 @@ def run(context: Context) -> Iterator[CheckResult]:
 
 
 def measured_alignments(context: Context, bench: FocusBench) -> list[SimulatedFocus]:
-    """Run alignments with rendered edges."""
+    """Simulate alignments of the focal plane with rendered edges, each with its own random misalignment."""
     count = context.count(ALIGNMENTS, FAST_ALIGNMENTS) if context.wants("004.alignment") else 1
     alignments = []
     for k, seed in enumerate(np.random.SeedSequence(context.seed).generate_state(count)):
@@ -211,7 +212,7 @@ def measured_alignments(context: Context, bench: FocusBench) -> list[SimulatedFo
 
 
 def _edges(alignment: SimulatedFocus, band: str) -> list[EdgeMtf]:
-    """Measure edges along the track at the fields of a band after the alignment."""
+    """Measure the MTF along the track from edges at the fields of a band, after the alignment."""
     noise, focus = alignment.bench.ccds[band].noise, alignment.states[-1].focus
     stacks = [f.frames[TRACK] for f, site in zip(focus, alignment.bench.sites, strict=True) if site.band == band]
     return [
@@ -220,10 +221,10 @@ def _edges(alignment: SimulatedFocus, band: str) -> list[EdgeMtf]:
 
 
 def _losses(factors: Mapping[str, float], value: float) -> list[Chosen]:
-    """Return the inputs of an MTF that the paper does not print.
+    """Return the factors of an MTF that the paper does not print, as inputs of the check.
 
-    The logarithm of each factor is proportional to the square of its size, as for small wavefront errors (Maréchal),
-    diffusion and small motions.
+    The logarithm of each factor is proportional to the square of its cause's size, as for small wavefront errors
+    (Maréchal), diffusion and small motions.
     """
     product = float(np.prod(list(factors.values())))
     wavefront = factors["wavefront"]
@@ -276,7 +277,7 @@ def _mtf(context: Context, alignments: Sequence[SimulatedFocus], facts: Mapping[
 def _measured(
     context: Context, alignments: Sequence[SimulatedFocus], facts: Mapping[str, Any]
 ) -> Iterator[CheckResult]:
-    """Check the results of the analysis of the curves against the traced pupils."""
+    """Check the results of the through-focus analysis against those of the traced pupils."""
     looks = [(a.states[0], a.states[-1]) for a in alignments]
     error = np.array([[measured_defocus(state)[0] - state.true_defocus for state in pair] for pair in looks])
     span = [a.states[0].true_defocus for a in alignments]
@@ -299,7 +300,7 @@ def _measured(
 
 
 def _chips(placed: Sequence[tuple[SimulatedFocus, Pose, Mapping[str, float]]]) -> Chosen:
-    """Return the glueing errors of the line CCDs, in millimetres, as an input.
+    """Return the glueing errors of the line CCDs, in millimetres, as an input that the paper does not print.
 
     The largest distance from best focus depends on them.
     """
@@ -315,7 +316,7 @@ def _chips(placed: Sequence[tuple[SimulatedFocus, Pose, Mapping[str, float]]]) -
 
 
 def _theodolite(alignments: Sequence[SimulatedFocus], value: float) -> Chosen:
-    """Return the error of measuring and setting the line's rotation as an input.
+    """Return the error of measuring and setting the line's rotation as an input that the paper does not print.
 
     The result is proportional to it.
     """
@@ -325,7 +326,7 @@ def _theodolite(alignments: Sequence[SimulatedFocus], value: float) -> Chosen:
 
 
 def _reached(context: Context, alignments: Sequence[SimulatedFocus], facts: Mapping[str, Any]) -> Iterator[CheckResult]:
-    """Check the result of repeated measuring and shimming."""
+    """Check the final result of repeated measuring and shimming."""
     plan = alignments[0].bench.setup.test
     far = np.array([[MM_PER_M * np.max(np.abs(s.true_defocus)) for s in a.states] for a in alignments])
     turns = np.array([[abs(s.true_level) / ARCMIN for s in a.states] for a in alignments])
@@ -351,9 +352,9 @@ def _reached(context: Context, alignments: Sequence[SimulatedFocus], facts: Mapp
 def alignment_svg(
     figure: Figure, far: NDArray[np.float64], turns: NDArray[np.float64], far_bound: float, turn_bound: float
 ) -> None:
-    """Draw A alignments before and after, with the results of the paper.
+    """Draw the results of A alignments before and after, and those of the paper.
 
-    Shown are the largest distance from best focus of each of S states, in mm, and rotations of the line, in arcmin,
+    Shown are the largest distance from best focus in each of S states, in mm, and the rotation of the line, in arcmin,
     both (A, S).
     """
     labels = ("farthest CCD from best focus [mm]", "turn of the line [arcmin]")

@@ -1,4 +1,4 @@
-"""Checks of paper 004, sections 3.2 and 3.3: the turntable's dividing error, its repeated readings and its fits."""
+"""Checks of paper 004 (Li et al. 2020), sections 3.2 and 3.3: dividing error, repeated readings and fits."""
 
 from __future__ import annotations
 
@@ -28,11 +28,13 @@ REPEATS = load_printed("004").whole("turntable.repeats")
 REPEAT_RMS_ARCSEC = load_printed("004").number("turntable.repeat_rms_arcsec")
 FIT_RMS_ARCSEC = load_printed("004").number("turntable.fit_rms_arcsec")
 TABLES, FAST_TABLES = 1000, 200
-"""Turntables that are calibrated; quick."""
+"""Numbers of simulated turntables that are calibrated, in a full and in a fast run."""
 FURTHER = 1.6
-"""Factor on an input with which tables are calibrated again, to find how the result depends on it."""
+"""Factor on an input (not printed in the paper) for a second calibration of the tables, which shows how the result
+depends on it.
+"""
 FITTED, FAST_FITTED = 60, 12
-"""Turntables whose calibration is fitted."""
+"""Numbers of simulated turntables whose calibration is fitted, in a full and in a fast run."""
 NETWORK = "network"
 _REPEATED = tuple(f"004.turntable.{name}" for name in ("repeat", "criterion", "chauvenet", "chauvenet_mean"))
 FIT_NAMES = {name: name.replace("_", " ") for name in FITS} | {"fourier": "Fourier series"}
@@ -41,12 +43,12 @@ CLOSED_FORMS = tuple(name for name in FITS if name != NETWORK)
 
 @dataclass(frozen=True, eq=False)
 class FittedTable:
-    """Turntable with its fits.
+    """Turntable with its fits of the dividing error.
 
     Attributes
     ----------
     chosen : str
-        Closed form that cross-validation on the calibration points selects.
+        Closed-form fit that cross-validation on the calibration points selects.
     held_out : mapping of str to float
         RMS of each fit at readings that no fit has used, radians; infinite if the fit failed.
     """
@@ -92,7 +94,7 @@ def run(context: Context) -> Iterator[CheckResult]:
 
 
 def _criterion(context: Context, series: Sequence[CalibrationSeries]) -> CheckResult:
-    """Check the limit of the rejection criterion by the readings that it accepted and rejected."""
+    """Check the limit of the outlier rejection by the readings that it accepted and rejected."""
     readings, keep = (np.concatenate([getattr(s, name) for s in series]) for name in ("comparisons", "keep"))
     size = np.abs(readings - readings.mean(axis=1, keepdims=True)) / readings.std(axis=1, ddof=1, keepdims=True)
     largest_accepted, smallest_rejected = float(np.max(size[keep])), float(np.min(size[~keep]))
@@ -143,7 +145,7 @@ def _repeats(
 
 
 def _readings(spec: TurntableTestSpec, seeds: NDArray[np.integer], identifier: str, value: float) -> list[Chosen]:
-    """Return the inputs on which the largest RMS of repeated readings depends.
+    """Return the inputs that the paper does not print, on which the largest RMS of repeated readings depends.
 
     They are the scatter of a reading and, before the rejection criterion, gross errors.
     """
@@ -167,7 +169,7 @@ def _readings(spec: TurntableTestSpec, seeds: NDArray[np.integer], identifier: s
 
 
 def _with_errors(spec: TurntableTestSpec, scatter: float, gross: float) -> TurntableTestSpec:
-    """Return the test with factors on the scatter of its readings and on its gross errors."""
+    """Return the test with the scatter of its readings and its gross errors multiplied by factors."""
     table, reference = spec.dividing_error, spec.reference
     noise = {"noise": scatter * reference.noise, "gross_error": gross * reference.gross_error}
     update = {
@@ -178,12 +180,15 @@ def _with_errors(spec: TurntableTestSpec, scatter: float, gross: float) -> Turnt
 
 
 def dividing(value: float, power: float = 1.0) -> Chosen:
-    """Return the dividing error as an input, to which the remaining error of fits and its effect are proportional."""
+    """Return the dividing error as an input that the paper does not print.
+
+    The remaining error of fits and its effect are proportional to it.
+    """
     return Chosen.power("dividing error of scenes/lab/turntable.yaml, times", 1.0, "1", value, power)
 
 
 def _ranks(tables: Sequence[FittedTable]) -> dict[str, Array]:
-    """Return fit -> its rank on each table, 1 for the smallest error."""
+    """Return fit -> its rank on each turntable, 1 for the smallest error."""
     return {
         name: np.array([1.0 + sum(v < t.held_out[name] for v in t.held_out.values()) for t in tables]) for name in FITS
     }

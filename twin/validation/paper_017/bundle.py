@@ -1,8 +1,9 @@
-"""Heights by a bundle of coarse three-line images and by intersection in fine ones, with equal errors of the attitude.
+"""Accuracy of heights from a bundle of coarse three-line images and from intersection in fine ones.
 
-A strip of twice the base is flown by TH-1's three lines with 5 m pixels. Its tie points connect the attitudes of all
-times; an image with 0.5 m pixels and the same look angles is intersected line by line with the attitudes as measured.
-Orbit and cameras are known in both, so that attitudes and image points alone differ.
+The attitude errors are equal in both. A strip of twice the base is flown by TH-1's three lines with 5 m pixels. In the
+bundle adjustment, tie points connect the attitudes of all times. An image with 0.5 m pixels and the same look angles is
+intersected line by line with the attitudes as measured. Orbit and cameras are known in both, so that only the errors of
+attitudes and image points matter.
 """
 
 from __future__ import annotations
@@ -28,9 +29,12 @@ from twin.validation.group import Context, group_of
 FINER = 10.0
 """Ratio of the pixel sizes of the coarse (5 m) and the fine (0.5 m) images."""
 IMAGE, FINE = 0.3, 0.1
-"""Errors of an image point, pixels."""
+"""Standard deviations of an image point, pixels, in the main simulation and in a second one.
+
+The second gives the exponent with which the result depends on this error.
+"""
 ERRORS = (0.35, 0.7, 1.4)
-"""Standard deviations of the attitude, arcsec, between which the limit is searched."""
+"""Standard deviations of the attitude, arcsec, for which both methods are simulated to find the limit."""
 STATED = 0.5
 STRIPS, FAST_STRIPS = 5, 3
 TIES, CHECKS = 800, 150
@@ -38,7 +42,7 @@ _FIXED = CameraChangeSpec.model_validate({"lasting": {"angles": 3 * ["0.002 arcs
 
 
 def strip(image: float, attitude: float) -> AdjustSetup:
-    """Return the setup of one pass of three lines without control.
+    """Return the setup of one pass of three lines without ground control.
 
     Parameters
     ----------
@@ -68,7 +72,7 @@ def strip(image: float, attitude: float) -> AdjustSetup:
 
 
 def height_error(drawn: DrawnBlock, bundle: bool) -> float:
-    """Root mean square error of the heights of the check points, metres, by a bundle or by intersection."""
+    """Return the root mean square error of the check points' heights, metres, by a bundle or by intersection."""
     block = drawn.block
     if bundle:
         ground = adjust_block(block).ground
@@ -83,7 +87,10 @@ def height_error(drawn: DrawnBlock, bundle: bool) -> float:
 
 @one_blas_thread()
 def ratios(image: float, seed: np.random.SeedSequence) -> np.ndarray:
-    """Return height errors of a bundle at 5 m over those of intersection at 0.5 m, for the attitude errors `ERRORS`."""
+    """Return the height errors of a bundle at 5 m divided by those of intersection at 0.5 m, (3,).
+
+    They are given for the attitude errors `ERRORS`.
+    """
     return np.array(
         [
             height_error(draw_block(strip(image, error), seed), True)
@@ -96,7 +103,8 @@ def ratios(image: float, seed: np.random.SeedSequence) -> np.ndarray:
 def limit(height_ratios: np.ndarray) -> float:
     """Return the attitude error, in arcseconds, above which the bundle has the smaller errors.
 
-    The ratios (3,) are those at `ERRORS`; their logarithms are nearly a parabola in the logarithm of the error.
+    ``height_ratios`` (3,) are the ratios of bundle to intersection at `ERRORS`; their logarithms are nearly a parabola
+    in the logarithm of the error.
     """
     place, value = np.log(ERRORS), np.log(height_ratios)
     fine = np.linspace(np.log(0.05), np.log(5.0), 2001)
