@@ -88,20 +88,20 @@ def images_figure(run: CameraRun) -> Figure:
     """Draw point images on a linear and on a logarithmic scale, with the grid of the line's pixels."""
     images = run.images
     assert images is not None
-    figure = new_figure(5.8)
-    axes = figure.subplots(len(images.psfs), 2)
+    figure = new_figure(2.9)
+    axes = figure.subplots(1, 2 * len(images.psfs), sharey=True)
     pitch = 1e6 * run.camera.line.pitch
-    for psf, row in zip(images.psfs, axes, strict=True):
+    for psf, pair in zip(images.psfs, axes.reshape(-1, 2), strict=True):
         um, shown = 1e6 * psf.position, psf.values / np.max(psf.values)
         half = min(float(um[-1]), 4.5 * pitch)
         for panel, values, ends, name in (
-            (row[0], shown, (0.0, 1.0), "linear"),
-            (row[1], np.log10(np.maximum(shown, 1e-6)), (-5.0, 0.0), "logarithmic, decades"),
+            (pair[0], shown, (0.0, 1.0), "linear"),
+            (pair[1], np.log10(np.maximum(shown, 1e-6)), (-5.0, 0.0), "decades"),
         ):
             mesh = panel.pcolormesh(
-                um, um, values, cmap="viridis", vmin=ends[0], vmax=ends[1], shading="nearest", rasterized=True
+                um, um, values, cmap="viridis", vmin=ends[0], vmax=ends[1], shading="gouraud", rasterized=True
             )
-            figure.colorbar(mesh, ax=panel, shrink=0.9)
+            figure.colorbar(mesh, ax=panel, location="bottom", shrink=0.9, ticks=ends)
             edges = pitch * (np.arange(-5, 5) + 0.5)
             for edge in edges[np.abs(edges) < half]:
                 panel.axhline(edge, color=LIGHT, lw=0.35, alpha=0.6)
@@ -111,7 +111,8 @@ def images_figure(run: CameraRun) -> Figure:
             panel.set_aspect("equal")
             panel.set_title(f"{degrees_text(run, psf.field)}: {name}", fontsize=8.5)
             panel.set_xlabel(f"along the line, {MICRO}")
-        row[0].set_ylabel(f"along the track, {MICRO}")
+            panel.tick_params(labelsize=7)
+    axes[0].set_ylabel(f"along the track, {MICRO}")
     return figure
 
 
