@@ -187,7 +187,7 @@ def point_images(optics: CameraOptics) -> PointImages:
     """
     *psfs, perfect = spectral_psfs(optics, IMAGE_FIELDS, np.array([optics.wavelength]), np.ones(1), perfect=True)
     # circles about every centroid within all samples
-    radius = np.linspace(0.0, 0.8 * min(float(psf.position[-1]) for psf in psfs), ENERGY_POINTS)
+    radius = np.linspace(0.0, 0.98 * min(map(_room, psfs)), ENERGY_POINTS)
     encircled, ensquared, pixel = [], [], []
     half = 0.5 * optics.model.spec.line.pitch
     for psf in psfs:
@@ -197,6 +197,13 @@ def point_images(optics: CameraOptics) -> PointImages:
         pixel.append(float(ensquared_energy(psf.values, step, half)[0]))
     limit = encircled_energy(perfect.values, float(perfect.position[1] - perfect.position[0]), radius)
     return PointImages(tuple(psfs), radius, np.array(encircled), np.array(ensquared), limit, np.array(pixel))
+
+
+def _room(psf: Psf) -> float:
+    """Return the radius of the largest circle about the centroid of a point image within its samples, metres."""
+    total = np.sum(psf.values)
+    centroid = [float(np.sum(psf.values.sum(axis=axis) * psf.position) / total) for axis in (0, 1)]
+    return float(psf.position[-1]) - max(map(abs, centroid))
 
 
 ENERGY: Record[PointImages] = Record(
