@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from optics.camera.prescription import Camera
-from optics.design.telescopes import TELESCOPES, first_design
+from optics.camera.telescopes import TELESCOPES, first_design
 
 HALF_FIELDS = {"dall-kirkham": 0.02, "korsch": 0.5, "off-axis": 1.0}
 """Half fields along the line, degrees, over which a kind is sharp at F/10; 0.05 for the others."""
@@ -44,7 +44,7 @@ def first_camera(
     pitch : float
         Pixel pitch of the line CCD, metres.
     primary_f_number, behind : float, optional
-        As for `optics.design.telescopes.first_design`.
+        As for `optics.camera.telescopes.first_design`.
 
     Raises
     ------

@@ -9,7 +9,7 @@ import pytest
 from typer.testing import CliRunner
 
 import optics
-from optics.design.telescopes import TELESCOPES, first_design
+from optics.camera.telescopes import TELESCOPES, first_design
 from scenes.lens.__main__ import app
 from scenes.specs.load import load_camera
 from tests.tiers import quick
