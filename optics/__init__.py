@@ -15,7 +15,8 @@ Wavefronts and images
     wavefront           Wavefront error, its rms, Zernike coefficients and Strehl ratio
     psf                 point spread function by diffraction, of one wavelength or a band
     mtf                 modulation transfer function
-    encircled_energy    energy of an image within circles
+    encircled_energy, ensquared_energy    energy of an image within circles or squares
+    seidel              third-order aberrations by surface: Seidel and chromatic sums
     mtf_from_psf        MTF of a sampled image
     airy, annular_mtf   diffraction limits of round pupils, with a central obscuration
 Pupils
@@ -59,6 +60,7 @@ if TYPE_CHECKING:
     from optics.camera.image_quality import Wavefront, mtf, psf, wavefront
     from optics.camera.prescription import Camera, OpticalSurface
     from optics.camera.ray_bundle import TracedRays, distortion, launch_rays, spot_radius, trace
+    from optics.camera.seidel import SeidelSums, seidel
     from optics.geometry.annular_zernike import annular_zernike
     from optics.geometry.zernike import fit as fit_zernikes
     from optics.geometry.zernike import name as zernike_name
@@ -69,7 +71,7 @@ if TYPE_CHECKING:
     from optics.numerics.quadrature import PupilNodes
     from optics.numerics.quadrature import disk as pupil_quadrature
     from optics.waves.diffraction import airy
-    from optics.waves.sampled_psf import annular_mtf, encircled_energy, mtf_from_psf
+    from optics.waves.sampled_psf import annular_mtf, encircled_energy, ensquared_energy, mtf_from_psf
 
 # Before anything can import drjit: it looks for LLVM once, and on many systems finds one that kills the process. What
 # is missing is said by `load_backend`, where a command can tell its user, and not in the middle of an import.
@@ -80,6 +82,7 @@ __all__ = [
     "Camera",
     "OpticalSurface",
     "PupilNodes",
+    "SeidelSums",
     "TracedRays",
     "Wavefront",
     "abbe_number",
@@ -88,6 +91,7 @@ __all__ = [
     "annular_zernike",
     "distortion",
     "encircled_energy",
+    "ensquared_energy",
     "fit_zernikes",
     "fresnel",
     "glass",
@@ -99,6 +103,7 @@ __all__ = [
     "psf",
     "pupil_quadrature",
     "refractive_index",
+    "seidel",
     "spot_radius",
     "trace",
     "wavefront",
@@ -110,13 +115,14 @@ _MODULES = {
     "camera.prescription": ("Camera", "OpticalSurface"),
     "camera.ray_bundle": ("TracedRays", "distortion", "launch_rays", "spot_radius", "trace"),
     "camera.image_quality": ("Wavefront", "mtf", "psf", "wavefront"),
+    "camera.seidel": ("SeidelSums", "seidel"),
     "geometry.annular_zernike": ("annular_zernike",),
     "geometry.zernike": ("fit_zernikes", "noll_to_nm", "zernike", "zernike_name"),
     "materials.fresnel_scatter": ("fresnel",),
     "materials.glass": ("abbe_number", "glass", "glass_names", "refractive_index"),
     "numerics.quadrature": ("PupilNodes", "pupil_quadrature"),
     "waves.diffraction": ("airy",),
-    "waves.sampled_psf": ("annular_mtf", "encircled_energy", "mtf_from_psf"),
+    "waves.sampled_psf": ("annular_mtf", "encircled_energy", "ensquared_energy", "mtf_from_psf"),
 }
 """Name of a module below ``optics`` -> the public names that are imported from it."""
 

@@ -73,6 +73,12 @@ def _check_out(out: Path, suffixes: Sequence[str], force: bool) -> None:
         raise InputError(Issue("the file exists", str(out), allowed="another name, or --force to replace it"))
 
 
+def _camera_name(out: Path) -> str:
+    """Return the name of a camera in a file: that of the file, in letters, digits and underscores."""
+    name = re.sub(r"[^A-Za-z0-9_-]", "_", out.stem)[:64]
+    return name if re.match(r"[A-Za-z]", name) else f"camera_{name}"[:64]
+
+
 def _write(out: Path, content: bytes) -> None:
     """Write a file so that it never exists half-written, even if the program is interrupted."""
     handle, name = -1, ""
@@ -180,15 +186,72 @@ def read(
             lens = replace(lens, fields=((0.0, 0.0), (0.0, half)), heights=(), field_kind="angles", round_field=True)
         if flat_image and not lens.image.surface.is_plane:
             lens = with_flat_image(lens)
-        name = re.sub(r"[^A-Za-z0-9_-]", "_", out.stem)[:64]
-        name = name if re.match(r"[A-Za-z]", name) else f"camera_{name}"[:64]
         assert step is not None
-        made = camera_of(lens, name, load_backend("llvm"), Width(wide, step))
+        made = camera_of(lens, _camera_name(out), load_backend("llvm"), Width(wide, step))
         _write(out, camera_text(made, lens).encode())
     with to_stdout(errors, f"the camera is complete in {out}"):
         for line in made.summary_lines(lens):
             sys.stdout.write(f"{printable(line)}\n")
         sys.stdout.write(f"{out}\n")
+
+
+@app.command()
+def new(
+    kind: Annotated[
+        str,
+        typer.Argument(
+            help="prime-focus, cassegrain, dall-kirkham, ritchey-chretien, korsch or off-axis (both of three mirrors)."
+        ),
+    ],
+    out: Annotated[Path, typer.Option(readable=False, help="The camera's file to write, .yaml.")],
+    aperture: Annotated[str, typer.Option(help="Diameter of the entrance pupil.")] = "0.5 m",
+    f_number: Annotated[float, typer.Option(min=0.5, max=1000.0, help="Focal length over the aperture.")] = 10.0,
+    wavelength: Annotated[str, typer.Option(help="Design wavelength.")] = "650 nm",
+    field: Annotated[
+        str | None,
+        typer.Option(help='Half field along the line, "0.2 deg". Default: one over which the kind is sharp.'),
+    ] = None,
+    pitch: Annotated[str, typer.Option(help="Pixel pitch of the line CCD.")] = "7 um",
+    primary: Annotated[
+        float | None, typer.Option(min=0.5, help="F-number of the primary of two mirrors. Default: a third, 1.5 to 3.")
+    ] = None,
+    behind: Annotated[
+        str | None,
+        typer.Option(help="Distance of the focus behind the primary of two mirrors. Default: half the aperture."),
+    ] = None,
+    force: Force = False,
+) -> None:
+    """Write the camera file of a new reflecting telescope, which the other commands read at once.
+
+        python -m scenes.lens new ritchey-chretien --aperture "0.4 m" --f-number 8 --out my_camera.yaml
+
+        python -m twin.camera my_camera.yaml
+
+    First-order optics give the layout with exactly this focal length, third-order optics the conic constants; those of
+    the off-axis anastigmat minimise the traced wavefront error. Exit code 2 if there is no such telescope.
+    """
+    errors = Console(stderr=True)
+    with _explained(errors):
+        _check_out(out, (".yaml", ".yml"), force)
+        sizes = [_quantity("--aperture", aperture, LENGTH), _quantity("--wavelength", wavelength, LENGTH)]
+        half, step = _quantity("--field", field, ANGLE), _quantity("--pitch", pitch, LENGTH)
+        back = _quantity("--behind", behind, LENGTH)
+        from scenes.lens.first_design import first_camera
+        from scenes.specs.camera import CameraSpec
+        from scenes.yaml.spec import validate
+        from scenes.yaml.yaml_file import parse_yaml
+
+        assert sizes[0] is not None
+        assert sizes[1] is not None
+        assert step is not None
+        try:
+            text = first_camera(kind, _camera_name(out), sizes[0], f_number, sizes[1], half, step, primary, back)
+        except ValueError as error:
+            raise InputError(Issue(str(error))) from None
+        validate(CameraSpec, parse_yaml(text))
+        _write(out, text.encode())
+    with to_stdout(errors, f"the camera is complete in {out}"):
+        sys.stdout.write(f"{out}\nanalyse it: python -m twin.camera {out}\n")
 
 
 @app.command()

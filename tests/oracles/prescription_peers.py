@@ -90,6 +90,25 @@ class Rayoptics:
         self.scale = {"mm": 1e-3, "inches": 25.4e-3, "cm": 1e-2}[self.model["system_spec"].dimensions]
         self.wave = float(self.model["optical_spec"]["wvls"].central_wvl)
 
+    def third_order(self) -> tuple[np.ndarray, float, float]:
+        """Its Seidel sums by surface (K, 5), radius of the paraxial beam at the stop, and edge of the field."""
+        from rayoptics.parax.thirdorder import compute_third_order
+
+        self.sequence.gaps[0].thi = 1e10
+        self.model.update_model()
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            table = compute_third_order(self.model)
+        marginal, chief, _ = self.model["analysis_results"]["parax_data"]
+        # the part of an asphere has a row of its own, 3.asp
+        rows = table.drop(index="sum")
+        sums = rows.groupby(lambda label: int(str(label).partition(".")[0]), sort=True).sum().to_numpy(float)
+        return (
+            self.scale * sums,
+            self.scale * abs(marginal[self.sequence.stop_surface][0]),
+            float(np.arctan(chief[0][1])),
+        )
+
     def glasses(self) -> list[tuple[str, float]]:
         """Names and indices of its glasses, in the order of the light."""
         surfaces = self.sequence.ifcs[: len(self.sequence.gaps)]

@@ -16,7 +16,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from optics.camera.seidel import seidel_sums
 from optics.numerics.backend import Backend
+from optics.raytrace.assembly import Interaction
 from optics.raytrace.system import assemble
 from optics.raytrace.trace import make_rays, trace
 from scenes.lens.batoid_reader import read_batoid
@@ -114,6 +116,32 @@ def test_files_that_would_be_taken_wrongly(name: str) -> None:
     with pytest.raises(InputError, match=problem) as caught:
         (read_zemax if path.suffix.lower() == ".zmx" else read_codev)(path, peers.AnyGlass())
     assert caught.value.line == line
+
+
+SEIDEL = """
+codev/tests/questar35.seq codev/tests/ag_dblgauss.seq codev/tests/schmidt.seq codev/tests/achroMangin_ok.seq
+codev/tests/schmidt_sph.seq codev/tests/lens_reflection_test.seq codev/tests/unfolded_lenses_w_ape.seq
+codev/tests/CODV_65988_noDOE.seq zemax/tests/US08427765-1.ZMX zemax/tests/US00583336-2-scaled.zmx
+""".split()
+"""Centred systems of ray-optics: mirrors, lenses, aspheres, a Mangin mirror, stops in front, within and behind."""
+
+
+@pytest.mark.parametrize("name", quick(2, SEIDEL))
+def test_seidel_sums_by_surface_are_those_of_ray_optics(name: str) -> None:
+    """Its light comes from a point 1e10 mm away, which is 1e-8 of the sums; surfaces without effect are nobody's."""
+    path = package("rayoptics") / name
+    peer = peers.Rayoptics(path)
+    lens = peers.read_alike(read_zemax if path.suffix.lower() == ".zmx" else read_codev, path, peer)
+    theirs, marginal, field = peer.third_order()
+    names = [surface.name for surface in lens.surfaces]
+    assembly, indices = lens.assembly(apertures=False), [1.0]
+    for name in names:
+        element = assembly.elements[name]
+        indices.append(element.index_after if element.interaction is Interaction.REFRACT else indices[-1])
+    ours = seidel_sums(assembly, names, lens.stop, marginal, field, [np.array(indices)]).sums
+    largest = np.max(np.abs(theirs), axis=0)
+    acting = [rows[np.max(np.abs(rows), axis=1) > 1e-12 * largest.max()] for rows in (ours, theirs)]
+    assert np.max(np.abs(acting[0] - acting[1]) / largest) < 1e-6
 
 
 BATOID = """

@@ -231,7 +231,7 @@ class CameraOptics:
         stop = np.concatenate([[[0.0, 0.0]], stop_nodes_xy, edge, INSIDE * np.stack([x[inside], y[inside]], axis=-1)])
         rays = self.rays(fields, stop)
         wavelength = self.wavelength
-        error = -self._path(rays) / wavelength
+        error = -self.path_error(rays) / wavelength
         out = []
         node_slice = slice(1, 1 + nodes.count)
         light, is_vignetted = rays.valid[:, node_slice] @ nodes.share, self.cut is not None or bool(self.model.edges)
@@ -242,7 +242,7 @@ class CameraOptics:
             tilt = zernike.fit(3, nodes.x, nodes.y, error[k, node_slice], weight)
             exact = None
             if is_vignetted:
-                exact = fit_illuminated(self.path, self.state, sight[k], RINGS, float(light[k]), self._path, terms)
+                exact = fit_illuminated(self.path, self.state, sight[k], RINGS, float(light[k]), self.path_error, terms)
             tilt = tilt if exact is None else exact.fit.level
             flat = error[k] - zernike.basis(3, *stop.T) @ tilt
             table = np.full(inside.shape, np.nan)
@@ -514,7 +514,7 @@ class CameraOptics:
         """Compute the MTF at one field and the wavelength of the light, over frequencies in cycles/m."""
         return self.mtfs([field], frequency)[0]
 
-    def _path(self, rays: LineRays) -> np.ndarray:
+    def path_error(self, rays: LineRays) -> np.ndarray:
         """Return optical paths to the reference spheres minus those of the chief rays, metres, (F, N).
 
         There are F fields with N rays each.

@@ -63,6 +63,82 @@ def spot_figure(run: CameraRun) -> Figure:
     return figure
 
 
+def fans_figure(run: CameraRun) -> Figure:
+    """Draw transverse ray fans and path fans of three fields."""
+    fans = run.fans
+    figure = new_figure(5.0)
+    axes = figure.subplots(2, len(fans.fields), sharex=True, sharey="row")
+    for f, field in enumerate(fans.fields):
+        for k, (colour, name) in enumerate(((LINE, "fan along the line"), (TRACK, "fan along the track"))):
+            axes[0, f].plot(fans.pupil, 1e6 * fans.transverse[f, k, k], color=colour, lw=1.4, label=name)
+            axes[1, f].plot(fans.pupil, fans.path[f, k], color=colour, lw=1.4)
+        axes[0, f].set_title(degrees_text(run, field), fontsize=8.5)
+        axes[1, f].set_xlabel("stop coordinate / radius")
+        for panel in axes[:, f]:
+            panel.axhline(0.0, color=LIGHT, lw=0.8, zorder=0)
+            panel.axvline(0.0, color=LIGHT, lw=0.8, zorder=0)
+            plain_axes(panel)
+    axes[0, 0].set_ylabel(f"ray from the chief ray, {MICRO}")
+    axes[1, 0].set_ylabel(f"path, waves of {1e9 * run.camera.wavelength:.0f} nm")
+    figure.legend(*axes[0, 0].get_legend_handles_labels(), ncols=2, loc="outside upper right", fontsize=7.5)
+    return figure
+
+
+def images_figure(run: CameraRun) -> Figure:
+    """Draw point images on a linear and on a logarithmic scale, with the grid of the line's pixels."""
+    images = run.images
+    assert images is not None
+    figure = new_figure(2.9)
+    axes = figure.subplots(1, 2 * len(images.psfs), sharey=True)
+    pitch = 1e6 * run.camera.line.pitch
+    for psf, pair in zip(images.psfs, axes.reshape(-1, 2), strict=True):
+        um, shown = 1e6 * psf.position, psf.values / np.max(psf.values)
+        half = min(float(um[-1]), 4.5 * pitch)
+        for panel, values, ends, name in (
+            (pair[0], shown, (0.0, 1.0), "linear"),
+            (pair[1], np.log10(np.maximum(shown, 1e-6)), (-5.0, 0.0), "decades"),
+        ):
+            mesh = panel.pcolormesh(
+                um, um, values, cmap="viridis", vmin=ends[0], vmax=ends[1], shading="gouraud", rasterized=True
+            )
+            figure.colorbar(mesh, ax=panel, location="bottom", shrink=0.9, ticks=ends)
+            edges = pitch * (np.arange(-5, 5) + 0.5)
+            for edge in edges[np.abs(edges) < half]:
+                panel.axhline(edge, color=LIGHT, lw=0.35, alpha=0.6)
+                panel.axvline(edge, color=LIGHT, lw=0.35, alpha=0.6)
+            panel.set_xlim(-half, half)
+            panel.set_ylim(-half, half)
+            panel.set_aspect("equal")
+            panel.set_title(f"{degrees_text(run, psf.field)}: {name}", fontsize=8.5)
+            panel.set_xlabel(f"along the line, {MICRO}")
+            panel.tick_params(labelsize=7)
+    axes[0].set_ylabel(f"along the track, {MICRO}")
+    return figure
+
+
+def energy_figure(run: CameraRun) -> Figure:
+    """Draw encircled and ensquared energy of the point images, and that of a perfect image."""
+    images = run.images
+    assert images is not None
+    figure = new_figure(3.3)
+    left, right = figure.subplots(1, 2, sharey=True)
+    um = 1e6 * images.radius
+    left.plot(um, images.limit, color=INK, lw=0.8, ls=(0, (4, 3)), label="without wavefront error")
+    for k, (psf, colour) in enumerate(zip(images.psfs, (BLUE, VERMILION), strict=True)):
+        left.plot(um, images.encircled[k], color=colour, lw=1.4, label=degrees_text(run, psf.field))
+        right.plot(um, images.ensquared[k], color=colour, lw=1.4, label=degrees_text(run, psf.field))
+    right.axvline(0.5e6 * run.camera.line.pitch, color=GREY, lw=0.8, ls=":", label="half a pixel")
+    for panel, name, axis in ((left, "Encircled", "radius"), (right, "Ensquared", "half width")):
+        panel.set_title(f"{name} energy")
+        panel.set_xlabel(f"{axis}, {MICRO}")
+        panel.set_xlim(0.0, float(um[-1]))
+        panel.set_ylim(0.0, 1.0)
+        panel.legend(fontsize=7.5, loc="lower right")
+        plain_axes(panel)
+    left.set_ylabel("share of the light")
+    return figure
+
+
 def zernike_figure(run: CameraRun) -> Figure:
     """Draw the Zernike coefficients of the wavefront in the middle of the field and at the worst field."""
     figure = new_figure(3.6)

@@ -8,10 +8,12 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
+from optics.camera.seidel import ABERRATIONS
 from optics.geometry import zernike
 from scenes.models.camera_design import file_with_plane
 from scenes.models.camera_sharpness import FIELDS, field_text
 from twin.camera import camera_plots as plots
+from twin.camera.aberrations import COEFFICIENTS
 from twin.camera.camera_run import CameraRun, built_text, camera_data, perturbed_text, refocus_text, verdict
 from twin.camera.colour import Colours
 from twin.camera.first_order_data import FIRST_ORDER, unmodelled_obscuration
@@ -34,10 +36,16 @@ def camera_report(run: CameraRun) -> Report:
         *([_refocus(run)] if run.refocus is not None else []),
         _wavefronts(run),
         _spots(run),
+        *([_energy(run)] if run.images is not None else []),
         _mtf(run),
     ]
     sections += [*_colours(run)]
-    sections += [_through_focus(run), _field(run), *([_bodies(run)] if run.quality is not None else [])]
+    sections += [
+        _through_focus(run),
+        _field(run),
+        _third_order(run),
+        *([_bodies(run)] if run.quality is not None else []),
+    ]
     return Report(
         f"Camera {run.setup.title}",
         verdict_text,
@@ -226,7 +234,51 @@ def _spots(run: CameraRun) -> Section:
     figure = _figure("spots", "Spot diagrams", caption, plots.spot_figure, run)
     decimals = (None, 3, 3, 3, 3, 3)
     table = Table("spot-sizes", "Spot sizes by field", "Radii about the centroid.", heads, rows, decimals)
-    return Section("Spots", (), (figure, table))
+    about = (
+        "Ray minus chief ray on the focal plane, in the direction of the fan; wavefront error against the chief ray."
+    )
+    fans = _figure("ray-fans", "Ray fans", about, plots.fans_figure, run)
+    return Section("Spots", (), (figure, fans, table))
+
+
+def _energy(run: CameraRun) -> Section:
+    """Return the section on point images and their energy."""
+    images = run.images
+    assert images is not None
+    rows: list[list[Cell]] = [
+        [plots.degrees_text(run, psf.field), *(None if v is None else 1e6 * v for v in (half, most)), float(pixel)]
+        for psf, half, most, pixel in zip(
+            images.psfs, images.radius_of(0.5), images.radius_of(0.8), images.pixel, strict=True
+        )
+    ]
+    heads = ("field", "50 % within [µm]", "80 % within [µm]", "light in a pixel")
+    about = "Optics alone at the design wavelength, peak 1, about the chief ray; the grid shows pixels of the line."
+    caption = "Light within circles and squares about the centroid; half widths of squares."
+    artefacts = (
+        _figure("point-images", "Point images", about, plots.images_figure, run),
+        _figure("energy", "Encircled and ensquared energy", caption, plots.energy_figure, run),
+        Table("energy-table", "Energy by field", "Radii of circles; a pixel is centred on the image.", heads, rows,
+              (None, 2, 2, 3)),
+    )  # fmt: skip
+    return Section("Point images", (), artefacts)
+
+
+def _third_order(run: CameraRun) -> Section:
+    """Return the section on third-order aberrations by surface."""
+    title, third = "Third-order aberrations", run.third_order
+    if third is None:
+        return Section(title, ("No Seidel sums: they are defined for surfaces centred on one axis.",))
+    rows: list[list[Cell]] = [[name, *map(float, row)] for name, row in zip(third.sums.names, third.waves, strict=True)]
+    rows.append(["sum", *map(float, third.waves.sum(axis=0))])
+    names = (*ABERRATIONS, "axial colour", "lateral colour")
+    heads = ["surface", *(f"{a} {c}" for a, c, _ in zip(names, COEFFICIENTS, third.waves.T, strict=False))]
+    text = (
+        "Seidel sums of the nominal camera about its axis, as wavefront coefficients at the rim of the stop and the "
+        "corner of the field that is farthest from the axis. Surfaces with large terms of opposite signs are sensitive "
+        f"to alignment. Petzval curvature {plain(third.sums.petzval, 4)} /m."
+    )
+    table = Table("third-order", "Coefficients by surface", "Waves.", heads, rows, (None, *[3] * (len(heads) - 1)))
+    return Section(title, (text,), (table,))
 
 
 def _mtf(run: CameraRun) -> Section:

@@ -28,6 +28,16 @@ from scenes.specs.perturbation import perturbation_text
 from scenes.specs.resolved import CameraSetup
 from scenes.yaml.errors import InputError, Issue
 from twin.camera import field_maps
+from twin.camera.aberrations import (
+    ENERGY,
+    THIRD_ORDER,
+    PointImages,
+    RayFans,
+    ThirdOrder,
+    point_images,
+    ray_fans,
+    third_order,
+)
 from twin.camera.camera_optics import CameraOptics
 from twin.camera.camera_results import Field, Mtf, Spot, Wavefront
 from twin.camera.colour import COLOURS, Colours, colour_data, evaluate_colours
@@ -49,6 +59,9 @@ GRID: tuple[Field, ...] = tuple((x, y) for y in (1.0, 0.0, -1.0) for x in (-1.0,
 
 MTF_FIELDS: tuple[Field, ...] = ((0.0, 0.0), (0.7, 0.0), (1.0, 0.0), (1.0, 1.0), (1.0, -1.0))
 """Fields, in fractions of the half fields along line and track, of MTF curves and of image quality through focus."""
+
+FAN_FIELDS: tuple[Field, ...] = ((0.0, 0.0), (1.0, 0.0), (1.0, 1.0))
+"""Fields of the ray fans."""
 
 ERROR_GRID = (25, 9)
 """Number of fields along the line and along the track at which the map of rms wavefront errors is computed."""
@@ -189,6 +202,21 @@ class CameraRun:
             kinds[aberration_name(j)] = kinds.get(aberration_name(j), 0.0) + float(part) ** 2
         ranked = sorted(((kind, float(np.sqrt(square))) for kind, square in kinds.items()), key=lambda k: -k[1])
         return tuple(ranked)
+
+    @cached_property
+    def third_order(self) -> ThirdOrder | None:
+        """Third-order aberrations of the nominal camera by surface; None for one that is not centred on an axis."""
+        return third_order(self.optics.model)
+
+    @cached_property
+    def fans(self) -> RayFans:
+        """Ray fans at FAN_FIELDS."""
+        return ray_fans(self.optics, FAN_FIELDS)
+
+    @cached_property
+    def images(self) -> PointImages | None:
+        """Point images and their energies at the design wavelength; None for a camera too blurred for an MTF."""
+        return point_images(self.optics) if self.mtfs else None
 
 
 def aberration_name(index: int) -> str:
@@ -522,6 +550,14 @@ CAMERA: Record[CameraRun] = Record(
     Quantity("first_order", lambda run: run.first_order, record=FIRST_ORDER),
     Quantity("fields", _field_numbers, "wavefront and spot, field by field"),
     Quantity("mtf_at_nyquist", lambda run: run.mtfs, record=_MTF),
+    Quantity("energy", lambda run: run.images, "energy of point images", record=ENERGY, where_known=True),
+    Quantity(
+        "third_order",
+        lambda run: run.third_order,
+        "Seidel and chromatic sums by surface",
+        record=THIRD_ORDER,
+        where_known=True,
+    ),
     Quantity("colours", lambda run: run.colours, "polychromatic results", record=COLOURS, where_known=True),
     Quantity("distortion", lambda run: run.distortion, record=_DISTORTION),
     Quantity("refocus", lambda run: run.refocus, record=_REFOCUS),
@@ -595,5 +631,11 @@ def camera_data(run: CameraRun) -> xr.Dataset:
         colour_variables, colour_coords = colour_data(run.colours)
         data |= colour_variables
         coords |= colour_coords
+    fan = ("fan_field", "fan", "direction", "pupil")
+    data["ray_fan"] = (fan, run.fans.transverse, named("position of rays of a fan, chief ray at 0", metres))
+    data["path_fan"] = (fan[:2] + fan[3:], run.fans.path, named("wavefront error of a fan, chief ray at 0", waves))
+    coords["fan"] = ("fan", ["along line", "along track"], named("diameter of the stop"))
+    coords["pupil"] = ("pupil", run.fans.pupil, named("coordinate in the stop, in units of its radius"))
+    coords["fan_field_share"] = (("fan_field", "direction"), np.array(FAN_FIELDS), named(share))
     attributes = {"title": "wavefronts, MTF and distortion of a camera over its field"}
     return xr.Dataset(data, coords, {**attributes, "reference_frames": frames_text("optics")})

@@ -247,9 +247,15 @@ def spectral_mtfs(
 
 
 def spectral_psfs(
-    optics: CameraOptics, fields: Sequence[Field] | np.ndarray, wavelengths: np.ndarray, weights: np.ndarray
+    optics: CameraOptics,
+    fields: Sequence[Field] | np.ndarray,
+    wavelengths: np.ndarray,
+    weights: np.ndarray,
+    perfect: bool = False,
 ) -> tuple[Psf, ...]:
     """Compute point images of K weighted wavelengths at F fields, (F, 2), with ``PSF_POINTS`` on each side.
+
+    With ``perfect`` the image of the first field's pupils without wavefront error is the last.
 
     Raises
     ------
@@ -290,7 +296,10 @@ def spectral_psfs(
             for w, pupil_field in zip(shares, sampled, strict=True)
         )
         out.append(Psf(design[f].field, grid.points(), values, peak / limit))
-    return tuple(out)
+        if perfect and f == 0:
+            flat = [replace(pupil_field, eikonal=np.zeros_like(pupil_field.eikonal)) for pupil_field in sampled]
+            ideal = Psf(design[f].field, grid.points(), over_light(grid, grid, flat), 1.0)
+    return (*out, ideal) if perfect else tuple(out)
 
 
 def _sampled(pupil: PupilFunction, wavelength: float, half: float) -> PupilField:

@@ -109,6 +109,9 @@ def distortion(optics: CameraOptics) -> Distortion:
     local = light @ plane
     # the light comes along +-Z of the focal plane; its image of a direction lies the way that the light goes
     tangent = local[:, 1::-1] / np.abs(local[:, 2:])
+    # an intermediate image turns the image over
+    upright = float(np.sign(np.sum((tangent - tangent.mean(axis=0)) * (places - places.mean(axis=0)))))
+    tangent = upright * tangent
     count = len(places)
     design = np.zeros((2 * count, 3))
     design[:, 0] = tangent.T.ravel()
@@ -126,6 +129,7 @@ def distortion(optics: CameraOptics) -> Distortion:
     angle = np.arctan2(camera_sight[:, 1], -camera_sight[:, 2]) - np.arctan2(
         camera_sight[LINE_POINTS // 2, 1], -camera_sight[LINE_POINTS // 2, 2]
     )
+    angle = upright * angle
     balanced = float(principal_distance(position, angle))
     both, point = (float(value) for value in principal_distance_and_point(position, angle))
     t = np.tan(angle)

@@ -1,0 +1,110 @@
+"""Seidel sums, ray fans and energies of a camera, against the library, each other and the analytic image of a ring."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.integrate import quad
+from scipy.special import j1
+
+import optics
+from optics import Camera, OpticalSurface
+from scenes.specs.load import load_camera
+from twin.camera.aberrations import IMAGE_FIELDS, point_images, ray_fans, third_order
+from twin.camera.camera_optics import CameraOptics
+from twin.camera.camera_run import FAN_FIELDS
+
+
+@pytest.fixture(scope="module")
+def gf7(backend) -> CameraOptics:
+    return CameraOptics.alone(load_camera("gf7"), backend)
+
+
+def test_third_order_of_a_camera_is_that_of_its_numbers(backend, gf7: CameraOptics) -> None:
+    """Typed from the file; the field is the corner of the biased field that is farthest from the axis."""
+    spec = gf7.model.spec
+    z = [*(mirror.z for mirror in spec.mirrors.values()), spec.image.z]
+    surfaces = []
+    for mirror, gap in zip(spec.mirrors.values(), np.diff(z), strict=True):
+        asphere = [mirror.aspheric.get(f"A{order}", 0.0) for order in (4, 6, 8)]
+        surfaces.append(OpticalSurface(mirror.radius, gap, mirror.conic, "mirror", asphere=asphere))
+    surfaces[1] = replace(surfaces[1], diameter=spec.stop_diameter)
+    field = np.arctan(np.hypot(np.tan(spec.field.x), np.tan(spec.field_bias + spec.field.y)))
+    expected = optics.seidel(Camera(surfaces, spec.wavelength, stop=1), field)
+    found = third_order(gf7.model)
+    assert found is not None
+    np.testing.assert_allclose(found.sums.sums, expected.sums, rtol=1e-9, atol=1e-9 * np.abs(expected.sums).max())
+
+
+def test_a_camera_with_a_tilted_mirror_has_no_third_order(backend) -> None:
+    spec = load_camera("ritchey_chretien")
+    mirror = spec.mirrors["M2"].model_copy(update={"rotate": (1e-4, 0.0, 0.0)})
+    tilted = spec.model_copy(update={"mirrors": {**spec.mirrors, "M2": mirror}})
+    assert third_order(CameraOptics.alone(spec, backend).model) is not None
+    assert third_order(CameraOptics.alone(tilted, backend).model) is None
+
+
+def test_rays_of_a_fan_are_the_slopes_of_its_path(gf7: CameraOptics) -> None:
+    """A ray leaves the image of its chief ray by the slope of the path in direction cosines, to first order."""
+    fans = ray_fans(gf7, FAN_FIELDS)
+    stop = np.concatenate([[[0.0, 0.0]], np.stack([fans.pupil, 0.0 * fans.pupil], -1)])
+    for f in range(len(FAN_FIELDS)):
+        rays = gf7.rays(FAN_FIELDS[f : f + 1], stop)
+        cosine = rays.direction[0, 1:, 1]
+        slope = np.gradient(gf7.wavelength * fans.path[f, 0], cosine)[2:-2]
+        transverse = fans.transverse[f, 0, 0, 2:-2]
+        assert np.max(np.abs(np.abs(slope) - np.abs(transverse))) < 0.03 * np.max(np.abs(transverse)) + 2e-8
+
+
+def test_energy_of_a_ring_is_the_analytic_one(backend) -> None:
+    """A paraboloid at F/40 with a central hole, on its axis: the image of an annular pupil."""
+    share = 0.3
+
+    def irradiance(v: float) -> float:
+        amplitude = 2.0 * j1(v) / v - share**2 * 2.0 * j1(share * v) / (share * v)
+        return float(v * amplitude**2)
+
+    camera = Camera(
+        [OpticalSurface(-16.0, -8.0, -1.0, "mirror", diameter=0.2, inner_diameter=share * 0.2)], wavelength=500e-9
+    )
+    step = 0.25 * camera.wavelength * camera.f_number
+    image = optics.psf(camera, step, 129)
+    radius = np.array([0.7, 1.5, 3.0, 6.0]) * camera.wavelength * camera.f_number
+    whole = 2.0 * (1.0 - share**2)
+    expected = [
+        quad(irradiance, 1e-9, np.pi * r / (camera.wavelength * camera.f_number), limit=400)[0] / whole for r in radius
+    ]
+    assert optics.encircled_energy(image, step, radius) == pytest.approx(expected, abs=1e-4)
+
+
+def test_energy_of_a_square_is_the_sum_of_its_samples() -> None:
+    """Of an image that is fine in its samples: trapezoids over the square."""
+    n, step = 801, 0.05
+    x = step * (np.arange(n) - n // 2)
+    image = np.exp(-0.5 * (x**2 + (x[:, None] - 0.4) ** 2) / 1.5**2) / (2.0 * np.pi * 1.5**2)
+    inside = np.abs(x) <= 2.0 + 1e-9
+    weight = np.where(inside, step, 0.0)
+    weight[np.flatnonzero(inside)[[0, -1]]] *= 0.5
+    (found,) = optics.ensquared_energy(image, step, 2.0, (0.0, 0.4))
+    around = np.roll(image, -8, axis=0)
+    assert found == pytest.approx(float(weight @ around @ weight), abs=1e-4)
+    with pytest.raises(ValueError, match="half widths"):
+        optics.ensquared_energy(image, step, 30.0)
+
+
+def test_point_images_of_a_camera_have_the_energy_of_its_pupil(gf7: CameraOptics) -> None:
+    images = point_images(gf7)
+    assert [psf.field for psf in images.psfs] == list(IMAGE_FIELDS)
+    assert np.all(np.diff(images.encircled, axis=1) > -1e-9)
+    assert np.all(images.encircled <= images.limit + 1e-3)
+    assert np.all(images.ensquared[:, 1:] > images.encircled[:, 1:])
+    half, most = images.radius_of(0.5)[0], images.radius_of(0.8)[0]
+    assert half is not None
+    assert most is not None
+    assert half < most
+    assert images.radius_of(0.999) == [None, None]
+    # a pixel of 7 um contains what the square of 3.5 um does; the curve is interpolated linearly between its points
+    at = np.interp(3.5e-6, images.radius, images.ensquared[0])
+    assert images.pixel[0] == pytest.approx(at, abs=4e-3)
