@@ -603,7 +603,7 @@ def heavy_tails(rows: Array, stated: Disturbances, noise: Array, gain: Array, de
         Degrees of freedom, above 2.
     """
     if degrees <= 2.0:
-        raise ValueError(f"heavy tails: Student's distribution has a variance above 2 degrees, found {degrees}")
+        raise ValueError(f"heavy tails: Student's t distribution needs more than 2 degrees of freedom, found {degrees}")
     reading = rows @ gain
     error = reading @ stated.spots - rows @ stated.parameters
     groups = list(prior_numbers(stated).values())

@@ -140,7 +140,7 @@ class NodalTemperature:
         count = len(self.points)
         if not MIN_NODES <= count <= MAX_NODES:
             text = f"{count} different nodes"
-            raise NodesError(text, f"{MIN_NODES} to {MAX_NODES}: those of this body alone")
+            raise NodesError(text, f"{MIN_NODES} to {MAX_NODES} nodes, all of this body")
         self._middle = self.points.mean(axis=0)
         # bodies are often thin with nodes in layers; equal extents along all axes give well-shaped tetrahedra
         extent = np.ptp(self.points, axis=0)

@@ -306,7 +306,7 @@ def test_outlines_that_are_wrong_about_the_light_are_refused(backend, camera, mo
     middle = np.zeros((1, 2))
     assert len(path.vignetted_pupils({}, path.directions(middle), middle)) == 1
     monkeypatch.setattr("twin.targets.target_path.WORST_PLACED", -1.0)
-    with pytest.raises(UnphysicalError, match="the outlines of its edges misjudge a fraction"):
+    with pytest.raises(UnphysicalError, match="the outlines of the apertures put a fraction"):
         path.vignetted_pupils({}, path.directions(middle), middle)
 
 

@@ -173,7 +173,12 @@ def _per_shift(table: Table, files: FocusFiles) -> Array | float:
     """
     if files.moved != "target":
         if "per shift" in table:
-            raise table.error(0, "per shift", "only a target's shift differs from the image's", allowed="moved: target")
+            raise table.error(
+                0,
+                "per shift",
+                "the key is for a target that moves; a detector moves as much as the image",
+                allowed="moved: target",
+            )
         # moving the CCD downstream is equivalent to moving the image upstream
         return 1.0 if files.moved == "image" else -1.0
     if "per shift" in table:

@@ -412,7 +412,7 @@ class TargetPath:
             )
             if misjudged > WORST_PLACED:
                 raise UnphysicalError(
-                    f"the outlines of its edges misjudge a fraction {misjudged:.2g} of a traced beam's rays"
+                    f"the outlines of the apertures put a fraction {misjudged:.2g} of the traced rays on the wrong side"
                 )
         return vignetted
 

@@ -568,7 +568,9 @@ class Check(Spec):
         if goal is None:
             raise ValueError(f"{self.id}: the paper prints no number, so `evaluate` needs `implied`")
         if not (math.isfinite(measured) and math.isfinite(noise) and math.isfinite(goal)):
-            raise ValueError(f"{self.id}: {measured!r} with sigma {sigma!r} against {goal!r} is no comparison")
+            raise ValueError(
+                f"{self.id}: measured {measured!r}, sigma {sigma!r} and expected {goal!r} must be finite numbers"
+            )
         if self.tells is None or (self.basis == "chosen") != bool(inputs):
             raise ValueError(f"{self.id}: it must say what it tells, and its inputs just where they are chosen")
         goal, allowed = float(goal), self.tolerance + noise

@@ -419,7 +419,10 @@ class OrbitAdjustSpec(PayloadTestSpec):
         if self.angles and not lasting:
             problem = "an angle between star trackers that have no constant error"
             raise Problem(
-                problem, None, "a law `constant` of `shared_by: tracker` in errors.attitude", within=("angles",)
+                problem,
+                None,
+                "an entry of errors.attitude with `law: constant` and `shared_by: tracker`",
+                within=("angles",),
             )
         return self._has_known_groups()
 

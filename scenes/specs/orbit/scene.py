@@ -65,7 +65,7 @@ def _apart(outlines: tuple[tuple[Corner, ...], ...]) -> tuple[tuple[Corner, ...]
     turn = 2.0 * np.pi * np.arange(64) / 64
     disk = np.stack([np.cos(turn), np.sin(turn)], axis=-1)[None]
     if sum(float(area(intersect(shape, *sides(disk)))[0]) for shape in shapes) > 0.9 * np.pi:
-        raise Problem("the pupil is covered", "", "outlines that leave at least a tenth of it")
+        raise Problem("the pupil is covered", "", "outlines that leave at least a tenth of the pupil open")
     return outlines
 
 

@@ -403,7 +403,10 @@ def _pairs(analysis: StudyAnalysis) -> Section | None:
 
 
 def _fronts(analysis: StudyAnalysis) -> Section | None:
-    remarks = tuple(f"{pair}: texts have no order, so that there is no front." for pair in analysis.not_numbers)
+    remarks = tuple(
+        f"{pair}: its values are texts, which have no order, so that no Pareto front is drawn."
+        for pair in analysis.not_numbers
+    )
     if not analysis.fronts:
         return Section("Best compromises", remarks) if remarks else None
     caption = (
