@@ -89,7 +89,7 @@ def _chief(camera: Camera, field: Field) -> tuple[np.ndarray, float]:
     if camera.is_afocal:
         raise UnphysicalError("the camera is afocal: parallel light leaves it parallel, so that it makes no image")
     launch, direction = (array[0] for array in launch_rays(camera, field, np.zeros((1, 2))))
-    distance = first_order(camera.matrix(launch, direction)).exit_pupil_distance
+    distance = first_order(camera._matrix(launch, direction)).exit_pupil_distance
     return chief_point(camera, field), float(distance[0])
 
 
@@ -179,9 +179,11 @@ def _field_at(camera: Camera, field: Field, nodes: PupilNodes, origin: np.ndarra
 
     ``origin`` (3,) is that point, in metres in the camera's frame.
     """
-    imaging, to_stop = camera.systems
-    rays = imaging_rays(default_backend(), imaging, to_stop, direction_of(field), camera.launch, camera.aperture, nodes)
-    return pupil_field(rays, camera.wavelength, camera.image_pose.inverse().apply(origin))
+    imaging, to_stop = camera._systems
+    rays = imaging_rays(
+        default_backend(), imaging, to_stop, direction_of(field), camera._launch, camera._aperture, nodes
+    )
+    return pupil_field(rays, camera.wavelength, camera._image_pose.inverse().apply(origin))
 
 
 def psf(
@@ -273,7 +275,7 @@ def mtf(
     camera : Camera
         Camera whose wavelength is used by default.
     frequency : (M,) array_like
-        M spatial frequencies, cycles per metre.
+        M spatial frequencies, cycles per metre; their sign has no meaning.
     field : (float, float)
         Angles x and y of the far point, radians.
     azimuth : float
