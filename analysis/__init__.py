@@ -64,6 +64,10 @@ Statistics
     robust_sigma              standard deviation of residuals with outliers
     proportion_interval       confidence interval of a proportion
 
+Classes of results
+    SpotFit, EdgeMtf, InteriorOrientation, ...
+                              as each function's help names them
+
 `help(analysis.fit_spot)` and so on show parameters, references and a runnable example. Names are imported when they are
 first used. They stay the same within a major version; the modules below this package may change.
 """
@@ -89,76 +93,97 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from analysis.block.block import make_block
-    from analysis.block.block_adjustment import adjust_block
-    from analysis.focal_plane.plane_fit import fit_focal_plane
-    from analysis.focal_plane.through_focus import focus_vertex
+    from analysis.block.block import Block, make_block
+    from analysis.block.block_adjustment import BlockAdjustment, adjust_block
+    from analysis.focal_plane.plane_fit import FocalPlaneFit, fit_focal_plane
+    from analysis.focal_plane.through_focus import FocusVertex, focus_vertex
     from analysis.matching.correlation import MatchOptions, distinct_points
-    from analysis.matching.matches import consensus, match_windows
+    from analysis.matching.matches import Consensus, Matches, consensus, match_windows
     from analysis.monitor.disturbances import Disturbances, TimeLaw
+    from analysis.monitor.jump_detection import Jump
     from analysis.monitor.monitor_formulas import MonitorGeometry
     from analysis.monitor.parameters import CameraCalibration, MonitorCalibration
-    from analysis.monitor.recovery import recover_monitor
-    from analysis.monitor.series_smoother import detect_jumps, smooth_series
-    from analysis.mtf.bar_mtf import bar_mtf
-    from analysis.mtf.slanted_edge import slanted_edge_mtf
-    from analysis.orbit.forward_intersection import circular_error, intersect_rays, linear_error
-    from analysis.orbit.jitter import find_jitter
+    from analysis.monitor.recovery import Recovery, recover_monitor
+    from analysis.monitor.series_smoother import SmoothedSeries, detect_jumps, smooth_series
+    from analysis.mtf.bar_mtf import BarMtf, bar_mtf
+    from analysis.mtf.slanted_edge import EdgeMtf, slanted_edge_mtf
+    from analysis.orbit.forward_intersection import StereoPoints, circular_error, intersect_rays, linear_error
+    from analysis.orbit.jitter import Lines, find_jitter
     from analysis.orbit.planes import height_error, intersection_angle
-    from analysis.orbit.rational_polynomial import fit_rpc
+    from analysis.orbit.rational_polynomial import RationalPolynomial, fit_rpc
     from analysis.orbit.three_line_model import LineModel, Rays
-    from analysis.orientation.interior import fit_interior_orientation
+    from analysis.orientation.interior import InteriorOrientation, fit_interior_orientation
     from analysis.spots.noise import NoiseModel
-    from analysis.spots.photon_transfer import photon_transfer
-    from analysis.spots.spot_fit import fit_spot
+    from analysis.spots.photon_transfer import PhotonTransfer, photon_transfer
+    from analysis.spots.spot_fit import SpotFit, fit_spot
     from analysis.spots.spot_template import SpotTemplate
     from analysis.statistics import proportion_interval, robust_sigma
-    from analysis.turntable.dividing_error import chauvenet, fit_dividing_error
-    from analysis.wavefront_maps.pupil_fit import Pupil, find_pupil, fit_wavefront_map
+    from analysis.turntable.dividing_error import AngleFit, chauvenet, fit_dividing_error
+    from analysis.wavefront_maps.pupil_fit import MapFit, Pupil, find_pupil, fit_wavefront_map
     from analysis.wavefront_maps.zernike_table import ansi_to_nm, fringe_to_nm, nm_to_noll
 
 _MODULES = {
-    "block.block": ("make_block",),
-    "block.block_adjustment": ("adjust_block",),
-    "focal_plane.plane_fit": ("fit_focal_plane",),
-    "focal_plane.through_focus": ("focus_vertex",),
+    "monitor.jump_detection": ("Jump",),
+    "block.block": ("Block", "make_block"),
+    "block.block_adjustment": ("BlockAdjustment", "adjust_block"),
+    "focal_plane.plane_fit": ("FocalPlaneFit", "fit_focal_plane"),
+    "focal_plane.through_focus": ("FocusVertex", "focus_vertex"),
     "matching.correlation": ("MatchOptions", "distinct_points"),
-    "matching.matches": ("consensus", "match_windows"),
+    "matching.matches": ("Consensus", "Matches", "consensus", "match_windows"),
     "monitor.disturbances": ("Disturbances", "TimeLaw"),
     "monitor.monitor_formulas": ("MonitorGeometry",),
     "monitor.parameters": ("CameraCalibration", "MonitorCalibration"),
-    "monitor.recovery": ("recover_monitor",),
-    "monitor.series_smoother": ("detect_jumps", "smooth_series"),
-    "mtf.bar_mtf": ("bar_mtf",),
-    "mtf.slanted_edge": ("slanted_edge_mtf",),
-    "orbit.forward_intersection": ("circular_error", "intersect_rays", "linear_error"),
-    "orbit.jitter": ("find_jitter",),
+    "monitor.recovery": ("Recovery", "recover_monitor"),
+    "monitor.series_smoother": ("SmoothedSeries", "detect_jumps", "smooth_series"),
+    "mtf.bar_mtf": ("BarMtf", "bar_mtf"),
+    "mtf.slanted_edge": ("EdgeMtf", "slanted_edge_mtf"),
+    "orbit.forward_intersection": ("StereoPoints", "circular_error", "intersect_rays", "linear_error"),
+    "orbit.jitter": ("Lines", "find_jitter"),
     "orbit.planes": ("height_error", "intersection_angle"),
-    "orbit.rational_polynomial": ("fit_rpc",),
+    "orbit.rational_polynomial": ("RationalPolynomial", "fit_rpc"),
     "orbit.three_line_model": ("LineModel", "Rays"),
-    "orientation.interior": ("fit_interior_orientation",),
+    "orientation.interior": ("InteriorOrientation", "fit_interior_orientation"),
     "spots.noise": ("NoiseModel",),
-    "spots.photon_transfer": ("photon_transfer",),
-    "spots.spot_fit": ("fit_spot",),
+    "spots.photon_transfer": ("PhotonTransfer", "photon_transfer"),
+    "spots.spot_fit": ("SpotFit", "fit_spot"),
     "spots.spot_template": ("SpotTemplate",),
     "statistics": ("robust_sigma", "proportion_interval"),
-    "turntable.dividing_error": ("chauvenet", "fit_dividing_error"),
-    "wavefront_maps.pupil_fit": ("Pupil", "find_pupil", "fit_wavefront_map"),
+    "turntable.dividing_error": ("AngleFit", "chauvenet", "fit_dividing_error"),
+    "wavefront_maps.pupil_fit": ("MapFit", "Pupil", "find_pupil", "fit_wavefront_map"),
     "wavefront_maps.zernike_table": ("ansi_to_nm", "fringe_to_nm", "nm_to_noll"),
 }
 """Public names by the module of this package that defines them; they are imported when first used."""
 
 __all__ = [
+    "AngleFit",
+    "BarMtf",
+    "Block",
+    "BlockAdjustment",
     "CameraCalibration",
+    "Consensus",
     "Disturbances",
+    "EdgeMtf",
+    "FocalPlaneFit",
+    "FocusVertex",
+    "InteriorOrientation",
+    "Jump",
     "LineModel",
+    "Lines",
+    "MapFit",
     "MatchOptions",
+    "Matches",
     "MonitorCalibration",
     "MonitorGeometry",
     "NoiseModel",
+    "PhotonTransfer",
     "Pupil",
+    "RationalPolynomial",
     "Rays",
+    "Recovery",
+    "SmoothedSeries",
+    "SpotFit",
     "SpotTemplate",
+    "StereoPoints",
     "TimeLaw",
     "adjust_block",
     "ansi_to_nm",
@@ -197,8 +222,10 @@ __all__ = [
 def __getattr__(name: str) -> Any:
     for module, names in _MODULES.items():
         if name in names:
-            value = getattr(importlib.import_module(f"{__name__}.{module}"), name)
-            globals()[name] = value
+            from optics.numerics.arguments import public
+
+            defined = getattr(importlib.import_module(f"{__name__}.{module}"), name)
+            value = globals()[name] = public(defined, __name__, name)
             return value
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 

@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike
 from scipy.special import chdtrc, chdtri, gammaln, i0e, i1e, xlogy
 
 from analysis.arrays import Array
+from optics.numerics.arguments import finite
 
 _NORMAL_SIZE = 1.4826
 """Ratio of a normal distribution's standard deviation to the median of the absolute deviations."""
@@ -167,7 +168,7 @@ def robust_sigma(residuals: ArrayLike) -> float:
     >>> round(float(np.std(residuals))), round(analysis.robust_sigma(residuals), 1)
     (140, 2.0)
     """
-    values = np.asarray(residuals)
+    values = finite("residuals", residuals, "in one unit")
     if not values.size:
         raise ValueError("robust sigma: need at least one residual")
     return _NORMAL_SIZE * float(np.median(np.abs(values)))

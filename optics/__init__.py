@@ -1,7 +1,8 @@
 """Physical optics of cameras in plain functions: prescriptions, rays, wavefronts, diffraction images and materials.
 
 Everything is in float64 and SI units: metres, radians, cycles per metre, kelvin. Errors are ``ValueError`` and say what
-is allowed. The package knows nothing of YAML files, commands or rendered scenes.
+is allowed; an argument of a wrong kind is a ``TypeError``, too. The package knows nothing of YAML files, commands or
+rendered scenes.
 
 Camera
     Camera              a camera from the numbers of its surfaces, with focal length, F-number and pupils
@@ -133,8 +134,10 @@ _ALIASES = {"fit_zernikes": "fit", "zernike_name": "name", "pupil_quadrature": "
 def __getattr__(name: str) -> Any:
     for module, names in _MODULES.items():
         if name in names:
-            value = getattr(importlib.import_module(f"{__name__}.{module}"), _ALIASES.get(name, name))
-            globals()[name] = value
+            from optics.numerics.arguments import public
+
+            defined = getattr(importlib.import_module(f"{__name__}.{module}"), _ALIASES.get(name, name))
+            value = globals()[name] = public(defined, __name__, name)
             return value
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 

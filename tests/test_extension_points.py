@@ -12,10 +12,10 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import fields, replace
+from dataclasses import dataclass, fields, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import pytest
@@ -420,6 +420,35 @@ def test_a_surface(backend: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     for case in ((surface, path_figure.ASTIGMATIC, state), (replace(surface, even=(1e-3,)), path_figure.WAVY, {})):
         monkeypatch.setitem(path_figure.CASES, "toy", case)
         path_figure.test_a_figured_mirror_as_the_sequential_trace_has_it(backend, "toy", "disk")
+
+
+@dataclass(frozen=True)
+class NumpyHeight:
+    """A sag term whose ``height`` calls NumPy, which would end the process while a kernel is recorded."""
+
+    POWERS: ClassVar = {"amount": 1}
+    amount: Any = 0.0
+
+    def height(self, x: Any, y: Any) -> tuple[Any, Any, Any]:
+        return self.amount * np.cos(x), -self.amount * np.sin(x), 0.0 * y
+
+
+@dataclass(frozen=True)
+class NoSlopes(NumpyHeight):
+    """A sag term that returns its height alone."""
+
+    def height(self, x: Any, y: Any) -> tuple[Any, Any, Any]:
+        return self.amount * x
+
+
+@pytest.mark.parametrize("kind", [NumpyHeight, NoSlopes])
+def test_a_height_that_is_no_kernel_is_refused(kind: Any, backend: Any) -> None:
+    surface = replace(surface_of(validate(MirrorSpec, parse_yaml("{z: 0 m, radius: -4 m}"))), terms=(kind(1e-9),))
+    systems = assemble(path_figure.bench(surface, Circle(0.2)), ["all"], [{}])
+    with pytest.raises(EntryPointError, match=f"{kind.__name__} of .*: its height cannot become part of a kernel"):
+        trace(backend, systems, make_rays(backend, *path_figure.rays(500)))
+    with pytest.raises(ValueError, match="there are no rays to trace"):
+        trace(backend, systems, make_rays(backend, np.empty((0, 3)), np.empty((0, 3))))
 
 
 @pytest.mark.parametrize("name", sorted(SAG_TERMS))

@@ -9,17 +9,17 @@
 
 Functions, each with its own help, such as help(twin.load):
 
-    load(what)          an instrument: InstrumentTwin, with perturbed, render, recover, camera, jacobian, to_yaml
-    load_camera(what)   a single camera, with wavefront, spot, mtf, each of which has plot()
-    study(pair, vary)   runs an instrument many times with factors that vary: a table of all runs
-    perform(name, file) runs the procedure of a command on a file, such as "lab focus" or "tolerance": TestResult
+    load(what)           an instrument: InstrumentTwin, with perturbed, render, recover, camera, refocused, jacobian
+    load_camera(what)    a single camera, with wavefront, spot, mtf (each with plot), first_order, refocused, perturbed
+    study(pair, vary)    runs an instrument many times with factors that vary: a table of all runs
+    perform(name, file)  runs the procedure of a command on a file, such as "lab focus" or "tolerance": TestResult
 
 Results:
 
-    Shot                of render: frames before and after, truth, verdict; save writes the run folder
-    Found               of recover: readings with their sigmas; compare lists them with the truth
-    TestResult          of perform: numbers, summary, report
-    InputError          raised for an input that cannot be used: file, line, key, what is allowed
+    Shot                 of render: frames before and after, truth, verdict; save writes the run folder
+    Found                of recover: readings with their sigmas; compare lists them with the truth
+    TestResult           of perform: numbers, summary, report
+    InputError           raised for an input that cannot be used: file, line, key, what is allowed
 
 All of them have a short representation, and in a notebook a figure or table. The names below are imported on first use,
 so that a command loads no library that it does not need.

@@ -25,6 +25,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from analysis.arrays import Array
+from optics.numerics.arguments import check_fields
 
 _LEAST_TEMPLATE = 11
 """Smallest side of a template, in pixels, for a parabola and a 5 x 5 window within the margins."""
@@ -224,6 +225,7 @@ class MatchOptions:
             A value is not positive and finite, a correlation, ratio or risk exceeds 1, or the margin is below 2 px or
             too small for the largest move.
         """
+        check_fields(self)
         for field in fields(self):
             value = getattr(self, field.name)
             if field.name not in ("sharpness", "saturation") and not (value > 0 and math.isfinite(value)):

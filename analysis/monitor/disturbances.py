@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike
 
 from analysis.arrays import Array, shows
 from analysis.statistics import chance_beyond, density, limit_of
+from optics.numerics.arguments import check_fields, checked
 from optics.numerics.array_math import covariance_root
 
 FALSE_ALARM = 1e-3
@@ -82,6 +83,7 @@ class TimeLaw:
 
     def __post_init__(self) -> None:
         """Check that the times and their combination are possible; raise ValueError otherwise."""
+        check_fields(self)
         for name in ("drift_s", "period_s", "trend_s", "relaxation_s", "every_s"):
             value = getattr(self, name)
             if value is not None and not value > 0.0:
@@ -221,6 +223,7 @@ class Disturbances:
             raise ValueError(f"disturbances: {count} motions need as many bodies, causes, units and laws")
 
     @classmethod
+    @checked
     def of(
         cls,
         spots: ArrayLike,

@@ -155,7 +155,8 @@ def _series(
         raise ValueError(f"series: {when.shape} times need values ({when.size}, {size}), found {values.shape}")
     if not (np.all(np.isfinite(when)) and np.all(np.isfinite(values))):
         raise ValueError("series: times and values must be finite; leave out what was not measured")
-    if isinstance(noise, np.ndarray):
+    if not hasattr(noise, "covariance"):
+        noise = np.asarray(noise, np.float64)
         if noise.shape != (size, size):
             raise ValueError(f"series: noise must be the covariance ({size}, {size}) of one time, found {noise.shape}")
         noise = WhiteNoise(noise)
@@ -191,7 +192,7 @@ def smooth_series(
     disturbances : Disturbances
         Prior on the motions and their covariance in time. Motions that may jump are searched for first.
     measured : (M,) array_like
-        Times of the measurements, in seconds, in any order.
+        Times of the measurements, in seconds, in any order; equal times are repeated measurements of one state.
     shifts : (M, D) array_like
         Measured values, such as shifts of spots, in the units of ``disturbances.spots``.
     noise : (D, D) ndarray or ShiftNoise
@@ -285,7 +286,7 @@ def detect_jumps(
         Motions and their laws in time; those with ``TimeLaw(jump=True)`` may step. `jump_false_alarm` is the
         probability of detecting any step in a series without one.
     measured : (M,) array_like
-        Times of the measurements, in seconds, in any order.
+        Times of the measurements, in seconds, in any order; equal times are repeated measurements of one state.
     shifts : (M, D) array_like
         Measured values, in the units of ``disturbances.spots``.
     noise : (D, D) ndarray or ShiftNoise

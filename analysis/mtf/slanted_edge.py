@@ -30,6 +30,7 @@ from analysis.mtf.edge_fit import OVERSAMPLING, EdgeDesign, EdgeSpread, FittedEd
 from analysis.mtf.edge_location import Axis, EdgeError, EdgeLine, checked_region, locate_edge, pixel_noise
 from analysis.spots.noise import NoiseModel
 from analysis.statistics import chance_beyond, measured_bias, rice_sigma, signal_modulus
+from optics.numerics.arguments import checked, finite
 
 # Fraction of the contrast by which means of blocks of 4 x 4 px may differ from the fitted edge.
 _OTHER_STRUCTURE = 0.1
@@ -519,13 +520,15 @@ class EdgeMtf:
         share = self.structure.rms / (self.bright - self.dark)
         if self.structure.chance >= FALSE_ALARM or share < _LEAST_STRUCTURE:
             return ""
+        form = "curved" if self.order > 1 else "straight"
         return (
             f"the region contains structure of {share:.2g} of the contrast (rms of means over blocks and strips, p ="
-            f" {self.structure.chance:.1g}) that an edge of order {self.order} between two planes does not explain:"
+            f" {self.structure.chance:.1g}) that a {form} edge between two planes does not explain:"
             " light that is not a plane, a rough edge, specks, or noise correlated between pixels. sigma does not"
             " include its effect on the MTF: use even light or a smaller region"
         )
 
+    @checked
     def at(self, frequency: float) -> tuple[float, float]:
         """Return the MTF and its sigma at one frequency along the edge's normal, cycles/pixel, by cubic interpolation.
 
@@ -541,11 +544,18 @@ class EdgeMtf:
         value = CubicSpline(self.frequency, self.mtf)(frequency)
         return float(value), float(np.interp(frequency, self.frequency, self.sigma))
 
+    @checked
     def frequency_at(self, value: float) -> tuple[float, float]:
         """Return the lowest frequency at which the MTF falls below a value, and its sigma, both in cycles/pixel.
 
-        Both are NaN if there is none.
+        Both are NaN if there is none, as for a value above 1.
+
+        Raises
+        ------
+        ValueError
+            The value is NaN or infinite.
         """
+        value = float(finite("value", value, "an MTF such as 0.5"))
         below = np.flatnonzero((self.mtf[1:] < value) & (self.mtf[:-1] >= value))
         if below.size == 0:
             return math.nan, math.nan

@@ -41,6 +41,7 @@ from scipy.optimize import brentq
 from scipy.special import ndtr
 
 from analysis.arrays import Array
+from optics.numerics.arguments import check_fields
 
 ROUNDING_VARIANCE = 1.0 / 12.0
 """Variance of the rounding error in one frame, DN^2."""
@@ -224,6 +225,7 @@ class NoiseModel:
     further: tuple[FurtherNoise, ...] = ()
 
     def __post_init__(self) -> None:
+        check_fields(self)
         for field in fields(self):
             value = getattr(self, field.name)
             if field.name == "further" or (field.name == "saturation_dn" and value == math.inf):

@@ -26,6 +26,7 @@ from scipy import fft, ndimage
 from scipy.interpolate import BSpline
 
 from analysis.arrays import Array, MeasurementError, UndeterminedError
+from optics.numerics.arguments import checked
 
 _DEGREE = 5
 _TAPS = _DEGREE + 1
@@ -108,6 +109,7 @@ class SpotTemplate:
     truncation: float
 
     @classmethod
+    @checked
     def from_image(
         cls,
         image: ArrayLike,
@@ -149,7 +151,7 @@ class SpotTemplate:
         data = np.asarray(image, dtype=np.float64)
         if data.ndim != 2 or not np.all(np.isfinite(data)):
             raise ValueError(f"spot template: image must be a finite (M, N) array, found shape {data.shape}")
-        if int(oversampling) != oversampling or oversampling < 1:
+        if oversampling < 1:
             raise ValueError(f"spot template: oversampling must be an integer >= 1, found {oversampling!r}")
         height, width = (int(n) for n in shape)
         need = ((height - 1) * oversampling + _TAPS, (width - 1) * oversampling + _TAPS)

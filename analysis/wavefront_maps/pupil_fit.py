@@ -23,6 +23,7 @@ from analysis.arrays import Array, UndeterminedError
 from analysis.statistics import chance_beyond
 from analysis.wavefront_maps.map_files import MapError, WavefrontMap
 from analysis.wavefront_maps.zernike_table import circle_terms, noll_to_nm
+from optics.numerics.arguments import check_fields
 
 _ORIENTATION_NAMES = {
     (False, 0): "as it is",
@@ -324,6 +325,7 @@ class Pupil:
     radius: float
 
     def __post_init__(self) -> None:
+        check_fields(self)
         if not (math.isfinite(self.x) and math.isfinite(self.y) and 0.0 < self.radius < math.inf):
             raise MapError(f"a pupil at {self.x:g}, {self.y:g} with radius {self.radius:g} pixels: radii are positive")
 

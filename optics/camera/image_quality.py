@@ -91,7 +91,7 @@ def _chief(camera: Camera, field: Field) -> tuple[np.ndarray, float]:
     if camera.is_afocal:
         raise UnphysicalError("the camera is afocal: parallel light leaves it parallel, so that it makes no image")
     launch, direction = (array[0] for array in launch_rays(camera, field, np.zeros((1, 2))))
-    distance = first_order(camera.matrix(launch, direction)).exit_pupil_distance
+    distance = first_order(camera._matrix(launch, direction)).exit_pupil_distance
     return chief_point(camera, field), float(distance[0])
 
 
@@ -183,9 +183,11 @@ def _field_at(camera: Camera, field: Field, nodes: PupilNodes, origin: np.ndarra
     There is one wave for each node of the stop, ``origin`` (3,) is the point, metres in the camera's frame, and the
     total power is 1.
     """
-    imaging, to_stop = camera.systems
-    rays = imaging_rays(default_backend(), imaging, to_stop, direction_of(field), camera.launch, camera.aperture, nodes)
-    return pupil_field(rays, camera.wavelength, camera.image_pose.inverse().apply(origin))
+    imaging, to_stop = camera._systems
+    rays = imaging_rays(
+        default_backend(), imaging, to_stop, direction_of(field), camera._launch, camera._aperture, nodes
+    )
+    return pupil_field(rays, camera.wavelength, camera._image_pose.inverse().apply(origin))
 
 
 def psf(
@@ -277,7 +279,7 @@ def mtf(
     camera : Camera
         Camera whose wavelength is used by default.
     frequency : (M,) array_like
-        M spatial frequencies, cycles per metre.
+        M spatial frequencies, cycles per metre; their sign has no meaning.
     field : (float, float)
         Angles x and y of the far point, radians.
     azimuth : float

@@ -21,6 +21,7 @@ from optics.geometry.surface import Surface, ZernikeFigure, plane
 from optics.geometry.tree import Body, RigidTree
 from optics.geometry.zernike import noll_to_nm
 from optics.materials.glass import refractive_index
+from optics.numerics.arguments import check_fields
 from optics.numerics.array_math import UnphysicalError, determinant
 from optics.numerics.backend import default_backend
 from optics.raytrace.aim import transverse_axes
@@ -102,6 +103,7 @@ class OpticalSurface:
 
     def __post_init__(self) -> None:
         """Check that every number is within its allowed range; raise ValueError otherwise."""
+        check_fields(self)
         if not abs(self.radius) > 0.0:
             raise ValueError(f"radius must not be 0 or NaN (a plane has math.inf), got {self.radius}")
         numbers = self.thickness, self.conic, *self.asphere, *self.offset, *self.decenter, *self.tilt
@@ -115,8 +117,10 @@ class OpticalSurface:
             noll_to_nm(term)
             if not isfinite(amount):
                 raise ValueError(f"figure: the amount of term {term} must be finite, in metres, got {amount}")
-        if any(np.shape(vane) != (2,) for vane in self.vanes):
-            raise ValueError(f"vanes must be pairs of a width, in metres, and an angle, in radians, got {self.vanes}")
+        if not all(0.0 < width < inf and isfinite(angle) for width, angle in self.vanes):
+            raise ValueError(
+                f"vanes must be pairs of a positive width, in metres, and an angle, in radians, got {self.vanes}"
+            )
         if self.figure and not isfinite(self.diameter):
             raise ValueError("a figure needs a finite diameter: its Zernike terms are over that disk")
 
@@ -195,7 +199,8 @@ class Camera:
 
     def __post_init__(self) -> None:
         """Check that stop, signs of thicknesses and glasses are possible; raise ValueError otherwise."""
-        if not isinstance(self.surfaces, Sequence) or not len(self.surfaces):
+        check_fields(self)
+        if not len(self.surfaces):
             raise ValueError("surfaces must be a sequence of at least one OpticalSurface")
         object.__setattr__(self, "surfaces", tuple(self.surfaces))
         if not 0 <= self.stop < len(self.surfaces):
@@ -204,8 +209,6 @@ class Camera:
             raise ValueError(f"the stop, surface {self.stop}, needs a finite diameter")
         if not 1e-9 <= self.wavelength <= 1e-2:
             raise ValueError(f"wavelength must be 1e-9 to 1e-2, in metres, got {self.wavelength}")
-        if self.medium not in ("vacuum", "air"):
-            raise ValueError(f"medium must be 'vacuum' or 'air', got {self.medium!r}")
         ahead = 1.0
         for k, surface in enumerate(self.surfaces):
             ahead = -ahead if surface.material == MIRROR else ahead
@@ -234,14 +237,14 @@ class Camera:
         return np.cumsum([0.0, *(surface.thickness for surface in self.surfaces)])
 
     @property
-    def image_pose(self) -> Pose:
+    def _image_pose(self) -> Pose:
         """Position and orientation of the image plane in the camera's frame."""
         return Pose(rotation_matrix(self.image_tilt), np.array([0.0, 0.0, self.vertices[-1]]))
 
     @cached_property
-    def assembly(self) -> Assembly:
+    def _assembly(self) -> Assembly:
         """Camera as an assembly of bodies and optical elements, the form in which rays are traced."""
-        bodies, elements, before = [Body(_IMAGE, self.image_pose)], {}, 1.0
+        bodies, elements, before = [Body(_IMAGE, self._image_pose)], {}, 1.0
         for k, (surface, z, index) in enumerate(zip(self.surfaces, self.vertices[:-1], self.indices, strict=True)):
             name, bends = f"s{k}", Interaction.PASS if index == before else Interaction.REFRACT
             light = Interaction.REFLECT if surface.material == MIRROR else bends
@@ -252,23 +255,23 @@ class Camera:
         return Assembly(RigidTree(tuple(bodies)), elements, {_IMAGE: tuple(elements)})
 
     @cached_property
-    def systems(self) -> tuple[SystemBatch, SystemBatch]:
+    def _systems(self) -> tuple[SystemBatch, SystemBatch]:
         """Two systems to trace: one of all surfaces and the image plane, and one that ends at the aperture stop."""
-        names = self.assembly.sequences[_IMAGE]
-        return assemble(self.assembly, [names]), assemble(self.assembly, [names[: self.stop + 1]])
+        names = self._assembly.sequences[_IMAGE]
+        return assemble(self._assembly, [names]), assemble(self._assembly, [names[: self.stop + 1]])
 
     @property
-    def aperture(self) -> Circle:
+    def _aperture(self) -> Circle:
         """Rim of the aperture stop, in the frame of its surface."""
         stop = self.surfaces[self.stop]
         return Circle(0.5 * stop.diameter, stop.offset)
 
     @property
-    def launch(self) -> np.ndarray:
+    def _launch(self) -> np.ndarray:
         """Point on the axis before the first surface through which plane wavefronts start, metres, (3,)."""
         return np.array([0.0, 0.0, -self.surfaces[self.stop].diameter])
 
-    def matrix(self, position: np.ndarray, direction: np.ndarray) -> RayMatrix:
+    def _matrix(self, position: np.ndarray, direction: np.ndarray) -> RayMatrix:
         """Return the derivatives of a ray on the image plane with respect to its launch point and launch direction.
 
         Parameters
@@ -279,16 +282,16 @@ class Camera:
             Launch direction, a unit vector.
         """
         axes = transverse_axes(direction[None], np.eye(3)[:1])
-        return ray_matrix(default_backend(), self.systems[0], self.stop, position[None], direction[None], axes)
+        return ray_matrix(default_backend(), self._systems[0], self.stop, position[None], direction[None], axes)
 
     @cached_property
     def _axial(self) -> RayMatrix:
-        return self.matrix(self.launch, np.array([0.0, 0.0, 1.0]))
+        return self._matrix(self._launch, np.array([0.0, 0.0, 1.0]))
 
     @cached_property
     def paraxial(self) -> Paraxial:
         """Focal lengths, and positions and magnification of the pupils, for rays close to the axis; in metres."""
-        return paraxial(self._axial, -float(self.launch[2]), abs(self.surfaces[-1].thickness))
+        return paraxial(self._axial, -float(self._launch[2]), abs(self.surfaces[-1].thickness))
 
     @property
     def is_afocal(self) -> bool:

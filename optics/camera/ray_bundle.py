@@ -30,6 +30,9 @@ The mean square of a wavefront error is exact when the error is a polynomial of 
 the stop.
 """
 
+_RIM = 1e-9
+"""Distance beyond the rim of the stop, in units of its radius, that counts as rounding of a point on it."""
+
 _MOST_NODES = 4_000_000
 """Largest number of points of the stop through which one beam is traced, which bounds the memory."""
 
@@ -98,7 +101,8 @@ def launch_rays(camera: Camera, field: Field = (0.0, 0.0), pupil: ArrayLike | No
     field : (float, float)
         Angles x and y of the far point, radians.
     pupil : (N, 2) array_like, optional
-        N points of the stop in units of its radius; by default the 12 rings of 48 points of a quadrature.
+        N points of the stop in units of its radius, at most 1 from its middle; by default the 12 rings of 48 points of
+        a quadrature.
 
     Returns
     -------
@@ -108,7 +112,7 @@ def launch_rays(camera: Camera, field: Field = (0.0, 0.0), pupil: ArrayLike | No
     Raises
     ------
     ValueError
-        The points are not (N, 2) and finite, or no ray of the field reaches the stop.
+        The points are not (N, 2), finite and within the stop, or no ray of the field reaches the stop.
 
     Examples
     --------
@@ -127,10 +131,18 @@ def launch_rays(camera: Camera, field: Field = (0.0, 0.0), pupil: ArrayLike | No
     points = np.stack([nodes.x, nodes.y], axis=-1) if pupil is None else np.asarray(pupil, float)
     if points.ndim != 2 or points.shape[1] != 2 or not points.size or not np.all(np.isfinite(points)):
         raise ValueError(f"pupil must be finite points of shape (N, 2), N at least 1, got shape {points.shape}")
-    rim = camera.aperture
+    farthest = float(np.max(np.hypot(*points.T)))
+    if farthest > 1.0 + _RIM:
+        raise ValueError(f"pupil must be points within the stop, at most 1 from its middle, got one at {farthest:.6g}")
+    return _aimed(camera, field, points)
+
+
+def _aimed(camera: Camera, field: Field, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return launch points and directions, (N, 3) each, of rays of a far point toward N points (N, 2) of the stop."""
+    rim = camera._aperture
     light, target = direction_of(field), rim.radius * points + np.array(rim.centre)
     try:
-        position, _ = aim_collimated(default_backend(), camera.systems[1], light, camera.launch, target)
+        position, _ = aim_collimated(default_backend(), camera._systems[1], light, camera._launch, target)
     except AimError as error:
         raise LightLostError(f"no ray of the field {field} rad reaches surface {camera.stop}, the stop") from error
     return position[0], np.tile(light, (len(points), 1))
@@ -180,7 +192,7 @@ def trace(camera: Camera, position: ArrayLike, direction: ArrayLike) -> TracedRa
     length = np.linalg.norm(light, axis=-1, keepdims=True)
     if not np.all(np.isfinite(start)) or not np.all(np.isfinite(length)) or not np.all(length > 0.0):
         raise ValueError("positions must be finite, and directions finite and not zero")
-    system, elements = camera.systems[0], camera.assembly.sequence("image")
+    system, elements = camera._systems[0], camera._assembly.sequence("image")
     sent = make_rays(default_backend(), start, np.broadcast_to(light / length, start.shape))
     traced = trace_systems(default_backend(), system, sent, keep=range(len(camera.surfaces)), world=True)
     place, leaving, path, reached = (array[0] for array in traced.numpy(traced.world))
@@ -208,7 +220,7 @@ def trace_stop(camera: Camera, field: Field, points: np.ndarray) -> TracedRays:
     LightLostError
         A ray within the rim of the stop misses a surface or is totally reflected.
     """
-    rays = trace(camera, *launch_rays(camera, field, points))
+    rays = trace(camera, *_aimed(camera, field, points))
     if not np.all(rays.reached | (np.hypot(*points.T) > 1.0)):
         raise LightLostError(
             f"rays of the field {field} rad miss a surface or are totally reflected in glass; a smaller stop or field "

@@ -91,9 +91,9 @@ def seidel(camera: Camera, field: float, ends: tuple[float, float] | None = None
     >>> bool(np.isclose(abs(terms[1]), np.tan(field) * 0.25 / (32 * 8**2)))
     True
     """
-    names = camera.assembly.sequences["image"][:-1]
+    names = camera._assembly.sequences["image"][:-1]
     indices = [np.array([1.0, *camera.at(wave).indices]) for wave in (camera.wavelength, *(ends or ()))]
-    return seidel_sums(camera.assembly, names, camera.stop, 0.5 * camera.surfaces[camera.stop].diameter, field, indices)
+    return seidel_sums(camera._assembly, names, camera.stop, 0.5 * camera.surfaces[camera.stop].diameter, field, indices)
 
 
 def seidel_sums(

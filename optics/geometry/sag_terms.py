@@ -9,12 +9,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache
 from typing import Any, ClassVar, Protocol, runtime_checkable
 
 import numpy as np
 
 from optics.geometry import zernike
-from optics.numerics.extension_table import ExtensionTable
+from optics.numerics.backend import Backend
+from optics.numerics.extension_table import EntryPointError, ExtensionTable
 from optics.numerics.number_tree import FrozenMap
 
 
@@ -58,6 +60,42 @@ def of_kinds(terms: Sequence[SagTerm], kinds: Sequence[type[SagTerm]]) -> tuple[
 def kinds_of(terms: Sequence[SagTerm]) -> tuple[type[SagTerm], ...]:
     """Return the kinds of the terms, each once, in an order that depends on the kinds alone."""
     return tuple(sorted({type(term) for term in terms}, key=lambda kind: (kind.__module__, kind.__qualname__)))
+
+
+@cache
+def check_height(kind: type[SagTerm], backend: Backend) -> None:
+    """Check that the ``height`` of a kind computes with Dr.Jit alone, before it becomes part of a kernel.
+
+    NumPy in it would evaluate arrays while the kernel is recorded, which ends the process. Here they are the variables
+    of a symbolic loop, whose evaluation is an error.
+
+    Parameters
+    ----------
+    kind : type[SagTerm]
+        Kind of sag term.
+    backend : Backend
+        Backend of the kernel.
+
+    Raises
+    ------
+    EntryPointError
+        ``height`` evaluates an array, fails, or returns something else than three numbers.
+    """
+    import drjit as dr
+
+    def once(n: Any, x: Any, y: Any, total: Any) -> tuple[Any, ...]:
+        height, along_x, along_y = kind(**dict.fromkeys(kind.POWERS, x)).height(x, y)
+        return n + 1, x, y, total + height + along_x + along_y
+
+    x, y, total = (backend.Float(number) for number in (0.01, 0.02, 0.0))
+    try:
+        dr.while_loop((backend.UInt(0), x, y, total), lambda n, *_: n < 1, once, mode="symbolic")
+    except RuntimeError as error:
+        reason = str(error.__cause__ or error).strip().partition("\n")[0]
+        raise EntryPointError(
+            f"the sag term {kind.__name__} of {kind.__module__}: its height cannot become part of a kernel ({reason}); "
+            "it has to return the height and its two slopes by functions of drjit, such as drjit.cos, without numpy"
+        ) from error
 
 
 @dataclass(frozen=True)

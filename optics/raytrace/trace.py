@@ -27,6 +27,7 @@ from typing import Any
 
 import numpy as np
 
+from optics.geometry.sag_terms import check_height
 from optics.geometry.surface import SurfaceNumbers, along, level, newton_step
 from optics.numerics.array_math import PhysicalError
 from optics.numerics.backend import Backend
@@ -342,11 +343,17 @@ def trace(
     Raises
     ------
     ValueError
-        The rays are for another number of systems.
+        The rays are for another number of systems, or there are none.
+    EntryPointError
+        A sag term of another distribution cannot become part of a kernel.
     """
     import drjit as dr
 
+    if not dr.width(rays.position):
+        raise ValueError("there are no rays to trace: at least one position and direction are needed")
     uploaded = systems.upload(backend) if isinstance(systems, SystemBatch) else systems
+    for kind in {kind for element in uploaded.structure for kind in element.terms}:
+        check_height(kind, backend)
     rays, shared = _full_width(backend, rays, uploaded.count)
     differentiable = uploaded.differentiable or dr.grad_enabled(rays.position) or dr.grad_enabled(rays.direction)
     lanes = _lanes(uploaded, dr.width(rays.position)) if evaluate and not differentiable else None

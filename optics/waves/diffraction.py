@@ -33,6 +33,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import ArrayLike
 
+from optics.numerics.arguments import finite
 from optics.numerics.array_math import PhysicalError
 from optics.numerics.backend import cores, one_blas_thread
 
@@ -425,7 +426,7 @@ def airy(radius: ArrayLike, wavelength: float, f_number: float, obscuration: flo
     Parameters
     ----------
     radius : array_like
-        Distance from the centre of the image, metres, any shape.
+        Distance from the centre of the image, metres, any shape; its sign has no meaning.
     wavelength : float
         Wavelength of the light, metres.
     f_number : float
@@ -459,7 +460,7 @@ def airy(radius: ArrayLike, wavelength: float, f_number: float, obscuration: flo
             f"wavelength and f_number must be positive and 0 <= obscuration < 1, got {wavelength}, {f_number} and "
             f"{obscuration}"
         )
-    z, hole = np.pi * np.asarray(radius, float) / (wavelength * f_number), obscuration**2
+    z, hole = np.pi * finite("radius", radius, "in metres") / (wavelength * f_number), obscuration**2
     return np.asarray(((_jinc(z) - hole * _jinc(obscuration * z)) / (1.0 - hole)) ** 2)
 
 

@@ -7,6 +7,8 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import ArrayLike
 
+from optics.numerics.arguments import finite
+
 
 def _checked(psf: ArrayLike, step: float) -> np.ndarray:
     """Return the samples of an image as an array; raise ValueError unless their sum and the step are positive."""
@@ -191,7 +193,7 @@ def annular_mtf(frequency: ArrayLike, wavelength: float, f_number: float, obscur
     Parameters
     ----------
     frequency : array_like
-        Spatial frequencies, cycles per metre, any shape.
+        Spatial frequencies, cycles per metre, any shape; their sign has no meaning.
     wavelength : float
         Wavelength of the light, metres.
     f_number : float
@@ -228,7 +230,7 @@ def annular_mtf(frequency: ArrayLike, wavelength: float, f_number: float, obscur
             f"wavelength and f_number must be positive and 0 <= obscuration < 1, got {wavelength}, {f_number} and "
             f"{obscuration}"
         )
-    shift = 2.0 * wavelength * f_number * np.abs(np.asarray(frequency, float))
+    shift = 2.0 * wavelength * f_number * np.abs(finite("frequency", frequency, "in cycles per metre"))
 
     def common(first: float, second: float) -> np.ndarray:
         """Area common to circles of two radii about centres ``shift`` apart."""

@@ -1,8 +1,8 @@
 """Perturbation of a body of an instrument, and the actions that each body allows."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, Any, Self, TypeVar
 
 from pydantic import AfterValidator, BeforeValidator, Field
 
@@ -22,7 +22,7 @@ from scenes.specs.course import (
     Term,
     noll,
 )
-from scenes.specs.motion_text import find_node, matching_nodes, perturbation_in_words
+from scenes.specs.motion_text import AXES, find_node, matching_nodes, perturbation_in_words
 from scenes.yaml.errors import InputError, Issue, KeyPath, Problem, names_text, shown, unknown
 from scenes.yaml.spec import ZERO_IS_NONE, Name, Paths, Spec
 from scenes.yaml.unit_fields import Quantity
@@ -102,6 +102,28 @@ class PlainPerturbationSpec(Spec):
         """
         return tuple(name for name in self.uses() if name != "temperature" or self.heat.warms)
 
+    def plus(self, other: Self) -> Self:
+        """Return the sum of this and another perturbation of the same body, as if one had both.
+
+        Components of vectors, figure terms, changes of scale, shape and index, and linear temperature changes add.
+
+        Parameters
+        ----------
+        other : PlainPerturbationSpec
+            The other perturbation.
+
+        Raises
+        ------
+        Problem
+            Both rotate or scale the body about different pivots, or both have a table of nodes.
+        """
+        pivots = list(dict.fromkeys(one.pivot for one in (self, other) if {"rotate", "scale"} & set(one.uses())))
+        if len(pivots) > 1:
+            text = "the body is rotated or scaled about another pivot already, and has only one"
+            raise Problem(text, pivots[1], pivots[0], within=("pivot",))
+        pivot = pivots[0] if pivots else other.pivot
+        return self.model_copy(update={**_sums(self, other), "pivot": pivot})
+
     def motion(self) -> Motion:
         """Return the motion, SI, that the perturbation without its temperature gives the body in a state."""
         figure = {noll(term): value for term, value in self.figure.items()}
@@ -116,6 +138,29 @@ class PlainPerturbationSpec(Spec):
             conic=self.conic or 0.0,
             abbe=self.abbe or 0.0,
         )
+
+
+def _sums(one: Spec, other: Spec) -> dict[str, Any]:
+    """Return the sums of the values of two specifications by key, without texts."""
+    pairs = {key: (value, getattr(other, key)) for key, value in one if not isinstance(value, str)}
+    return {key: _sum(key, *pair) for key, pair in pairs.items()}
+
+
+def _sum(key: str, one: Any, other: Any) -> Any:
+    """Return the sum of the values of a key of two perturbations; None is nothing."""
+    if one is None or other is None:
+        return other if one is None else one
+    if isinstance(one, Spec):
+        table = getattr(other, "table", None)
+        if table and getattr(one, "table", None):
+            text = "this body has a table of nodes already, and another cannot be added"
+            raise Problem(text, table, "one table of each body", within=(key, "table"))
+        return one.model_copy(update=_sums(one, other))
+    if isinstance(one, Mapping):
+        return FrozenMap({**one, **{name: _sum(key, one.get(name), value) for name, value in other.items()}})
+    if isinstance(one, tuple):
+        return tuple(_sum(key, *pair) for pair in zip(one, other, strict=True))
+    return float(f"{one + other:.15g}")  # 20 um + 3 um are 23 um, without the rounding of floats
 
 
 def _in_words(value: Any) -> Any:
@@ -253,17 +298,36 @@ def not_allowed(owner: Spec, info: NodeInfo, action: str, key: KeyPath) -> Issue
 
 
 def perturbation_text(perturb: Mapping[str, PlainPerturbationSpec]) -> str:
-    """Return perturbations as readable text: ``base/gf7/M2 shift (0 um, 0 um, 20 um); ...``."""
-    parts = []
-    for path, what in perturb.items():
-        plain = what.plain()
-        parts.append(f"{path} {', '.join(f'{key} {_short(plain[key])}' for key in what.uses())}")
-    return "; ".join(parts)
+    """Return perturbations as a job takes them: ``base/gf7/M2 shift z 20 um; base/gf7/M2 rotate x 3 arcsec``."""
+    return "; ".join(f"{path} {part}" for path, what in perturb.items() for part in _parts(what))
 
 
-def _short(value: Any) -> str:
-    """Return a quantity as short text; several, such as the components of a vector, in parentheses."""
-    if isinstance(value, dict):
-        known = {key: part for key, part in value.items() if part not in ("0 K", ["0 K/m"] * 3)}
-        return ", ".join(f"{key} {_short(part)}" for key, part in known.items())
-    return f"({', '.join(map(str, value))})" if isinstance(value, list) else str(value)
+def _parts(what: PlainPerturbationSpec) -> Iterator[str]:
+    """Yield the parts of a perturbation as text, such as ``shift z 20 um``; a table of nodes by its file."""
+    plain, about = what.plain(), "" if what.pivot == DEFAULT_PIVOT else f" about {what.pivot}"
+    for key in what.uses():
+        text, end = plain[key], about if key in ("rotate", "scale") else ""
+        if key in ("shift", "rotate"):
+            yield from _components(key, getattr(what, key), text, end)
+        elif key == "figure":
+            yield from (f"figure {term} {text[term]}" for term, size in what.figure.items() if size)
+        elif key == "deformation":
+            yield f"deformation {text['table']}"
+        elif key == "temperature":
+            yield from _heat_parts(what.heat, text)
+        else:
+            yield f"{key} {text}{end}"
+
+
+def _heat_parts(heat: job_tables.TemperatureSpec, plain: Mapping[str, Any]) -> Iterator[str]:
+    """Yield a temperature change as text, ``temperature 2 K``; a change of zero only where it is all."""
+    if "table" in plain:
+        yield f"temperature {plain['table']}"
+    if heat.change or not heat.warms:
+        yield f"temperature {plain['change']}"
+    yield from _components("gradient", heat.gradient, plain["gradient"])
+
+
+def _components(key: str, vector: Sequence[float], texts: Sequence[str], end: str = "") -> Iterator[str]:
+    """Yield the components of a vector that are not zero as text, such as ``shift z 20 um``."""
+    yield from (f"{key} {axis} {text}{end}" for axis, size, text in zip(AXES, vector, texts, strict=True) if size)

@@ -16,6 +16,7 @@ from scenes.specs.detector import DetectorSpec, require_detector
 from scenes.specs.disturbances import DisturbancesSpec, ErrorBudgetSpec
 from scenes.specs.instrument import InstrumentSpec
 from scenes.specs.job import JobSpec, PerturbationSpec, TargetsSpec, with_tables
+from scenes.specs.perturbation import IN_WORDS
 from scenes.specs.turntable import MeasuredTurntableSpec, TurntableFiles, TurntableTestSpec
 from scenes.yaml.errors import InputError, Issue, unknown
 from scenes.yaml.input_file import is_file
@@ -493,7 +494,7 @@ class CameraSetup(Spec):
     mounted: Name | None = None
     instrument: InstrumentSpec | None = None
     cameras: Paths[CameraSpec] = Field(default_factory=FrozenMap)
-    perturb: Paths[PerturbationSpec] = Field(default_factory=FrozenMap)
+    perturb: Annotated[Paths[PerturbationSpec], IN_WORDS] = Field(default_factory=FrozenMap)
     seed: ClassVar[int] = 0
 
     def with_seed(self, seed: int) -> CameraSetup:

@@ -271,7 +271,7 @@ def test_spots():
     refuses(ValueError, "need their gain maps", noise_parts, bare, NOISE)
     square = airy(40, 40, (80, 80))
     for said, place, options in (
-        ("oversampling must be an integer", (40, 40), {"oversampling": 1.5}),
+        ("oversampling must be a whole number", (40, 40), {"oversampling": 1.5}),
         ("lies outside the image", (99, 40), {}),
         ("tolerance must be in", (40, 40), {"tolerance": 0.5}),
     ):

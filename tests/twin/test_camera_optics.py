@@ -112,8 +112,42 @@ def test_fields_are_shares_of_the_half_field(gf7, gf7_alone) -> None:
     np.testing.assert_allclose(light, gf7.camera_frame.rotation.T @ own, atol=1e-15)
     with pytest.raises(ValueError, match="from -1 to 1"):
         gf7_alone.wavefront((1.2, 0.0))
-    with pytest.raises(ValueError, match="pairs"):
+    with pytest.raises(ValueError, match="a field is a pair"):
         gf7_alone.wavefronts([0.0, 1.0])  # type: ignore[list-item]
+
+
+def test_a_field_with_a_unit_is_its_share(gf7_alone) -> None:
+    """As results and reports print it, too; gf7's half field is 1.25 by 0.15 deg."""
+    shares = gf7_alone.fractions(["0.25 -0.075 deg", ("0.25 deg", "-4.5 arcmin"), "(0.25, -0.075) deg", (0.2, -0.5)])
+    np.testing.assert_allclose(shares, [[0.2, -0.5]] * 4, rtol=1e-12)
+    wave = gf7_alone.wavefront("0.25 -0.075 deg")
+    assert wave.rms == gf7_alone.wavefront(wave.field).rms
+    assert "field (0.25, -0.075) deg" in repr(wave)
+    assert gf7_alone.spot("0.25 0 deg", "20 um").rms == gf7_alone.spot((0.2, 0.0), 20e-6).rms
+    assert gf7_alone.at("486 nm").wavelength == 486e-9
+    # four digits of the field's edge are inside it, and a pair that mixes both is neither
+    assert np.all(gf7_alone.fractions([("1.2502 deg", "0 deg")]) == [[1.0, 0.0]])
+    for wrong in ("0.2 deg", "1.3 0 deg", "0.2 0", ("0.2 deg", 0.1), "0.2 0 um", (np.nan, 0.0), None):
+        with pytest.raises(ValueError, match=r"field: .* angles from its middle, such as '0.625 0.075 deg', up to"):
+            gf7_alone.wavefront(wrong)
+
+
+def test_an_mtf_takes_the_unit_that_it_shows(gf7_alone) -> None:
+    mtf = gf7_alone.mtf()
+    assert "nyquist 7.143e+04 cycles/m" in repr(mtf)
+    assert np.all(mtf.at("50 cycles/mm") == mtf.at(50e3))
+    assert np.all(gf7_alone.mtf(frequency=["0 cycles/mm", "50 cycles/mm"]).frequency == [0.0, 50e3])
+    for wrong, told in (
+        ("50 deg", "a unit of an angle"),
+        (2e5, "outside the tabulated range, 0 to 142857"),
+        (np.nan, ""),
+    ):
+        with pytest.raises(ValueError, match=f"frequency: .*{told}"):
+            mtf.at(wrong)
+    # beyond the cut-off there is no contrast
+    coarse = gf7_alone.at("2 um").mtf()
+    assert coarse.frequency[-1] < coarse.nyquist
+    assert np.all(coarse.at(coarse.nyquist) < 1e-3)
 
 
 # --- over all wavelengths of its light --------------------------------------------------------------------------------

@@ -213,7 +213,7 @@ def test_every_knob_moves_what_it_names(bench):
         if (knob.node, knob.kind) in seen:
             continue
         seen.add((knob.node, knob.kind))
-        made = bench.twin.perturbed(perturbation({name: 0.123}, {}, bench.knobs, first))
+        made = bench.twin.with_perturbations(perturbation({name: 0.123}, {}, bench.knobs, first))
         own = made.resolved.job.perturb[knob.node]
         assert own.uses() == (KINDS[knob.kind].key,)
         assert all(not what.uses() for node, what in made.resolved.job.perturb.items() if node != knob.node)

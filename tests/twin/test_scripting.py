@@ -14,8 +14,11 @@ import pytest
 import twin
 from analysis.monitor.estimators import ESTIMATORS
 from analysis.monitor.monitor_formulas import PARAMETERS
+from scenes.specs.job import PerturbationSpec
+from scenes.specs.load import LIBRARY
+from scenes.specs.perturbation import perturbation_text
 from scenes.specs.procedures import PROCEDURES
-from scenes.yaml.errors import InputError
+from scenes.yaml.errors import InputError, Problem
 from tests.twin.commands import files
 from tests.twin.study_bench import TEXTS, refusals
 from twin.main_job.monitor_reading import stated
@@ -97,10 +100,63 @@ def test_what_a_state_is_does_not_depend_on_how_it_was_said(pair: twin.Instrumen
     listed = pair.perturbed({"base/forward/M2": {"shift": ["0 mm", "0 nm", "0.003 mm"]}}).perturbed(TURN)
     assert one.state == other.state == listed.state
     assert (pair.state, one.experiment) == ({}, pair.experiment)  # the instrument is built once, and stays as it is
-    # a node that is perturbed again has the new perturbation alone
-    assert pair.perturbed({"base/forward/M2": {"shift": "9 0 0 um"}}).perturbed(DESPACE).state == {
-        body: motion for body, motion in one.state.items() if body == "base/forward/M2"
-    }
+    # the text of all perturbations makes them again
+    assert pair.perturbed(one.perturbed_by.split("; ")).state == one.state
+    assert f"perturbed by {one.perturbed_by}>" in repr(one)
+
+
+def test_a_further_perturbation_adds_to_those_before(pair: twin.InstrumentTwin) -> None:
+    """Component by component, in texts, mappings and lists of them; `with_perturbations` replaces a body's."""
+    first = pair.perturbed("forward/M2 shift z 20 um", "base temperature 2 K")
+    more = ["forward/M2 shift z 3 um", {"forward/M2": {"rotate": "1 0 0 arcsec", "figure": {"Z5": "10 nm"}}}]
+    both = first.perturbed(more).perturbed("forward/M2 figure Z6 5 nm", "base gradient z 1 K/m", "base temperature 1 K")
+    assert both.perturbed_by == (
+        "base/forward/M2 rotate x 1 arcsec; base/forward/M2 shift z 23 um; base/forward/M2 figure Z5 10 nm; "
+        "base/forward/M2 figure Z6 5 nm; base temperature 3 K; base gradient z 1 K/m"
+    )
+    assert first.perturbed_by == "base/forward/M2 shift z 20 um; base temperature 2 K"
+    assert first.with_perturbations({"forward/M2": {"shift": "9 0 0 um"}, "base": {}}).perturbed_by == (
+        "base/forward/M2 shift x 9 um"
+    )
+    turned = pair.perturbed("forward/focal_plane rotate x 2 arcsec about rear_node")
+    assert turned.perturbed("forward/focal_plane shift z 3 um").perturbed_by.startswith(
+        "base/forward/focal_plane rotate x 2 arcsec about rear_node; base/forward/focal_plane shift z 3 um"
+    )
+    for motion, told in (
+        ("forward/focal_plane rotate y 1 arcsec", "about another pivot already.*found origin, allowed: rear_node"),
+        ({"forward/M2": {}, "base/forward/M2": {}}, "this node is perturbed twice"),
+        (3, "perturb: not a perturbation; found 3"),
+    ):
+        with pytest.raises(twin.InputError, match=told):
+            turned.perturbed(motion)
+
+
+def test_tables_of_nodes_are_kept_but_not_added() -> None:
+    bent, moved = ({"deformation": "m2.csv", "temperature": "t.csv"}, {"shift": "0 0 3 um", "temperature": "1 K"})
+    first, second = (PerturbationSpec.model_validate(keys) for keys in (bent, moved))
+    parts = "base/M2 shift z 3 um; base/M2 temperature t.csv; base/M2 temperature 1 K; base/M2 deformation m2.csv"
+    assert perturbation_text({"base/M2": first.plus(second)}) == parts
+    with pytest.raises(Problem, match="this body has a table of nodes already"):
+        first.plus(first)
+
+
+@pytest.mark.second
+def test_a_camera_is_refocused_and_described_in_one_line(tmp_path: Path) -> None:
+    """As `python -m twin.camera FILE --refocus` does, of a file that is 50 um out of focus."""
+    text = (LIBRARY / "cameras/gf7_conic.yaml").read_text("utf-8")
+    file = tmp_path / "blurred.yaml"
+    file.write_text(text.replace("z: -5216.4137 mm", "z: -5216.3637 mm"), "utf-8")
+    nominal, blurred = twin.load_camera("gf7_conic"), twin.load_camera(file)
+    sharp = blurred.refocused()
+    assert blurred.wavefront().rms > 1.5 * sharp.wavefront().rms
+    assert sharp.first_order["focal_length_m"] == blurred.first_order["focal_length_m"]
+    # the same plane, wherever the search begins
+    assert sharp.model.spec.image.z == pytest.approx(nominal.refocused().model.spec.image.z, abs=1e-9)
+    numbers = twin.perform("camera", file, perturb=["M2 shift z 20 um"]).numbers
+    moved = blurred.perturbed("M2 shift z 20 um")
+    assert numbers["first_order"] == moved.first_order
+    with pytest.raises(twin.InputError, match=r"refocusing applies to a nominal camera.*M2 shift z 20 um"):
+        moved.refocused()
 
 
 @pytest.mark.second

@@ -1,8 +1,9 @@
 """Wavefront, spot and MTF of one camera in one state, at positions in its field.
 
 A **field** is a pair (along the line, along the track) of fractions of the camera's half angles of view, each from -1
-to 1: (1, 0) is the end of the unperturbed camera's field on the side of the left end (+Y') of its line CCD. It rotates
-with the camera, so that a look angle or a motion of the whole camera does not change its image quality.
+to 1: (1, 0) is the end of the unperturbed camera's field on the side of the left end (+Y') of its line CCD. Angles from
+the middle of the field with a unit, ``"0.2 -0.1 deg"``, are taken as well. A field rotates with the camera, so that a
+look angle or a motion of the whole camera does not change its image quality.
 
 Wavefront errors are measured from the sphere about the image of the chief ray, with the radius of the nominal exit
 pupil, and are positive where the wavefront is ahead. Piston and tilt, which shift an image without blurring it, are
@@ -38,7 +39,22 @@ from scenes.models.instrument_model import Instrument
 from scenes.models.shadow import ImagingShadows, imaging_shadows
 from scenes.specs.camera import CameraSpec
 from scenes.specs.instrument import BASE
-from twin.camera.camera_results import ROUNDING, TERMS, Field, Mtf, Spot, Wavefront, check_mtf, check_wavefront
+from scenes.yaml.units import LENGTH
+from twin.camera.camera_results import (
+    ROUNDING,
+    TERMS,
+    Field,
+    FieldText,
+    Frequencies,
+    Mtf,
+    Spot,
+    Wavefront,
+    check_mtf,
+    check_wavefront,
+    field_fractions,
+    in_cycles_per_m,
+    in_si,
+)
 from twin.camera.cut_wavefront import RAYS_ACCURACY, WORST_LIGHT, fit_by_rays, fit_illuminated
 from twin.targets.target_path import LineRays, TargetPath
 
@@ -136,8 +152,8 @@ class CameraOptics:
         """Return the analysis of the same camera in another state (motions of its bodies and effects of heat)."""
         return replace(self, state=FrozenMap(state))
 
-    def at(self, wavelength: float) -> Self:
-        """Return the camera in light of another wavelength, metres.
+    def at(self, wavelength: float | str) -> Self:
+        """Return the camera in light of another wavelength, in metres or with its unit, such as ``"486 nm"``.
 
         Lenses have their refractive index there, and wavefront errors are in waves of it.
 
@@ -146,8 +162,9 @@ class CameraOptics:
         ValueError
             The glass of a lens is not named, or its index is unknown at this wavelength.
         """
-        self.path.coloured(self.state, wavelength)
-        return replace(self, colour=wavelength)
+        colour = in_si(wavelength, LENGTH, "wavelength")
+        self.path.coloured(self.state, colour)
+        return replace(self, colour=colour)
 
     @property
     def wavelength(self) -> float:
@@ -176,11 +193,27 @@ class CameraOptics:
             return None
         return lambda fields, points: covered(self.path.shadow_pieces({}, self._designed(fields)), points, SMALLEST)
 
+    def fractions(self, fields: Sequence[Field | FieldText] | np.ndarray) -> np.ndarray:
+        """Return F fields as fractions of the half angles of view, (F, 2).
+
+        Raises
+        ------
+        ValueError
+            A field lies beyond the camera's field of view, for which it has no clear apertures.
+        """
+        half = self.model.spec.field
+        return np.array([field_fractions(field, (half.x, half.y)) for field in fields])
+
+    def _angles(self, field: np.ndarray) -> tuple[float, float]:
+        """Return the angles of a field, (2,) fractions, from the middle along line and track, radians."""
+        half = self.model.spec.field
+        return float(field[0]) * half.x, float(field[1]) * half.y
+
     def _designed(self, fields: np.ndarray) -> np.ndarray:
         """Return the directions of the light of F fields for the camera in its nominal state, (F, 3)."""
         return replace(self, state=FrozenMap()).directions(fields)
 
-    def directions(self, fields: Sequence[Field] | np.ndarray) -> np.ndarray:
+    def directions(self, fields: Sequence[Field | FieldText] | np.ndarray) -> np.ndarray:
         """Return the directions of the light of F fields, (F, 2), in the world frame, unit vectors (F, 3).
 
         Raises
@@ -188,18 +221,11 @@ class CameraOptics:
         ValueError
             A field lies beyond the camera's field of view, for which it has no clear apertures.
         """
-        shares = np.asarray(fields, dtype=np.float64)
-        if shares.ndim != 2 or shares.shape[1] != 2 or not np.all(np.abs(shares) <= 1.0):
-            raise ValueError(
-                f"fields are pairs (along the line, along the track) of fractions of half the field, from -1 to 1; "
-                f"got {shares.tolist()}"
-            )
-        spec = self.model.spec
-        light = np.array([field_direction(spec, x * spec.field.x, y * spec.field.y) for x, y in shares])
+        light = np.array([field_direction(self.model.spec, *self._angles(field)) for field in self.fractions(fields)])
         root = self.assembly.place([self.state]).pose(self.path.root)
         return np.asarray(light @ self.model.camera_frame.rotation @ root.rotation.T)
 
-    def rays(self, fields: Sequence[Field] | np.ndarray, points: np.ndarray) -> LineRays:
+    def rays(self, fields: Sequence[Field | FieldText] | np.ndarray, points: np.ndarray) -> LineRays:
         """Trace rays of F fields, (F, 2), through N points of the stop, (N, 2), to the line CCD.
 
         Points are in units of the stop's radius.
@@ -213,7 +239,7 @@ class CameraOptics:
 
     @one_blas_thread()  # small matrices: threads would only wait for each other
     def wavefronts(
-        self, fields: Sequence[Field] | np.ndarray, points: int = MAP_POINTS, terms: int = TERMS
+        self, fields: Sequence[Field | FieldText] | np.ndarray, points: int = MAP_POINTS, terms: int = TERMS
     ) -> tuple[Wavefront, ...]:
         """Compute wavefront errors at F fields, (F, 2), with maps of ``points`` by ``points``.
 
@@ -222,6 +248,7 @@ class CameraOptics:
         AimError, BeamMissedError
             In this state the light misses the stop or the plane of the line CCD.
         """
+        fields = self.fractions(fields)
         nodes = stop_nodes(self.model, RINGS, self.cut is not None)
         axis = np.linspace(-1.0, 1.0, points)
         x, y = np.meshgrid(axis, axis)
@@ -236,7 +263,7 @@ class CameraOptics:
         node_slice = slice(1, 1 + nodes.count)
         light, is_vignetted = rays.valid[:, node_slice] @ nodes.share, self.cut is not None or bool(self.model.edges)
         sight = self.directions(fields)[:, None]
-        for k, where in enumerate(np.asarray(fields, dtype=np.float64)):
+        for k, where in enumerate(fields):
             passed = rays.valid[k]
             weight = nodes.weight * passed[node_slice]
             tilt = zernike.fit(3, nodes.x, nodes.y, error[k, node_slice], weight)
@@ -255,6 +282,7 @@ class CameraOptics:
             through = float(np.sum(weight) / np.sum(nodes.weight)) if exact is None else exact.light
             wave = Wavefront(
                 field=(float(where[0]), float(where[1])),
+                field_rad=self._angles(where),
                 wavelength=wavelength,
                 x=axis,
                 y=axis,
@@ -274,28 +302,29 @@ class CameraOptics:
             out.append(wave)
         return tuple(out)
 
-    def wavefront(self, field: Field = (0.0, 0.0), points: int = MAP_POINTS) -> Wavefront:
+    def wavefront(self, field: Field | FieldText = (0.0, 0.0), points: int = MAP_POINTS) -> Wavefront:
         """Compute the wavefront error at one field, with a map of ``points`` by ``points``."""
         return self.wavefronts([field], points)[0]
 
-    def spots(self, fields: Sequence[Field] | np.ndarray, defocus: float = 0.0) -> tuple[Spot, ...]:
-        """Compute spots at F fields, (F, 2), on the line CCD moved by ``defocus`` metres downstream.
+    def spots(self, fields: Sequence[Field | FieldText] | np.ndarray, defocus: float | str = 0.0) -> tuple[Spot, ...]:
+        """Compute spots at F fields, (F, 2), on the line CCD moved downstream by ``defocus``, metres or text.
 
         Raises
         ------
         AimError, BeamMissedError
             In this state the light misses the stop or the plane of the line CCD.
         """
+        fields, moved = self.fractions(fields), in_si(defocus, LENGTH, "defocus")
         nodes = stop_nodes(self.model, RINGS, self.cut is not None)
         rings = [r / SPOT_RINGS * rim(6 * r) for r in range(1, SPOT_RINGS + 1)]
         stop = np.concatenate([np.zeros((1, 2)), np.stack([nodes.x, nodes.y], axis=-1), *rings])
         rays = self.rays(fields, stop)
         leaving = rays.direction
         # the light travels along -Z or +Z of the line CCD; downstream is its direction
-        position = rays.position[..., 1::-1] + defocus * leaving[..., 1::-1] / np.abs(leaving[..., 2:])
+        position = rays.position[..., 1::-1] + moved * leaving[..., 1::-1] / np.abs(leaving[..., 2:])
         position = position / rays.size
         out = []
-        for k, where in enumerate(np.asarray(fields, dtype=np.float64)):
+        for k, where in enumerate(fields):
             passed = rays.valid[k]
             weight = nodes.weight * passed[1 : 1 + nodes.count]
             weight = weight / np.sum(weight)
@@ -307,6 +336,7 @@ class CameraOptics:
             out.append(
                 Spot(
                     field=(float(where[0]), float(where[1])),
+                    field_rad=self._angles(where),
                     rays=hexapolar,
                     centroid=centroid,
                     rms=float(np.sqrt(np.sum(spread))),
@@ -318,11 +348,11 @@ class CameraOptics:
             )
         return tuple(out)
 
-    def spot(self, field: Field = (0.0, 0.0), defocus: float = 0.0) -> Spot:
-        """Compute the spot at one field on the line CCD moved by ``defocus`` metres downstream."""
+    def spot(self, field: Field | FieldText = (0.0, 0.0), defocus: float | str = 0.0) -> Spot:
+        """Compute the spot at one field on the line CCD moved downstream by ``defocus``, metres or text."""
         return self.spots([field], defocus)[0]
 
-    def beams(self, fields: Sequence[Field] | np.ndarray, rings: int = RINGS) -> FieldBeams:
+    def beams(self, fields: Sequence[Field | FieldText] | np.ndarray, rings: int = RINGS) -> FieldBeams:
         """Trace the beams of F fields near the image, in the prescription's frame.
 
         In a perturbed state the beams have their true position relative to the moved line CCD, which is drawn where it
@@ -342,7 +372,7 @@ class CameraOptics:
         InputError
             Edges block all of a field's light.
         """
-        places = tuple((float(x), float(y)) for x, y in np.asarray(fields, dtype=np.float64))
+        places = tuple((float(x), float(y)) for x, y in self.fractions(fields))
         if not self.state and not self.built:
             return FieldBeams.trace(self.model, self.path.backend, places, rings, self.cut, wavelength=self.wavelength)
         nodes = stop_nodes(self.model, rings, self.cut is not None)
@@ -365,7 +395,7 @@ class CameraOptics:
         )
 
     @one_blas_thread()
-    def errors(self, fields: Sequence[Field] | np.ndarray) -> np.ndarray:
+    def errors(self, fields: Sequence[Field | FieldText] | np.ndarray) -> np.ndarray:
         """Compute rms wavefront errors at F fields, (F, 2), in waves of the design wavelength, (F,).
 
         Piston and tilt are removed.
@@ -375,12 +405,12 @@ class CameraOptics:
         AimError, BeamMissedError
             In this state the light misses the stop or the plane of the line CCD.
         """
-        all_fields, plane = np.asarray(fields, dtype=np.float64), FocalPlane.of(self.model.spec)
+        all_fields, plane = self.fractions(fields), FocalPlane.of(self.model.spec)
         step = max(1, MAX_RAYS // stop_nodes(self.model, RINGS, self.cut is not None).count)
         parts = [all_fields[start : start + step] for start in range(0, len(all_fields), step)]
         return np.concatenate([self.beams(part).errors(plane) for part in parts])
 
-    def pupils(self, fields: Sequence[Field] | np.ndarray) -> tuple[PupilFunction, ...]:
+    def pupils(self, fields: Sequence[Field | FieldText] | np.ndarray) -> tuple[PupilFunction, ...]:
         """Compute the exit pupils of F fields, (F, 2), with image axes along the line and along the track.
 
         Each is the pupil as seen from the image of its field. The pupils are centred on the design wavelength's chief
@@ -409,8 +439,8 @@ class CameraOptics:
 
     def mtfs(
         self,
-        fields: Sequence[Field] | np.ndarray,
-        frequency: np.ndarray | None = None,
+        fields: Sequence[Field | FieldText] | np.ndarray,
+        frequency: Frequencies | None = None,
         wavelengths: np.ndarray | None = None,
         weights: np.ndarray | None = None,
     ) -> tuple[Mtf, ...]:
@@ -420,8 +450,9 @@ class CameraOptics:
         ----------
         fields : (F, 2) array_like
             The F fields.
-        frequency : (M,) ndarray, optional
-            Spatial frequencies, cycles/m; by default 65 from 0 to the cut-off or twice Nyquist, whichever is smaller.
+        frequency : (M,) ndarray or sequence of str or str, optional
+            Spatial frequencies in cycles/m, or with their unit, such as ``"50 cycles/mm"``; by default 65 from 0 to the
+            cut-off or twice Nyquist, whichever is smaller.
         wavelengths : (K,) ndarray, optional
             Wavelengths of the light, metres; by default the design wavelength.
         weights : (K,) ndarray, optional
@@ -432,6 +463,8 @@ class CameraOptics:
         AimError, BeamMissedError, ValueError
             The light is lost, edges cut a pupil into too many pieces, or a wavefront is too irregular.
         """
+        fields = self.fractions(fields)
+        frequency = None if frequency is None else in_cycles_per_m(frequency)
         colours = np.array([self.wavelength]) if wavelengths is None else np.asarray(wavelengths, float)
         shares = np.ones(len(colours)) if weights is None else np.asarray(weights, float)
         if self.model.edges and (frequency is None or even_step(frequency)):
@@ -446,7 +479,7 @@ class CameraOptics:
             frequency = np.linspace(0.0, min(cutoff, 2.0 * self.nyquist), MTF_POINTS)
         both = np.concatenate([frequency[:, None] * axis for axis in np.eye(2)])
         out = []
-        for where, field_pupils in zip(np.asarray(fields, dtype=np.float64), pupils, strict=True):
+        for where, field_pupils in zip(fields, pupils, strict=True):
             perfect = [replace(pupil, eikonal_terms=np.zeros_like(pupil.eikonal_terms)) for pupil in field_pupils]
             values, limit = (
                 np.abs(
@@ -457,14 +490,18 @@ class CameraOptics:
                 for pupil_set in (field_pupils, perfect)
             )
             place = (float(where[0]), float(where[1]))
-            out.append(Mtf(place, frequency, values, limit, colours, self.nyquist, shares / np.sum(shares)))
+            out.append(
+                Mtf(
+                    place, self._angles(where), frequency, values, limit, colours, self.nyquist, shares / np.sum(shares)
+                )
+            )
             check_mtf(out[-1])
         return tuple(out)
 
     @one_blas_thread()  # small matrices: a second thread would only wait
     def _mtfs_by_lines(
         self,
-        fields: Sequence[Field] | np.ndarray,
+        fields: Sequence[Field | FieldText] | np.ndarray,
         frequency: np.ndarray | None,
         colours: np.ndarray,
         shares: np.ndarray,
@@ -484,18 +521,19 @@ class CameraOptics:
             for pupils, colour in zip(pupils_by_colour, colours, strict=True)
         ]
         out = []
-        for k, where in enumerate(np.asarray(fields, dtype=np.float64)):
+        for k, where in enumerate(fields):
             # (colour, axis, with its wavefront and without, frequency)
             parts = np.array([[(t.values, t.perfect) for t in by_field[k]] for by_field in transfers])
             values, limit = np.abs(np.einsum("k,kawm->wam", shares, parts))
             place = (float(where[0]), float(where[1]))
             accuracy = max(t.error for by_field in transfers for t in by_field[k])
-            out.append(Mtf(place, frequency, values, limit, colours, self.nyquist, shares, accuracy=accuracy))
+            angles = self._angles(where)
+            out.append(Mtf(place, angles, frequency, values, limit, colours, self.nyquist, shares, accuracy=accuracy))
             check_mtf(out[-1])
         return tuple(out)
 
     def colour_pupils(
-        self, fields: Sequence[Field] | np.ndarray, wavelengths: np.ndarray
+        self, fields: Sequence[Field | FieldText] | np.ndarray, wavelengths: np.ndarray
     ) -> list[tuple[PupilFunction, ...]]:
         """Return the pupils of each of F fields, (F, 2), for K wavelengths, (K,), in metres.
 
@@ -510,8 +548,8 @@ class CameraOptics:
             return [(pupil,) for pupil in self.at(float(np.min(wavelengths))).pupils(fields)]
         return list(zip(*(self.at(float(colour)).pupils(fields) for colour in wavelengths), strict=True))
 
-    def mtf(self, field: Field = (0.0, 0.0), frequency: np.ndarray | None = None) -> Mtf:
-        """Compute the MTF at one field and the wavelength of the light, over frequencies in cycles/m."""
+    def mtf(self, field: Field | FieldText = (0.0, 0.0), frequency: Frequencies | None = None) -> Mtf:
+        """Compute the MTF at one field and the wavelength of the light, over frequencies in cycles/m or with a unit."""
         return self.mtfs([field], frequency)[0]
 
     def path_error(self, rays: LineRays) -> np.ndarray:

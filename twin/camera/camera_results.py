@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from analysis.arrays import shows
 from optics.geometry import zernike
 from optics.numerics.array_math import check_at_most, check_close, check_range
+from scenes.yaml.errors import Problem
+from scenes.yaml.units import ANGLE, Kind, parse_quantity, split_row
 from twin.framework.reference_frames import frames_text
 
 if TYPE_CHECKING:  # takes half a second with pandas, and only who asks for a data set needs it
@@ -17,6 +20,24 @@ if TYPE_CHECKING:  # takes half a second with pandas, and only who asks for a da
 
 Field = tuple[float, float]
 """Position in the field: fractions, from -1 to 1, of the half angles of view along the line and along the track."""
+
+FieldText = str | tuple[str, str]
+"""Position in the field as angles from its middle, along the line and along the track: ``"0.2 -0.1 deg"``, ``"(0.2,
+-0.1) deg"`` as results show it, or ``("0.2 deg", "-0.1 deg")``.
+"""
+
+Frequencies = np.ndarray | Sequence[float] | Sequence[str] | float | str
+"""Spatial frequencies in cycles/m, or with their unit, such as ``"50 cycles/mm"``."""
+
+LAST_DIGIT = 1e-3
+"""Relative amount by which a field in angles may lie beyond the edge of the field, since results show four digits."""
+
+SMALLEST_HALF_FIELD = 1e-12
+"""Half angle of view that stands for zero in a quotient, radians: only the field's middle lies within it."""
+
+SPATIAL_FREQUENCY = Kind("a spatial frequency", "1/m", ("cycles/mm", "cycles/m"), "50 cycles/mm")
+
+_NO_BRACKETS = str.maketrans("(),", "   ")
 
 TERMS = 37
 """Number of Zernike terms of a wavefront in Noll's order.
@@ -40,7 +61,7 @@ MAX_RMS_WAVES = 1e6
 """Rms wavefront error beyond which a result is rejected as unphysical, waves; it is 0.6 m of path."""
 
 
-@shows("field", "rms [waves]", "peak_to_valley [waves]", "strehl", "vignetted [percent]", "map [waves]")
+@shows("field_rad [deg]", "rms [waves]", "peak_to_valley [waves]", "strehl", "vignetted [percent]", "map [waves]")
 @dataclass(frozen=True, eq=False)
 class Wavefront:
     """Wavefront error at one field.
@@ -48,7 +69,9 @@ class Wavefront:
     Attributes
     ----------
     field : Field
-        Field of the beam.
+        Field of the beam, as fractions of the half angles.
+    field_rad : tuple of float
+        Angles of the field from its middle, along the line and along the track, radians.
     wavelength : float
         Wavelength, metres; errors "in waves" are in this unit.
     x, y : (n,) ndarray
@@ -86,6 +109,7 @@ class Wavefront:
     """
 
     field: Field
+    field_rad: tuple[float, float]
     wavelength: float
     x: np.ndarray
     y: np.ndarray
@@ -157,7 +181,7 @@ class Wavefront:
         )
 
 
-@shows("field", "rms [um]", "farthest [um]", "airy [um]", "rays [um]")
+@shows("field_rad [deg]", "rms [um]", "farthest [um]", "airy [um]", "rays [um]")
 @dataclass(frozen=True, eq=False)
 class Spot:
     """Spot diagram of one field on the line CCD.
@@ -165,7 +189,9 @@ class Spot:
     Attributes
     ----------
     field : Field
-        Field of the beam.
+        Field of the beam, as fractions of the half angles.
+    field_rad : tuple of float
+        Angles of the field from its middle, along the line and along the track, radians.
     rays : (N, 2) ndarray
         Positions of N rays relative to the chief ray, (along the line, along the track), metres; hexapolar on the stop,
         the chief ray first, without vignetted rays.
@@ -184,6 +210,7 @@ class Spot:
     """
 
     field: Field
+    field_rad: tuple[float, float]
     rays: np.ndarray
     centroid: np.ndarray
     rms: float
@@ -202,7 +229,7 @@ class Spot:
         return xr.Dataset(data, attrs={**attributes, "rms_m": self.rms, "airy_m": self.airy})
 
 
-@shows("field", "at_nyquist", "nyquist [cycles/mm]", "frequency [cycles/mm]", "wavelengths [nm]")
+@shows("field_rad [deg]", "at_nyquist", "nyquist [cycles/m]", "frequency [cycles/m]", "wavelengths [nm]")
 @dataclass(frozen=True, eq=False)
 class Mtf:
     """Modulation transfer function at one field, of the optics alone.
@@ -210,7 +237,9 @@ class Mtf:
     Attributes
     ----------
     field : Field
-        Field of the beam.
+        Field of the beam, as fractions of the half angles.
+    field_rad : tuple of float
+        Angles of the field from its middle, along the line and along the track, radians.
     frequency : (M,) ndarray
         The M spatial frequencies, cycles/m.
     values : (2, M) ndarray
@@ -231,6 +260,7 @@ class Mtf:
     """
 
     field: Field
+    field_rad: tuple[float, float]
     frequency: np.ndarray
     values: np.ndarray
     limit: np.ndarray
@@ -246,12 +276,33 @@ class Mtf:
         ends = {"left": np.nan, "right": np.nan}
         return np.array([np.interp(self.nyquist, self.frequency, row, **ends) for row in self.values])
 
-    def at(self, frequency: float) -> np.ndarray:
-        """Return the MTF along the line and along the track, (2,), at a frequency in cycles/m.
+    def at(self, frequency: float | str) -> np.ndarray:
+        """Return the MTF along the line and along the track at a frequency.
 
-        The frequency is within the range of the tabulated ones.
+        Parameters
+        ----------
+        frequency : float or str
+            Frequency in cycles/m, or with its unit, such as ``"50 cycles/mm"``.
+
+        Returns
+        -------
+        (2,) ndarray
+            MTF, interpolated between the tabulated frequencies; beyond a table that ends at the cut-off, its end.
+
+        Raises
+        ------
+        ValueError
+            The frequency is not a frequency, or beyond a table that ends before the cut-off.
         """
-        return np.array([np.interp(frequency, self.frequency, row) for row in self.values])
+        asked = float(in_cycles_per_m(frequency)[0])
+        first, last = float(self.frequency[0]), float(self.frequency[-1])
+        cut_off = float(np.max(self.limit[:, -1])) <= MTF_ROUNDING
+        if not (first <= asked and (asked <= last or cut_off)):
+            raise ValueError(
+                f"frequency: {asked:.6g} cycles/m is outside the tabulated range, {first:.6g} to {last:.6g} cycles/m; "
+                "mtf(field, frequency) computes others"
+            )
+        return np.array([np.interp(asked, self.frequency, row) for row in self.values])
 
     def to_xarray(self) -> xr.Dataset:
         """Return a data set of the MTF (``mtf``) and its diffraction limit (``limit``) over direction and frequency."""
@@ -270,6 +321,83 @@ class Mtf:
                 **({"accuracy": self.accuracy} if self.accuracy else {}),
             },
         )
+
+
+def in_si(value: float | str, kind: Kind, name: str) -> float:
+    """Return a quantity in SI units, from a number in SI units or from text with a unit.
+
+    Parameters
+    ----------
+    value : float or str
+        Number in SI units, or text such as ``"20 um"``.
+    kind : Kind
+        Kind of quantity.
+    name : str
+        Name of the argument, for messages.
+
+    Raises
+    ------
+    ValueError
+        The text is not such a quantity, or the number is not finite.
+    """
+    try:
+        number = parse_quantity(value, kind) if isinstance(value, str) else float(value)
+    except (Problem, TypeError) as problem:
+        raise ValueError(f"{name}: {problem}, {value!r}; allowed: {kind.allowed}, or a number in {kind.si}") from None
+    if not np.isfinite(number):
+        raise ValueError(f"{name}: {value!r} is not finite; allowed: {kind.allowed}, or a number in {kind.si}")
+    return number
+
+
+def in_cycles_per_m(frequency: Frequencies) -> np.ndarray:
+    """Return spatial frequencies, (M,), in cycles/m, from numbers in cycles/m or from text such as ``"50 cycles/mm"``.
+
+    Raises
+    ------
+    ValueError
+        A text is not a spatial frequency, or a number is not finite.
+    """
+    texts = [
+        str(one).replace("cycles/", "1/").replace("lp/", "1/") if isinstance(one, str) else one
+        for one in np.atleast_1d(np.asarray(frequency, dtype=object))
+    ]
+    return np.array([in_si(one, SPATIAL_FREQUENCY, "frequency") for one in texts])
+
+
+def field_fractions(field: Field | FieldText, half: tuple[float, float]) -> Field:
+    """Return a field as fractions of the half angles of view.
+
+    Parameters
+    ----------
+    field : Field or FieldText
+        Fractions, or angles with a unit.
+    half : tuple of float
+        Half angles of view along the line and along the track, radians.
+
+    Raises
+    ------
+    ValueError
+        It is neither, or lies beyond the camera's field of view, for which it has no clear apertures.
+    """
+    parts: Any = split_row(field.translate(_NO_BRACKETS), 2) or () if isinstance(field, str) else field
+    try:
+        angles = all(isinstance(part, str) for part in parts)
+        numbers = [in_si(part, ANGLE, "field") if angles else float(part) for part in parts]
+        shares = np.array(
+            [n / max(h, SMALLEST_HALF_FIELD) for n, h in zip(numbers, half, strict=True)] if angles else numbers
+        )
+        inside = len(numbers) == 2 and bool(np.all(np.abs(shares) <= (1.0 + LAST_DIGIT if angles else 1.0)))
+    except (TypeError, ValueError):
+        inside = False
+    if not inside:
+        along, across = np.degrees(half)
+        raise ValueError(
+            f"field: {field!r} is not in the field; a field is a pair (along the line, along the track) of angles from "
+            f"its middle, such as '{0.5 * along:.4g} {0.5 * across:.4g} deg', up to ({along:.4g}, {across:.4g}) deg, "
+            "or of fractions of these half angles, from -1 to 1"
+        )
+    shares = np.clip(shares, -1.0, 1.0)
+    return float(shares[0]), float(shares[1])
 
 
 def check_wavefront(wave: Wavefront) -> None:

@@ -21,8 +21,9 @@ from matplotlib.collections import QuadMesh
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle
 
+from analysis.arrays import summary
 from twin.camera.camera_optics import CameraOptics
-from twin.camera.camera_results import Field, Mtf, Spot, Wavefront
+from twin.camera.camera_results import Field, FieldText, Frequencies, Mtf, Spot, Wavefront
 from twin.framework.svg import BLUE, DIVERGING, GREY, INK, LIGHT, VERMILION, look, plain_axes, to_svg
 
 LINE, TRACK = BLUE, VERMILION
@@ -30,12 +31,6 @@ LINE, TRACK = BLUE, VERMILION
 
 WAVES = DIVERGING
 """Colour map of wavefront errors; points without light are white."""
-
-
-def field_text(field: tuple[float, float]) -> str:
-    """Format a field (fractions of the half fields along line and track) for a plot's title."""
-    along, across = field
-    return f"({along:+.2g}, {across:+.2g})".replace("+0)", "0)").replace("(+0,", "(0,").replace("-", "\N{MINUS SIGN}")
 
 
 def draw_wavefront(axes: Axes, wavefront: Wavefront, most: float | None = None) -> QuadMesh:
@@ -133,7 +128,9 @@ class WavefrontView(Wavefront, Plottable):
             figure = Figure(figsize=SIZE, layout="constrained")
             axes = figure.subplots()
             mesh = draw_wavefront(axes, self)
-            axes.set_title(f"field {field_text(self.field)}: {self.rms:.3g} waves rms, {self.peak_to_valley:.3g} PV")
+            axes.set_title(
+                f"field {summary(self.field_rad, 'deg')}: {self.rms:.3g} waves rms, {self.peak_to_valley:.3g} PV"
+            )
             axes.set_xlabel("x / stop radius (along the line)")
             axes.set_ylabel("y / stop radius (along the track)")
             figure.colorbar(mesh, ax=axes, label=f"waves of {1e9 * self.wavelength:.0f} nm", shrink=0.85)
@@ -150,7 +147,7 @@ class SpotView(Spot, Plottable):
             figure = Figure(figsize=(SIZE[1], SIZE[1]), layout="constrained")
             axes = figure.subplots()
             draw_spot(axes, self)
-            axes.set_title(f"field {field_text(self.field)}: rms radius {1e6 * self.rms:.3g} \N{MICRO SIGN}m")
+            axes.set_title(f"field {summary(self.field_rad, 'deg')}: rms radius {1e6 * self.rms:.3g} \N{MICRO SIGN}m")
             axes.set_xlabel("along the line [\N{MICRO SIGN}m]")
             axes.set_ylabel("along the track [\N{MICRO SIGN}m]")
         return figure
@@ -166,7 +163,7 @@ class MtfView(Mtf, Plottable):
             figure = Figure(figsize=SIZE, layout="constrained")
             axes = figure.subplots()
             draw_mtf(axes, self)
-            axes.set_title(f"MTF of the optics, field {field_text(self.field)}")
+            axes.set_title(f"MTF of the optics, field {summary(self.field_rad, 'deg')}")
             axes.legend()
         return figure
 
@@ -182,13 +179,14 @@ class CameraView(CameraOptics, Plottable):
         with look("layout"):
             return layout_figure(self.model, self.path.backend)
 
-    def wavefront(self, field: Field = (0.0, 0.0), points: int = 129) -> WavefrontView:
+    def wavefront(self, field: Field | FieldText = (0.0, 0.0), points: int = 129) -> WavefrontView:
         """Compute the wavefront error at a field.
 
         Parameters
         ----------
-        field : Field
-            Fractions of the half field along the line and along the track.
+        field : Field or FieldText
+            Angles from the middle of the field, along the line and along the track, such as ``"0.2 -0.1 deg"``, or
+            fractions of the half field, such as ``(1, 0)``.
         points : int
             Points of the map on each axis.
 
@@ -199,8 +197,15 @@ class CameraView(CameraOptics, Plottable):
         """
         return _shown(WavefrontView, super().wavefront(field, points))
 
-    def spot(self, field: Field = (0.0, 0.0), defocus: float = 0.0) -> SpotView:
-        """Compute the spot at a field, on the line CCD moved by ``defocus`` metres downstream.
+    def spot(self, field: Field | FieldText = (0.0, 0.0), defocus: float | str = 0.0) -> SpotView:
+        """Compute the spot at a field, on the line CCD moved downstream.
+
+        Parameters
+        ----------
+        field : Field or FieldText
+            Field, as for `wavefront`.
+        defocus : float or str
+            Distance of the line CCD, metres or with its unit, such as ``"20 um"``.
 
         Raises
         ------
@@ -209,8 +214,16 @@ class CameraView(CameraOptics, Plottable):
         """
         return _shown(SpotView, super().spot(field, defocus))
 
-    def mtf(self, field: Field = (0.0, 0.0), frequency: np.ndarray | None = None) -> MtfView:
-        """Compute the MTF at a field and frequencies (cycles/m).
+    def mtf(self, field: Field | FieldText = (0.0, 0.0), frequency: Frequencies | None = None) -> MtfView:
+        """Compute the MTF at a field.
+
+        Parameters
+        ----------
+        field : Field or FieldText
+            Field, as for `wavefront`.
+        frequency : (M,) ndarray or sequence of str or str, optional
+            Spatial frequencies in cycles/m, or with their unit, such as ``"50 cycles/mm"``; by default 65 from 0 to the
+            cut-off or twice Nyquist, whichever is smaller.
 
         Raises
         ------

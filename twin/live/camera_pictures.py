@@ -7,10 +7,11 @@ from matplotlib.figure import Figure
 
 from optics.geometry.tree import State
 from optics.waves.optical_transfer import polychromatic_transfer
+from scenes.models.camera_sharpness import field_text
 from scenes.specs.job import TargetsSpec
 from scenes.specs.resolved import ResolvedJob, resolve_job
 from scenes.yaml.errors import InputError
-from twin.camera.camera_view import CameraView, draw_mtf, draw_spot, draw_wavefront, field_text
+from twin.camera.camera_view import CameraView, draw_mtf, draw_spot, draw_wavefront
 from twin.framework.random_streams import stream
 from twin.framework.svg import AFTER, BEFORE, BLUE, GRAY, GREY, INK, VERMILION, look, to_svg
 from twin.monitor.monitor_experiment import MonitorExperiment
@@ -194,6 +195,6 @@ def _focus(figure: Figure, views: list[CameraView], field: float) -> None:
     axes.axvline(0.0, color=INK, lw=0.6)
     axes.set_xlabel(f"the line CCD moved downstream by [{UM}]")
     axes.set_ylabel("MTF at Nyquist")
-    axes.set_title(f"through focus, field {field_text((field, 0.0))}")
+    axes.set_title(f"through focus, field {field_text(views[0].model.spec, (field, 0.0))}")
     axes.set_ylim(bottom=0.0)
     axes.legend(fontsize=7)

@@ -215,7 +215,9 @@ class LiveBench:
     def _new_perturbed_twin(
         self, knobs: Sequence[tuple[str, float]], pivots: Sequence[tuple[str, str]]
     ) -> InstrumentTwin:
-        return self.twin.perturbed(perturbation(dict(knobs), dict(pivots), self.knobs, self._job_perturbations))
+        return self.twin.with_perturbations(
+            perturbation(dict(knobs), dict(pivots), self.knobs, self._job_perturbations)
+        )
 
     @cached_property
     def _job_perturbations(self) -> Mapping[str, Any]:

@@ -16,22 +16,27 @@ import numpy as np
 import pandas as pd
 import xarray as xr
 
+from analysis.arrays import shows
 from analysis.monitor import parameters
 from analysis.monitor.recovery import recover_monitor
 from optics.geometry.tree import ORIGIN, State
 from optics.numerics.backend import Backend, load_backend
+from optics.numerics.number_tree import FrozenMap
+from scenes.models.camera_design import with_plane
 from scenes.models.camera_sharpness import blur_warnings
 from scenes.specs.course import noll
-from scenes.specs.job import JobSpec, checked_nodes, with_tables
+from scenes.specs.job import JobSpec, PerturbationSpec, checked_nodes, with_tables
 from scenes.specs.load import INSTRUMENTS, find_disturbances, is_path, library_names
 from scenes.specs.load import load_camera as read_camera
-from scenes.specs.motion_text import AXES, find_node, matching_nodes, motion_of, perturbation_in_words
-from scenes.specs.perturbation import NodeInfo
+from scenes.specs.motion_text import AXES, FORMS, find_node, matching_nodes, motion_of, perturbation_in_words
+from scenes.specs.perturbation import NodeInfo, perturbation_text
 from scenes.specs.resolved import ResolvedJob, resolve, resolve_job
-from scenes.yaml.errors import InputError, Issue, Problem, names_text, nearest, unknown
+from scenes.yaml.errors import InputError, Issue, Problem, names_text, nearest, shown, unknown
 from scenes.yaml.spec import validate
 from scenes.yaml.yaml_file import YamlFile, read_yaml
+from twin.camera.camera_run import find_focus
 from twin.camera.camera_view import CameraView
+from twin.camera.first_order_data import FIRST_ORDER, first_order_data
 from twin.framework.reference_frames import frames_text
 from twin.main_job.monitor_reading import MonitorReading
 from twin.main_job.render_job import render_job
@@ -43,6 +48,9 @@ from twin.monitor.truth import truth_jacobian
 from twin.scripting.results import Found, Shot, as_frames, found_table, name_html
 from twin.scripting.results import shot_of as _shot_of
 from twin.sensors.area_detector import coarse_warnings
+
+Perturbation = Mapping[str, Mapping[str, Any]] | str
+"""Motion in words, ``"M2 shift z 3 um"``, or body -> keys of `perturb:` in a job's YAML."""
 
 
 class Twin(Protocol):
@@ -56,13 +64,21 @@ class Twin(Protocol):
     def state(self) -> State:
         """Path of each moved body -> its motion in SI units (metres, radians)."""
 
-    def perturbed(self, *perturb: Mapping[str, Mapping[str, Any]] | str) -> Self:
-        """Return the instrument with these bodies perturbed.
+    @property
+    def perturbed_by(self) -> str:
+        """All perturbations as text that `perturbed` takes, separated by semicolons; empty without any."""
+
+    def refocused(self, camera: str = "", tilt: bool = False) -> Self:
+        """Return the instrument with the image plane of a camera at its best focus."""
+
+    def perturbed(self, *perturb: Perturbation | Sequence[Perturbation]) -> Self:
+        """Return the instrument with these bodies perturbed further.
 
         Raises InputError for an unknown body or a motion that it does not allow.
         """
 
 
+@shows("name", "model.mirrors", "model.paraxial.focal_length [m]", "model.entrance_pupil [mm]", "twin.perturbed_by")
 @dataclass(frozen=True, eq=False, repr=False, kw_only=True)
 class CameraTwin(CameraView):
     """Camera of an instrument in one state, made by `load_camera` and `InstrumentTwin.camera`.
@@ -98,12 +114,12 @@ class CameraTwin(CameraView):
         seen = CameraView.within(experiment.instrument, name, experiment.backend, twin.state, obstruction)
         return cls(seen.path, seen.state, twin=twin, name=name, obstruction=obstruction)
 
-    def perturbed(self, *perturb: Mapping[str, Mapping[str, Any]] | str) -> CameraTwin:
-        """Return the same camera with bodies of its instrument perturbed.
+    def perturbed(self, *perturb: Perturbation | Sequence[Perturbation]) -> CameraTwin:
+        """Return the same camera with bodies of its instrument perturbed, in addition to what they are already.
 
         Parameters
         ----------
-        perturb : Mapping[str, Mapping[str, Any]] or str
+        perturb : str, Mapping[str, Mapping[str, Any]] or a list of them
             Motions in words, such as ``"M2 shift z 20 um"``, or path of a body -> keys of `perturb:` in a job's YAML,
             such as ``{"base/gf7/M2": {"shift": "0 0 20 um"}}``.
 
@@ -114,17 +130,43 @@ class CameraTwin(CameraView):
         """
         return CameraTwin.of(self.twin.perturbed(*perturb), self.name, self.obstruction)
 
+    def refocused(self, tilt: bool = False) -> CameraTwin:
+        """Return the camera with its image plane at the least mean square wavefront error over 15 fields.
+
+        Parameters
+        ----------
+        tilt : bool
+            Whether the plane is tilted about the line as well.
+
+        Raises
+        ------
+        InputError
+            The camera is perturbed or as built, or its light has no focus after the last mirror.
+        """
+        return CameraTwin.of(self.twin.refocused(self.name, tilt), self.name, self.obstruction)
+
+    @property
+    def first_order(self) -> Mapping[str, Any]:
+        """First-order data of the camera in its state, as in optics.json: names end in their unit.
+
+        Raises
+        ------
+        AimError, BeamMissedError, AfocalError
+            Light does not pass, or has no focus.
+        """
+        return FIRST_ORDER(first_order_data(self))
+
 
 class _Bench:
     """Model of an instrument for ray tracing, built once and shared by all perturbed copies of the instrument."""
 
     def __init__(self, resolved: ResolvedJob, backend: str, like: _Bench | None = None) -> None:
-        self._resolved, self._name, self._like = resolved, backend, like
+        self._resolved, self.name, self._like = resolved, backend, like
 
     @cached_property
     def backend(self) -> Backend:
         """Backend that traces the rays."""
-        return load_backend(self._name) if self._like is None else self._like.backend
+        return load_backend(self.name) if self._like is None else self._like.backend
 
     @cached_property
     def experiment(self) -> MonitorExperiment:
@@ -135,7 +177,7 @@ class _Bench:
 
     def stating(self, resolved: ResolvedJob) -> _Bench:
         """Return the model of the same instrument with the disturbance prior of the job ``resolved``."""
-        return _Bench(resolved, self._name, self)
+        return _Bench(resolved, self.name, self)
 
 
 @dataclass(frozen=True, eq=False)
@@ -223,41 +265,80 @@ class InstrumentTwin:
         """
         return self._bench.experiment.state(self.resolved.job)
 
-    def perturbed(self, *perturb: Mapping[str, Mapping[str, Any]] | str) -> InstrumentTwin:
-        """Return this instrument with the given bodies perturbed.
+    @property
+    def perturbed_by(self) -> str:
+        """All perturbations as text that `perturbed` takes, separated by semicolons; empty without any."""
+        return perturbation_text(self.resolved.job.perturb)
+
+    def perturbed(self, *perturb: Perturbation | Sequence[Perturbation]) -> InstrumentTwin:
+        """Return this instrument with the given bodies perturbed, in addition to the perturbations that they have.
 
         Parameters
         ----------
-        perturb : Mapping[str, Mapping[str, Any]] or str
+        perturb : str, Mapping[str, Mapping[str, Any]] or a list of them
             Motions in words, such as ``"M2 shift z 3 um"``, or node -> keys and unit strings of `perturb:` in a job's
             YAML, such as ``{"base/forward/M2": {"shift": "0 0 3 um"}}``. The last parts of a node's path are enough
-            where only one node ends with them. The perturbation of a node that already has one is replaced; other nodes
-            keep theirs.
+            where only one node ends with them. Amounts of the same component add: shifts and rotation vectors,
+            temperatures, figure terms and other changes.
+
+        Raises
+        ------
+        InputError
+            No such node, a motion that it does not allow, or one that cannot be added: a rotation about another pivot.
+        """
+        twin = self
+        for asked in self._given(perturb):
+            before = twin.resolved.job.perturb
+            twin = twin.with_perturbations(asked)
+            own = twin.resolved.job.perturb
+            twice = {path: _sum_of(path, before[path], own[path]) for path in asked if path in before}
+            twin = twin.with_perturbations(twice) if twice else twin
+        return twin
+
+    def _given(self, perturb: Sequence[Perturbation | Sequence[Perturbation]]) -> list[dict[str, Any]]:
+        """Return the requested perturbations by the bodies' full paths: all texts together, then each mapping."""
+        asked = [one for item in perturb for one in (item if isinstance(item, list | tuple) else [item])]
+        try:
+            wrong = [one for one in asked if not isinstance(one, str | Mapping)]
+            if wrong:
+                raise Problem(
+                    "not a perturbation", shown(wrong[0]), f"{FORMS}, or a mapping as below perturb in a file"
+                )
+            words = perturbation_in_words(one for one in asked if isinstance(one, str))
+        except Problem as problem:
+            raise InputError(problem.at("", key=("perturb",))) from None
+        return [self._by_path(one) for one in (words, *asked) if isinstance(one, Mapping) and one]
+
+    def _by_path(self, perturb: Mapping[str, Any]) -> dict[str, Any]:
+        """Return a perturbation by the bodies' full paths; unknown names stay and are reported later."""
+        out: dict[str, Any] = {}
+        for name, motion in perturb.items():
+            try:
+                path = find_node(name, self._nodes) if matching_nodes(name, self._nodes) else name
+                if path in out:
+                    raise Problem("this node is perturbed twice", shown(name), f"{path} once, under one name")
+            except Problem as problem:
+                raise InputError(problem.at("", key=("perturb",))) from None
+            out[path] = motion
+        return out
+
+    def with_perturbations(self, perturb: Mapping[str, Mapping[str, Any]]) -> InstrumentTwin:
+        """Return this instrument with the perturbations of these bodies replaced; other bodies keep theirs.
+
+        Parameters
+        ----------
+        perturb : Mapping[str, Mapping[str, Any]]
+            Node -> keys and unit strings of `perturb:` in a job's YAML, as for `perturbed`. An empty mapping, ``{}``,
+            takes the perturbation away.
 
         Raises
         ------
         InputError
             No such node, or a motion that it does not allow.
         """
-        plain = {**self._plain, "perturb": {**self._plain.get("perturb", {}), **self._given(perturb)}}
-        twin = self._with_job(plain)
+        twin = self._with_job({**self._plain, "perturb": {**self._plain.get("perturb", {}), **self._by_path(perturb)}})
         job = checked_nodes(twin.resolved.job, self._nodes)
         return InstrumentTwin(twin.resolved.with_job(job), twin._bench)
-
-    def _given(self, perturb: Sequence[Mapping[str, Mapping[str, Any]] | str]) -> dict[str, Any]:
-        """Return full path of a body -> its requested perturbation; unknown names are kept and reported later."""
-        try:
-            asked: dict[str, Any] = perturbation_in_words(one for one in perturb if isinstance(one, str))
-            for one in perturb:
-                if not isinstance(one, str):
-                    asked |= dict(one)
-            nodes = self._nodes
-            return {
-                find_node(name, nodes) if matching_nodes(name, nodes) else name: motion
-                for name, motion in asked.items()
-            }
-        except Problem as problem:
-            raise InputError(problem.at("", key=("perturb",))) from None
 
     def with_disturbances(self, disturbances: str | Mapping[str, Any]) -> InstrumentTwin:
         """Return this instrument with another disturbance prior, on which `posterior` and all total sigmas are based.
@@ -428,10 +509,40 @@ class InstrumentTwin:
         InputError
             There is no camera of that name.
         """
+        return CameraTwin.of(self, self._camera_name(name), obstruction)
+
+    def _camera_name(self, name: str) -> str:
+        """Return the name of a camera, that of the only one for an empty name; raise `InputError` for another."""
         name = name or (self.cameras[0] if len(self.cameras) == 1 else "")
         if name not in self.cameras:
             raise InputError(unknown("no such camera", name, self.cameras).at())
-        return CameraTwin.of(self, name, obstruction)
+        return name
+
+    def refocused(self, camera: str = "", tilt: bool = False) -> InstrumentTwin:
+        """Return this instrument with the image plane of a camera at the least mean square error over its field.
+
+        The plane of the prescription moves, in every camera of the instrument that has this prescription.
+
+        Parameters
+        ----------
+        camera : str
+            Name of the camera; optional if there is only one.
+        tilt : bool
+            Whether the plane is tilted about the line as well.
+
+        Raises
+        ------
+        InputError
+            There is no such camera, the instrument is perturbed or as built, or the light has no focus.
+        """
+        resolved, mounted = self.resolved, self.resolved.instrument.cameras[self._camera_name(camera)].camera
+        if resolved.job.perturb or resolved.instrument.as_built:
+            text = "refocusing applies to a nominal camera, and this one is perturbed or as built"
+            raise InputError(Issue(text, found=self.perturbed_by or "as built", allowed="a nominal instrument"))
+        design, backend = resolved.cameras[mounted], self._bench.backend
+        moved = with_plane(design, find_focus(design, backend, tilt).after)
+        cameras = FrozenMap({**resolved.cameras, mounted: moved})
+        return InstrumentTwin.of(resolved.model_copy(update={"cameras": cameras}), self._bench.name)
 
     def to_yaml(self) -> str:
         """Return the text of a self-contained job file for this instrument, for `load` and the commands."""
@@ -453,8 +564,7 @@ class InstrumentTwin:
         return InstrumentTwin(self.resolved.with_job(job), self._bench)
 
     def __repr__(self) -> str:
-        perturbed = ", ".join(self.resolved.job.perturb) or "nothing"
-        return f"<{self.name}: cameras {', '.join(self.cameras)}; perturbed: {perturbed}>"
+        return f"<{self.name}: cameras {', '.join(self.cameras)}; perturbed by {self.perturbed_by or 'nothing'}>"
 
     def _repr_html_(self) -> str:
         return name_html(self.name, self.cameras, self.perturbations)
@@ -466,6 +576,14 @@ def _pivot(uses: Sequence[str], plain: Mapping[str, Any]) -> tuple[str, ...]:
     ``uses`` are the kinds of motion in the perturbation, and ``plain`` are its keys and values.
     """
     return ("pivot",) if {"rotate", "scale"} & set(uses) and "pivot" in plain else ()
+
+
+def _sum_of(path: str, one: PerturbationSpec, other: PerturbationSpec) -> dict[str, Any]:
+    """Return the sum of two perturbations of a body as plain data; raise `InputError` where there is none."""
+    try:
+        return one.plus(other).plain()
+    except Problem as problem:
+        raise InputError(problem.below(path).at("", key=("perturb",))) from None
 
 
 def load(

@@ -43,8 +43,11 @@ class Perturbed(Protocol):
     def resolved(self) -> ResolvedJob:
         """Job that describes the instrument, with its perturbation and settings."""
 
-    def perturbed(self, perturb: Mapping[str, Mapping[str, Any]]) -> Perturbed:
-        """Return the instrument with these bodies perturbed; raise InputError if that is impossible."""
+    def with_perturbations(self, perturb: Mapping[str, Mapping[str, Any]]) -> Perturbed:
+        """Return the instrument with the perturbations of these bodies replaced.
+
+        Raises InputError if that is impossible.
+        """
 
 
 @dataclass(frozen=True)
@@ -230,7 +233,7 @@ def config_text(
         middle[node] = {key: _with_middle_values(value, (node, key), spreads) for key, value in keys.items()}
     if not spreads:
         raise InputError(Issue("nothing varies", key=("vary",), allowed=_FORMS))
-    resolved = instrument.perturbed(middle).resolved
+    resolved = instrument.with_perturbations(middle).resolved
     paths = {node: find_node(node, resolved.job.perturb) for node in middle}
     spreads = [Spread((paths[str(s.key[0])], *s.key[1:]), s.factor) for s in spreads]
     named = {"factors": {s.name: {"key": ["job", "perturb", *s.key], **s.factor} for s in spreads}}
