@@ -93,7 +93,9 @@ def seidel(camera: Camera, field: float, ends: tuple[float, float] | None = None
     """
     names = camera._assembly.sequences["image"][:-1]
     indices = [np.array([1.0, *camera.at(wave).indices]) for wave in (camera.wavelength, *(ends or ()))]
-    return seidel_sums(camera._assembly, names, camera.stop, 0.5 * camera.surfaces[camera.stop].diameter, field, indices)
+    return seidel_sums(
+        camera._assembly, names, camera.stop, 0.5 * camera.surfaces[camera.stop].diameter, field, indices
+    )
 
 
 def seidel_sums(
