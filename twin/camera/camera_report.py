@@ -168,11 +168,15 @@ def _refocus(run: CameraRun) -> Section:
         + (", position and tilt" if refocused.tilt else "")
         + ". All other results refer to the refocused camera."
     )
-    name = _new_name(run)
-    file = file_with_plane(run.setup.camera, refocused.after, name)
+    file: tuple[Artefact, ...] = ()
+    if run.camera is not run.setup.camera:
+        name = _new_name(run)
+        new = file_with_plane(run.setup.camera, refocused.after, name)
+        about = "Its file, which differs in name and image plane only."
+        file = (CameraFile(name.lower(), "The refocused camera", about, new),)
     artefacts: tuple[Artefact, ...] = (
         _figure("refocus", "Before and after", "Waves rms, logarithmic scale.", plots.refocus_figure, run),
-        CameraFile(name.lower(), "The refocused camera", "Its file, which differs in name and image plane only.", file),
+        *file,
         Table("refocus-fields", "Wavefront error by field", "Waves rms.", ("field", "before", "after"), rows,
               (None, 4, 4)),
     )  # fmt: skip
