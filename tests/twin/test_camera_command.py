@@ -29,7 +29,7 @@ from tests.twin.test_blurred_cameras import GF7, gf7_with
 from twin.camera.__main__ import app
 from twin.camera.camera_optics import CameraOptics
 from twin.camera.camera_plots import distortion_figure
-from twin.camera.camera_run import aberration_name, find_focus, perturbed_text, refocus_text, run_camera
+from twin.camera.camera_run import aberration_name, find_focus, perturbed_text, refocus_text, run_camera, verdict
 from twin.camera.field_maps import distortion
 from twin.design.__main__ import app as design_app
 from twin.design.design_run import HELD_BY, _held_text, run_design
@@ -61,6 +61,19 @@ def test_distortion_is_that_of_the_papers_formula(gf7_alone) -> None:
     reach = np.abs(np.concatenate([line.get_xydata() for line in left.lines])).max(axis=0)
     np.testing.assert_allclose(reach, 1e3 * np.abs(found.ideal).max(axis=(0, 1)), rtol=0.3)
     np.testing.assert_allclose(right.lines[0].get_xydata(), np.stack([1e3 * found.position, 1e6 * found.residual], -1))
+
+
+@pytest.mark.parametrize(
+    ("sharp", "words"),
+    [(0, "nowhere in"), (1, "in less than 1 % of"), (90, "in 40 % of"), (224, "in more than 99 % of")],
+)
+def test_a_small_share_of_the_field_is_not_none(gf7_alone, sharp: int, words: str) -> None:
+    """One field of 225 is not "0 %", and all but one are not "100 %"."""
+    errors = np.where(np.arange(225) < sharp, 0.05, 0.2).reshape(25, 9)
+    run = SimpleNamespace(
+        errors=errors, worst=(0.2, (1.0, 0.0)), camera=gf7_alone.model.spec, mtfs=(), limits=(("coma", 0.1),)
+    )
+    assert verdict(run)[0].startswith(f"Diffraction limited {words} the field: ")
 
 
 def test_kinds_of_aberration() -> None:

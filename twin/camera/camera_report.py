@@ -241,7 +241,8 @@ def _mtf(run: CameraRun) -> Section:
         rows.append([plots.degrees_text(run, mtf.field), *map(float, values), *limits])
     heads = ("field", "along line", "along track", "limit along line", "limit along track")
     text = (
-        f"Optics alone, at {1e9 * run.camera.wavelength:.0f} nm, without the effects of pixels, charge and motion. "
+        f"Optics alone, at {1e9 * run.camera.wavelength:.0f} nm, without the effects of pixels, charge and motion; "
+        "with the pixel: `render: {quality: true}` in a job. "
         f"Nyquist is {1e-3 * run.optics.nyquist:.4g} cycles/mm."
     )
     change = max(mtf.accuracy for mtf in run.mtfs)
@@ -251,9 +252,11 @@ def _mtf(run: CameraRun) -> Section:
             f"{change:.1g}."
         )
     caption = "Along the line and along the track; dashed: diffraction limit."
-    figure = _figure("mtf", "MTF by field", caption, plots.mtf_figure, run)
+    figure = _figure("mtf", "MTF of the optics by field", caption, plots.mtf_figure, run)
     return Section(
-        "MTF", (text,), (figure, Table("mtf-nyquist", "MTF at Nyquist", "", heads, rows, (None, 3, 3, 3, 3)))
+        "MTF",
+        (text,),
+        (figure, Table("mtf-nyquist", "MTF of the optics at Nyquist", "", heads, rows, (None, 3, 3, 3, 3))),
     )
 
 
@@ -316,8 +319,10 @@ def _light(run: CameraRun, colours: Colours, ends: str) -> Section:
         "one point of the image, so that lateral and axial colour blur it."
     )
     caption = "MTF by field; below: point images (square root of irradiance) about the design wavelength's chief ray."
-    figure = _figure("light-mtf", "MTF and point images", caption, plots.light_mtf_figure, run)
-    table = Table("light-mtf-nyquist", "Polychromatic MTF at Nyquist", "", heads, rows, (None, 3, 3, 3, 3, 3))
+    figure = _figure("light-mtf", "MTF of the optics and point images", caption, plots.light_mtf_figure, run)
+    table = Table(
+        "light-mtf-nyquist", "Polychromatic MTF of the optics at Nyquist", "", heads, rows, (None, 3, 3, 3, 3, 3)
+    )
     return Section(title, (text,), (figure, table))
 
 

@@ -398,7 +398,10 @@ def verdict(run: CameraRun) -> tuple[str, ...]:
         text += f" (Mar\N{LATIN SMALL LETTER E WITH ACUTE}chal's limit is {SHARP:.3f})."
     elif worst <= BLURRED:
         share = float(np.mean(run.errors <= SHARP))
-        part = f"in {100.0 * share:.0f} % of" if share else "nowhere in"
+        part = "nowhere in"
+        if share:
+            percent = "less than 1" if share < 0.01 else "more than 99" if share > 0.99 else f"{100.0 * share:.0f}"
+            part = f"in {percent} % of"
         text = f"Diffraction limited {part} the field: the worst wavefront error is "
         text += f"{lead} (Mar\N{LATIN SMALL LETTER E WITH ACUTE}chal's limit is {SHARP:.3f})."
     else:
@@ -408,7 +411,11 @@ def verdict(run: CameraRun) -> tuple[str, ...]:
     if run.mtfs:
         low = min(float(np.min(mtf.at(run.optics.nyquist))) for mtf in run.mtfs)
         limit = max(float(np.interp(mtf.nyquist, mtf.frequency, row)) for mtf in run.mtfs for row in mtf.limit)
-        return text, f"The lowest MTF of the optics at Nyquist is {low:.2g}; the diffraction limit is {limit:.2f}."
+        text_mtf = (
+            f"The lowest MTF of the optics, without the pixel, at Nyquist is {low:.2g} over the field; the diffraction "
+            f"limit is {limit:.2f}."
+        )
+        return text, text_mtf
     return (text,)
 
 
@@ -429,7 +436,7 @@ def perturbed_text(run: CameraRun) -> str:
     )
     if len(perturbed.mtf) and run.mtfs:
         after = min(float(np.min(mtf.at(run.optics.nyquist))) for mtf in run.mtfs)
-        text += f", the lowest MTF at Nyquist from {float(np.min(perturbed.mtf)):.3f} to {after:.3f}"
+        text += f", the lowest MTF of the optics at Nyquist from {float(np.min(perturbed.mtf)):.3f} to {after:.3f}"
     return f"{text}. {_OF_THE_DRAWING}"
 
 
@@ -480,7 +487,7 @@ _SPOT: Record[Spot] = Record(
     Quantity("spot_largest_um", lambda s: s.farthest, "largest distance of a ray from the centroid"),
 )
 _MTF: Record[Mtf] = Record(
-    "MTF of the optics alone at the pixels' Nyquist frequency.",
+    "MTF of the optics, without the pixel, at the Nyquist frequency.",
     Quantity("field", lambda m: m.field, "shares of the half field, along the line and along the track"),
     Quantity("along_line", lambda m: m.at(m.nyquist)[0]),
     Quantity("along_track", lambda m: m.at(m.nyquist)[1]),
@@ -532,7 +539,11 @@ _PERTURBED: Record[Perturbed] = Record(
         for k, parameter in enumerate(parameters.ESTIMATED)
     ),
     Quantity("worst_as_designed_waves", lambda p: p.errors.max(), "wavefront error of the worst field"),
-    Quantity("mtf_as_designed", lambda p: p.mtf, "MTF at Nyquist, along the line and along the track, field by field"),
+    Quantity(
+        "mtf_as_designed",
+        lambda p: p.mtf,
+        "MTF of the optics at Nyquist, along the line and along the track, field by field",
+    ),
 )
 
 
@@ -575,7 +586,7 @@ CAMERA: Record[CameraRun] = Record(
     ),
     Quantity("first_order", lambda run: run.first_order, record=FIRST_ORDER),
     Quantity("fields", _field_numbers, "wavefront and spot, field by field"),
-    Quantity("mtf_at_nyquist", lambda run: run.mtfs, record=_MTF),
+    Quantity("mtf_at_nyquist", lambda run: run.mtfs, "MTF of the optics, field by field", record=_MTF),
     Quantity("colours", lambda run: run.colours, "polychromatic results", record=COLOURS, where_known=True),
     Quantity("distortion", lambda run: run.distortion, record=_DISTORTION),
     Quantity("refocus", lambda run: run.refocus, record=_REFOCUS),
@@ -616,7 +627,7 @@ def camera_data(run: CameraRun) -> xr.Dataset:
         "through_focus_mtf": (
             ("mtf_field", "direction", "defocus"),
             run.focus.mtf,
-            named("modulation at the Nyquist frequency through focus"),
+            named("MTF of the optics at the Nyquist frequency through focus"),
         ),
         "distortion_line": (
             ("line",),
@@ -637,11 +648,11 @@ def camera_data(run: CameraRun) -> xr.Dataset:
         "mtf_field_share": (("mtf_field", "direction"), np.array(MTF_FIELDS), named(share)),
     }
     if run.mtfs:
-        data["mtf"] = (mtf, np.stack([m.values for m in run.mtfs]), named("modulation of the optics"))
+        data["mtf"] = (mtf, np.stack([m.values for m in run.mtfs]), named("MTF of the optics"))
         data["mtf_limit"] = (
             mtf,
             np.stack([m.limit for m in run.mtfs]),
-            named("modulation without wavefront error, the diffraction limit"),
+            named("MTF of the optics without wavefront error, the diffraction limit"),
         )
         axis_attributes = named("spatial frequency in the image, cycles per length", {"units": "1/m"})
         coords["frequency"] = ("frequency", run.mtfs[0].frequency, axis_attributes)
