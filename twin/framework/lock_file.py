@@ -148,7 +148,7 @@ class Differences:
 
 
 def differences(project: str, folder: Path = FOLDER) -> Differences:
-    """Compare the installed packages with the lock files; packages of --live and --test may be missing.
+    """Compare the installed packages with the lock files; packages of the live twin and --test may be missing.
 
     Parameters
     ----------

@@ -20,7 +20,7 @@ TOKEN = "TWIN_LIVE_TOKEN"
 """Environment variable with a token that stays valid when the server is restarted."""
 EXTRA = (
     "the live twin needs starlette, uvicorn and websockets, which are not installed; install them with "
-    "`bash setup.sh --live`"
+    "`bash setup.sh`"
 )
 """Error if the optional packages are missing."""
 
@@ -72,7 +72,7 @@ def main(
     has it can adjust the knobs. The environment variable TWIN_LIVE_TOKEN sets a token that stays valid after a restart.
     The command ends ten seconds after the last page is closed, or with Ctrl-C.
 
-    It needs what the extra `live` installs: bash setup.sh --live
+    It needs what bash setup.sh installs; with pip it is the extra `live`.
 
     Exit codes: 0 ended, 2 bad input, 1 anything else.
     """
