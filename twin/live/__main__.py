@@ -19,8 +19,7 @@ PORT = 8790
 TOKEN = "TWIN_LIVE_TOKEN"
 """Environment variable with a token that stays valid when the server is restarted."""
 EXTRA = (
-    "the live twin needs starlette, uvicorn and websockets, which are not installed; install them with "
-    "`bash setup.sh`"
+    "the live twin needs starlette, uvicorn and websockets, which are not installed; install them with `bash setup.sh`"
 )
 """Error if the optional packages are missing."""
 
