@@ -154,6 +154,13 @@ def test_files_that_it_takes(tmp_path) -> None:
     assert isinstance(validate(CameraSpec, read_yaml(LIBRARY / "cameras" / "gf7.yaml")), CameraSpec)
 
 
+def test_a_telescope_on_its_axis_needs_no_field_bias(tmp_path) -> None:
+    text = (LIBRARY / "cameras" / "cassegrain.yaml").read_text("utf-8")
+    assert "\nfield_bias: 0 deg\n" in text
+    (tmp_path / "own.yaml").write_text(text.replace("\nfield_bias: 0 deg\n", "\n"), "utf-8")
+    assert load_camera(tmp_path / "own.yaml") == load_camera("cassegrain")
+
+
 def test_what_it_refuses(tmp_path) -> None:
     for words, message in REFUSED["cameras"]:
         result = invoke(app, *words, "--out", tmp_path / "out")
