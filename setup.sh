@@ -5,15 +5,13 @@ set -euo pipefail
 
 usage() {
     cat <<'TEXT'
-Usage: bash setup.sh [--test | --live] [--help]
+Usage: bash setup.sh [--test] [--help]
 
 Makes a virtual environment in .venv, installs the space camera twin and what it needs into it, and checks that it works.
 What is installed is pinned with checksums in docs/supply/lock; docs/installed.md says more.
 
   --test   also install what the tests need (pytest, ruff, mypy, the programs the twin is checked against, ray-optics among
-           them in a folder of its own, .venv/peers), what builds the documentation (Sphinx), what writes Parquet and what
-           --live installs
-  --live   also install what serves the live twin, python -m twin.live
+           them in a folder of its own, .venv/peers), what builds the documentation (Sphinx) and what writes Parquet
   --help   this text
 
 Needs Python 3.11 or newer with its venv module, and libatomic.so.1. As root on Debian or Ubuntu the last two are installed when
@@ -24,10 +22,10 @@ TEXT
 }
 
 all="install runtime live test peers"
-layers="install runtime"
+layers="install runtime live"
 for argument in "$@"; do
     case "$argument" in
-        --live) [ "$layers" = "$all" ] || layers="install runtime live" ;;
+        --live) ;; # of earlier versions; what serves the live twin is always installed, 2.4 MB
         --test) layers="$all" ;;
         -h | --help) usage; exit 0 ;;
         *) echo "setup.sh: unknown option $argument" >&2; usage >&2; exit 2 ;;

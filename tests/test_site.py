@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 import twin
-from docs.site.__main__ import HERE, NEEDED, BuildError, build, run_sphinx, with_policy
+from docs.site.__main__ import HERE, NEEDED, BuildError, Progress, build, run_sphinx, with_policy
 from docs.site.command_pages import command_page, commands, programs
 from docs.site.file_pages import ACTIONS, file_pages, key_page, node_table
 from docs.site.markdown import slug
@@ -171,11 +171,28 @@ def test_a_broken_site_is_refused(tmp_path: Path) -> None:
     (tmp_path / "a/index.md").write_text("\n\n".join(["# Index", *FAULTS, "[x](docs/there.md#here)", tree]))
     (tmp_path / "a/docs/there.md").write_text("# There\n\n## Here\n")
     (tmp_path / "a/docs/lost.md").write_text("# In no tree\n")
+    progress: list[str] = []
     with pytest.raises(BuildError) as told:
-        run_sphinx(tmp_path / "a", tmp_path / "site", "off")
+        run_sphinx(tmp_path / "a", tmp_path / "site", "off", lambda text, step: progress.append(text))
+    assert any(line.startswith("reading sources") for line in progress)
     for words in (*FAULTS.values(), "docs/lost.md: WARNING: document isn't included in any toctree"):
         assert words in str(told.value)
     assert len(str(told.value).splitlines()) == len(FAULTS) + 1
+
+
+def test_what_is_missing_is_named_with_what_installs_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("docs.site.__main__.NEEDED", ("numpy", "no_such_package"))
+    with pytest.raises(BuildError, match=r"^not installed: no_such_package; they come with bash setup\.sh --test$"):
+        build(tmp_path / "site", notebooks=False)
+
+
+def test_progress_is_a_line_for_each_step_and_few_within_one(capsys: pytest.CaptureFixture[str]) -> None:
+    tell = Progress()
+    tell("one")
+    for number in range(9):
+        tell(f"part {number}", step=False)
+    tell("two")
+    assert capsys.readouterr().err == "progress: one\nprogress: two\n"
 
 
 def test_a_folder_with_other_things_is_not_replaced(tmp_path: Path) -> None:

@@ -63,6 +63,8 @@ def main(
 
           base/forward/M2: {shift: [0 um, 0 um, 3 um]}
 
+        disturbances: launch
+
         render: {images: [spots], frames: 9, seed: 1}
 
     Every quantity carries its unit. The run folder gets the images (TIFF), the expected irradiance (netCDF),

@@ -13,6 +13,8 @@ import shutil
 import subprocess
 import sys
 import tempfile
+import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated
 
@@ -48,7 +50,7 @@ def main(
 ) -> None:
     """Build the documentation as web pages that need no network: guides, notebooks, and the generated reference.
 
-    Sphinx's warnings are errors, and every link within the site is checked. Needs the extra `docs`.
+    Sphinx's warnings are errors, and every link within the site is checked. Needs what bash setup.sh --test installs.
     """
     if keys is not None:
         from docs.site.file_pages import key_page
@@ -56,14 +58,34 @@ def main(
         keys.write_text(key_page(), "utf-8")
         return
     try:
-        count = build(out, notebooks)
+        count = build(out, notebooks, Progress())
     except BuildError as error:
         sys.stderr.write(f"{error}\n")
         raise typer.Exit(1) from None
     sys.stdout.write(f"{count} pages: {out / 'index.html'}\n")
 
 
-def build(out: Path, notebooks: bool = True) -> int:
+class Progress:
+    """Lines on stderr that say what is being done: each step, and within a step at most one every few seconds."""
+
+    EVERY_S = 5.0
+
+    def __init__(self) -> None:
+        self._last = -self.EVERY_S
+
+    def __call__(self, text: str, step: bool = True) -> None:
+        """Print a line; one within a step only if the last one is old enough."""
+        if step or time.monotonic() - self._last >= self.EVERY_S:
+            self._last = time.monotonic()
+            sys.stderr.write(f"progress: {text}\n")
+            sys.stderr.flush()
+
+
+def silent(text: str, step: bool = True) -> None:
+    """Print nothing."""
+
+
+def build(out: Path, notebooks: bool = True, tell: Callable[..., None] = silent) -> int:
     """Build the site.
 
     Parameters
@@ -72,6 +94,8 @@ def build(out: Path, notebooks: bool = True) -> int:
         Folder for the pages; the site of a previous build there is replaced.
     notebooks : bool
         Whether the notebooks are run; otherwise they are shown as they are.
+    tell : callable
+        Called with each step as text, and within a step with ``step=False``.
 
     Returns
     -------
@@ -84,13 +108,15 @@ def build(out: Path, notebooks: bool = True) -> int:
         A package is missing, the reference cannot be made, Sphinx warns, or a page needs the network.
     """
     if missing := [name for name in NEEDED if importlib.util.find_spec(name) is None]:
-        raise BuildError(f"not installed: {', '.join(missing)}; install the extra `docs`: pip install -e .[docs]")
+        raise BuildError(f"not installed: {', '.join(missing)}; they come with bash setup.sh --test")
     if out.exists() and any(out.iterdir()) and not (out / "objects.inv").exists():
         raise BuildError(f"{out} contains other files than a site; choose another folder")
     with tempfile.TemporaryDirectory(prefix="docs-") as place:
         source, made = Path(place, "source"), Path(place, "site")
+        tell("making the reference from the program")
         stage(source)
-        pages = run_sphinx(source, made, "force" if notebooks else "off")
+        tell("building the pages" + (" and running the notebooks, minutes" if notebooks else ""))
+        pages = run_sphinx(source, made, "force" if notebooks else "off", tell)
         if out.exists():
             shutil.rmtree(out)
         out.parent.mkdir(parents=True, exist_ok=True)
@@ -126,7 +152,7 @@ def stage(source: Path) -> None:
         (source / name).write_text(text, "utf-8")
 
 
-def run_sphinx(source: Path, made: Path, notebooks: str) -> int:
+def run_sphinx(source: Path, made: Path, notebooks: str, tell: Callable[..., None] = silent) -> int:
     """Build the pages in a process that imports this checkout, and return their number.
 
     Parameters
@@ -137,6 +163,8 @@ def run_sphinx(source: Path, made: Path, notebooks: str) -> int:
         Folder for the site.
     notebooks : str
         ``nb_execution_mode`` of MyST-NB.
+    tell : callable
+        Called with what Sphinx is doing and ``step=False``.
 
     Raises
     ------
@@ -145,11 +173,18 @@ def run_sphinx(source: Path, made: Path, notebooks: str) -> int:
     """
     environment = os.environ | {"JUPYTER_PLATFORM_DIRS": "1"}
     environment["PYTHONPATH"] = os.pathsep.join(filter(None, [str(ROOT), os.environ.get("PYTHONPATH")]))
-    words = ["-b", "html", "-q", "-W", "--keep-going", "-c", HERE, "-D", f"nb_execution_mode={notebooks}"]
+    words = ["-b", "html", "-W", "--keep-going", "-c", HERE, "-D", f"nb_execution_mode={notebooks}"]
     command = [sys.executable, "-m", "sphinx", *words, "-d", source.with_name("state"), source, made]
-    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False, cwd=ROOT)
-    if done.returncode:
-        raise BuildError(done.stderr.replace(f"{source}/", "").strip() or "Sphinx failed")
+    with tempfile.TemporaryFile("w+") as errors:
+        with subprocess.Popen(
+            command, env=environment, stdout=subprocess.PIPE, stderr=errors, text=True, cwd=ROOT
+        ) as sphinx:
+            assert sphinx.stdout is not None
+            for line in filter(None, map(str.strip, sphinx.stdout)):
+                tell(line, step=False)
+        if sphinx.returncode:
+            errors.seek(0)
+            raise BuildError(errors.read().replace(f"{source}/", "").strip() or "Sphinx failed")
     pages = sorted(made.rglob("*.html"))
     for page in pages:
         try:

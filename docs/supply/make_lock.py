@@ -20,7 +20,7 @@ PLATFORM = "x86_64-manylinux_2_28"
 HEADS = {
     "install": "What everything else is installed with.",
     "runtime": "What the twin needs.",
-    "live": "What `setup.sh --live` installs beside runtime.txt.",
+    "live": "What serves the live twin, beside runtime.txt.",
     "test": "What `setup.sh --test` installs beside runtime.txt and live.txt.",
     "peers": "What `setup.sh --test` installs into .venv/peers.",
 }

@@ -491,7 +491,8 @@ class CameraSpec(TitledSpec):
         Diameter of the entrance pupil, in metres: of the axial beam before the first surface. Its rays define the size
         of the stop, unless ``stop_diameter`` states it.
     field_bias : float
-        Angle of the line CCD's centre from the parent axis, in the plane of symmetry, in radians.
+        Angle of the line CCD's centre from the parent axis, in the plane of symmetry, in radians; 0, the default, for a
+        telescope that is used on its axis.
     field : FieldSpec
         Half angles of the field of view about the field bias.
     wavelength : float
@@ -519,7 +520,7 @@ class CameraSpec(TitledSpec):
 
     focal_length: PositiveLength
     entrance_pupil: PositiveLength
-    field_bias: instruments.FieldPlace
+    field_bias: instruments.FieldPlace = 0.0
     field: FieldSpec
     wavelength: Wavelength
     stop: Name

@@ -29,7 +29,7 @@ from tests.twin.test_blurred_cameras import GF7, gf7_with
 from twin.camera.__main__ import app
 from twin.camera.camera_optics import CameraOptics
 from twin.camera.camera_plots import distortion_figure
-from twin.camera.camera_run import aberration_name, find_focus, run_camera
+from twin.camera.camera_run import aberration_name, find_focus, perturbed_text, refocus_text, run_camera, verdict
 from twin.camera.field_maps import distortion
 from twin.design.__main__ import app as design_app
 from twin.design.design_run import HELD_BY, _held_text, run_design
@@ -63,6 +63,19 @@ def test_distortion_is_that_of_the_papers_formula(gf7_alone) -> None:
     np.testing.assert_allclose(right.lines[0].get_xydata(), np.stack([1e3 * found.position, 1e6 * found.residual], -1))
 
 
+@pytest.mark.parametrize(
+    ("sharp", "words"),
+    [(0, "nowhere in"), (1, "in less than 1 % of"), (90, "in 40 % of"), (224, "in more than 99 % of")],
+)
+def test_a_small_share_of_the_field_is_not_none(gf7_alone, sharp: int, words: str) -> None:
+    """One field of 225 is not "0 %", and all but one are not "100 %"."""
+    errors = np.where(np.arange(225) < sharp, 0.05, 0.2).reshape(25, 9)
+    run = SimpleNamespace(
+        errors=errors, worst=(0.2, (1.0, 0.0)), camera=gf7_alone.model.spec, mtfs=(), limits=(("coma", 0.1),)
+    )
+    assert verdict(run)[0].startswith(f"Diffraction limited {words} the field: ")
+
+
 def test_kinds_of_aberration() -> None:
     kinds = {4: "defocus", 5: "astigmatism", 6: "astigmatism", 7: "coma", 9: "trefoil", 11: "spherical aberration"}
     kinds |= {13: "secondary astigmatism", 22: "secondary spherical aberration"}
@@ -73,23 +86,26 @@ def test_kinds_of_aberration() -> None:
 def test_refocusing_finds_a_focal_plane_that_was_moved(backend) -> None:
     """Of a sharp camera 1 mm out of focus, and 5 mrad out of level: back to where its own best focus is."""
     camera = load_camera("gf7")
-    own = find_focus(camera, backend, tilt=True)
+    own = find_focus(CameraOptics.alone(camera, backend), tilt=True)
     moved = camera.model_copy(
         update={"image": camera.image.model_copy(update={"z": camera.image.z + 1e-3, "tilt": 5e-3})}
     )
-    found = find_focus(moved, backend, tilt=True)
+    found = find_focus(CameraOptics.alone(moved, backend), tilt=True)
     assert found.after.z == pytest.approx(own.after.z, abs=1e-6)
     assert found.after.tilt == pytest.approx(own.after.tilt, abs=1e-6)
     assert found.errors_before.max() > 0.3 > found.errors_after.max()
     assert {(-x, y) for x, y in FIELDS} == set(FIELDS)  # both sides count alike
     assert len(set(FIELDS)) == len(found.errors_after)
-    assert abs(find_focus(camera, backend, tilt=False).after.z - camera.image.z) < 3e-6  # it was designed so
+    assert (
+        abs(find_focus(CameraOptics.alone(camera, backend), tilt=False).after.z - camera.image.z) < 3e-6
+    )  # it was designed so
 
 
 def test_the_refocused_file_keeps_all_else(backend, tmp_path) -> None:
     file, made = gf7_with(tmp_path, "-2.02 m"), tmp_path / "gf7_refocused.yaml"
     given = load_camera(file)
-    made.write_text(file_with_plane(given, find_focus(given, backend, tilt=False).after, "gf7_refocused"), "utf-8")
+    plane = find_focus(CameraOptics.alone(given, backend), tilt=False).after
+    made.write_text(file_with_plane(given, plane, "gf7_refocused"), "utf-8")
     before, after = file.read_text("utf-8"), made.read_text("utf-8")
     comments = [line for line in before.splitlines() if line.lstrip().startswith("#")]
     assert comments
@@ -138,6 +154,13 @@ def test_files_that_it_takes(tmp_path) -> None:
     assert isinstance(validate(CameraSpec, read_yaml(LIBRARY / "cameras" / "gf7.yaml")), CameraSpec)
 
 
+def test_a_telescope_on_its_axis_needs_no_field_bias(tmp_path) -> None:
+    text = (LIBRARY / "cameras" / "cassegrain.yaml").read_text("utf-8")
+    assert "\nfield_bias: 0 deg\n" in text
+    (tmp_path / "own.yaml").write_text(text.replace("\nfield_bias: 0 deg\n", "\n"), "utf-8")
+    assert load_camera(tmp_path / "own.yaml") == load_camera("cassegrain")
+
+
 def test_what_it_refuses(tmp_path) -> None:
     for words, message in REFUSED["cameras"]:
         result = invoke(app, *words, "--out", tmp_path / "out")
@@ -155,6 +178,52 @@ def test_a_camera_without_a_focus_cannot_be_refocused(tmp_path, backend) -> None
     assert not (tmp_path / "out").exists()
     with pytest.raises(InputError, match="no focus after M3"):
         run_camera(resolve_camera(Path(file)), backend, refocus=True)
+
+
+PERTURBED = ("M2 shift z 30 um", "M2 rotate x 3 arcsec")
+
+
+@pytest.mark.second
+@pytest.mark.parametrize(
+    ("camera", "words", "tilt"),
+    [
+        ("gf7", PERTURBED, False),
+        ("gf7", (*PERTURBED, "focal_plane rotate x 10 arcsec", "focal_plane shift z 5 um"), True),
+        ("gf7_pair", ("forward/M2 shift z 30 um", "base temperature 2 K"), False),
+        ("cassegrain", (), False),  # a camera as designed, too
+    ],
+)
+def test_the_printed_motion_refocuses(backend, monkeypatch, camera: str, words: tuple[str, ...], tilt: bool) -> None:
+    """Its text, given as a perturbation in place of the focal plane's own one, is the camera that was analysed.
+
+    The text has five digits of a shift of some 50 um, 0.5 nm: far below 1e-5 waves.
+    """
+    monkeypatch.setattr("twin.camera.camera_run.MAX_WAVES_FOR_MTF", 0.0)  # no MTF, which takes most of the time
+    setup = resolve_camera(camera, "forward" if camera == "gf7_pair" else None)
+    found = run_camera(setup.perturbed(words), backend, refocus=True, tilt=tilt)
+    moved = found.refocus.words
+    assert all("focal_plane" in text for text in moved)
+    assert found.refocus.moved == any("focal_plane" in text for text in words)
+    others = tuple(text for text in words if "focal_plane" not in text)
+    pasted = run_camera(setup.perturbed((*others, *moved)), backend)
+    assert pasted.errors == pytest.approx(found.errors, abs=1e-5)
+    if words:
+        assert found.refocus.errors_before.max() > 1.2 * found.refocus.errors_after.max()
+        text = perturbed_text(found)
+        assert text.startswith("Perturbed and refocused: ")
+        assert pasted.perturbed.change.vector == pytest.approx(found.perturbed.change.vector, abs=1e-8)
+
+
+@pytest.mark.second
+def test_the_sign_of_the_printed_motion(backend, monkeypatch) -> None:
+    """A focal plane 40 um too far toward the scene goes back, whether the light there comes from the scene or not."""
+    monkeypatch.setattr("twin.camera.camera_run.MAX_WAVES_FOR_MTF", 0.0)
+    for name, along in (("gf7", "along"), ("cassegrain", "against")):
+        found = run_camera(resolve_camera(name).perturbed(["focal_plane shift z 40 um"]), backend, refocus=True)
+        own = find_focus(CameraOptics.alone(load_camera(name), backend), tilt=False)
+        assert found.refocus.motion.shift[2] == pytest.approx(own.motion.shift[2] - 40e-6, abs=1e-8)
+        assert f"(+z points toward the scene, here {along} the light)" in refocus_text(found)
+        assert "in place of the focal plane's own perturbation" in refocus_text(found)
 
 
 def test_tilt_is_an_option(tmp_path, monkeypatch) -> None:

@@ -159,7 +159,7 @@ def test_a_server_that_cannot_be_is_told(monkeypatch):
     monkeypatch.setenv(command.TOKEN, "short")
     assert "TWIN_LIVE_TOKEN needs 22 or more" in told("gf7_pair")[1]
     monkeypatch.setitem(sys.modules, "twin.live.server", None)
-    assert "bash setup.sh --live" in told("gf7_pair")[1]
+    assert "bash setup.sh`" in told("gf7_pair")[1]
 
 
 def test_a_folder_does_not_hide_an_instrument_of_the_library(tmp_path, monkeypatch):

@@ -93,6 +93,10 @@ def filter_result(life: Path, tmp_path_factory: pytest.TempPathFactory) -> Filte
 @pytest.mark.second
 def test_without_a_plan_there_is_no_estimate(record: Path, life: Path) -> None:
     assert said("status", record)["estimate"] is None
+    (line,) = (line for line in " ".join(run("status", record).stdout.split()).split(". ") if "no estimate" in line)
+    assert (
+        "no estimate: the record has no plan of operation; name one, or store one: python -m twin.operate init" in line
+    )
     for words in (("forecast", record), ("ingest", record, life / "plan.yaml", "--report", life / "r.html")):
         done = run(*words)
         assert done.exit_code == 2

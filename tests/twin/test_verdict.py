@@ -226,7 +226,10 @@ def test_softer_images_are_told_where_it_matters(job) -> None:
         return SimpleNamespace(cameras={"forward": same, "backward": softer}, fields=(0.0, 0.9))
 
     told = judge(replace(run, quality=quality(0.1)))
-    softer = "The MTF at Nyquist of backward along the line, at 0.9 of half the line, falls from 0.200 to 0.100"
+    softer = (
+        "The MTF with the pixel at Nyquist of backward along the line, at 0.9 of half the line, falls from 0.200 to "
+        "0.100"
+    )
     assert softer in all_of(told)
     assert "MTF" not in all_of(judge(replace(run, quality=quality(0.198))))
 

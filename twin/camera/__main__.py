@@ -39,7 +39,9 @@ def main(
     refocus: Annotated[
         bool,
         typer.Option(
-            "--refocus", help="Find the best image plane first; also writes the camera's file with that plane."
+            "--refocus",
+            help="Find the best image plane first, of a perturbed camera in its state; of a camera as designed, also "
+            "write its file with that plane.",
         ),
     ] = False,
     perturb: Annotated[
@@ -71,14 +73,15 @@ def main(
 
         python -m twin.camera my_camera.yaml --refocus
 
-        python -m twin.camera my_camera.yaml --perturb "M2 shift z 20 um" --perturb "M2 rotate x 3 arcsec"
+        python -m twin.camera my_camera.yaml --perturb "M2 shift z 20 um" --perturb "M2 rotate x 3 arcsec" --refocus
 
     With --refocus the image plane is moved to the smallest mean square wavefront error over the field, and with
-    `--refocus --tilt` it is tilted about the line as well. The camera's file with that plane and all comments is in
-    artefacts/, ready for use.
+    `--refocus --tilt` it is tilted about the line as well. The motion is printed as --perturb takes it. The file of a
+    camera as designed with that plane and all comments is in artefacts/, ready for use.
 
     With --perturb, --temperature or a job the camera is analysed in that state, and the first paragraph describes the
-    effect. Bodies are named by their path or its last parts, as in a job's file.
+    effect. With --refocus, too, it is what is left after refocusing. Bodies are named by their path or its last parts,
+    as in a job's file.
 
     The run folder gets report.html, optics.json (numbers), optics.nc (maps, spots, curves), config.yaml, and figures
     and tables in artefacts/.

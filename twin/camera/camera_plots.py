@@ -312,7 +312,7 @@ def focus_figure(run: CameraRun) -> Figure:
     axes[0].set_ylim(0.0, None)
     axes[0].legend(fontsize=7.0, title="field", title_fontsize=7.5)
     for panel, name in zip(axes[1:], ("along the line", "along the track"), strict=False):
-        panel.set_title(f"MTF at Nyquist {name}")
+        panel.set_title(f"MTF of the optics at Nyquist {name}")
         panel.set_ylim(0.0, None)
     for panel in axes:
         panel.axvline(0.0, color=LIGHT, lw=0.8, zorder=0)

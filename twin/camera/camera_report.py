@@ -179,11 +179,15 @@ def _refocus(run: CameraRun) -> Section:
         + (", position and tilt" if refocused.tilt else "")
         + ". All other results refer to the refocused camera."
     )
-    name = _new_name(run)
-    file = file_with_plane(run.setup.camera, refocused.after, name)
+    file: tuple[Artefact, ...] = ()
+    if run.camera is not run.setup.camera:
+        name = _new_name(run)
+        new = file_with_plane(run.setup.camera, refocused.after, name)
+        about = "Its file, which differs in name and image plane only."
+        file = (CameraFile(name.lower(), "The refocused camera", about, new),)
     artefacts: tuple[Artefact, ...] = (
         _figure("refocus", "Before and after", "Waves rms, logarithmic scale.", plots.refocus_figure, run),
-        CameraFile(name.lower(), "The refocused camera", "Its file, which differs in name and image plane only.", file),
+        *file,
         Table("refocus-fields", "Wavefront error by field", "Waves rms.", ("field", "before", "after"), rows,
               (None, 4, 4)),
     )  # fmt: skip
@@ -292,7 +296,8 @@ def _mtf(run: CameraRun) -> Section:
         rows.append([plots.degrees_text(run, mtf.field), *map(float, values), *limits])
     heads = ("field", "along line", "along track", "limit along line", "limit along track")
     text = (
-        f"Optics alone, at {1e9 * run.camera.wavelength:.0f} nm, without the effects of pixels, charge and motion. "
+        f"Optics alone, at {1e9 * run.camera.wavelength:.0f} nm, without the effects of pixels, charge and motion; "
+        "with the pixel: `render: {quality: true}` in a job. "
         f"Nyquist is {1e-3 * run.optics.nyquist:.4g} cycles/mm."
     )
     change = max(mtf.accuracy for mtf in run.mtfs)
@@ -302,9 +307,11 @@ def _mtf(run: CameraRun) -> Section:
             f"{change:.1g}."
         )
     caption = "Along the line and along the track; dashed: diffraction limit."
-    figure = _figure("mtf", "MTF by field", caption, plots.mtf_figure, run)
+    figure = _figure("mtf", "MTF of the optics by field", caption, plots.mtf_figure, run)
     return Section(
-        "MTF", (text,), (figure, Table("mtf-nyquist", "MTF at Nyquist", "", heads, rows, (None, 3, 3, 3, 3)))
+        "MTF",
+        (text,),
+        (figure, Table("mtf-nyquist", "MTF of the optics at Nyquist", "", heads, rows, (None, 3, 3, 3, 3))),
     )
 
 
@@ -367,8 +374,10 @@ def _light(run: CameraRun, colours: Colours, ends: str) -> Section:
         "one point of the image, so that lateral and axial colour blur it."
     )
     caption = "MTF by field; below: point images (square root of irradiance) about the design wavelength's chief ray."
-    figure = _figure("light-mtf", "MTF and point images", caption, plots.light_mtf_figure, run)
-    table = Table("light-mtf-nyquist", "Polychromatic MTF at Nyquist", "", heads, rows, (None, 3, 3, 3, 3, 3))
+    figure = _figure("light-mtf", "MTF of the optics and point images", caption, plots.light_mtf_figure, run)
+    table = Table(
+        "light-mtf-nyquist", "Polychromatic MTF of the optics at Nyquist", "", heads, rows, (None, 3, 3, 3, 3, 3)
+    )
     return Section(title, (text,), (figure, table))
 
 

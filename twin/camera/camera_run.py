@@ -13,20 +13,21 @@ import xarray as xr
 from analysis.arrays import shows
 from analysis.monitor import parameters
 from optics.geometry import zernike
-from optics.geometry.tree import State
+from optics.geometry.pose import rotation_matrix, triple
+from optics.geometry.tree import Motion, State, compose
 from optics.numerics.array_math import UnphysicalError
 from optics.numerics.backend import Backend
 from optics.raytrace.first_order import LineChange
 from scenes.models.camera_design import with_plane
+from scenes.models.camera_model import focal_plane_body
 from scenes.models.camera_sharpness import BLURRED, FIELDS, FieldBeams, FocalPlane, field_text
 from scenes.models.instrument_builder import build_instrument
-from scenes.models.job_state import job_state
+from scenes.models.job_state import job_state, motions_of
 from scenes.models.thermal_model import ThermalModel
 from scenes.specs.camera import CameraSpec
 from scenes.specs.job import JobSpec, checked_nodes
 from scenes.specs.perturbation import perturbation_text
 from scenes.specs.resolved import CameraSetup
-from scenes.yaml.errors import InputError, Issue
 from twin.camera import field_maps
 from twin.camera.aberrations import (
     ENERGY,
@@ -81,11 +82,20 @@ class Refocus:
     Attributes
     ----------
     before, after : FocalPlane
-        Focal plane in the camera's file, and the best one.
+        Plane of the file and the best one. In a perturbed state both are seen from the moved focal plane, which is
+        drawn where it was designed to be.
     errors_before, errors_after : ndarray
         Rms wavefront error at the F fields over which the focus is optimised (``FIELDS``), (F,), waves.
     tilt : bool
         True if the plane was tilted as well.
+    motion : Motion
+        Motion of the focal plane that refocuses, in the axes of its body, which the state may have moved.
+    words : tuple of str
+        Perturbation of the focal plane that gives the refocused camera, such as ``focal_plane shift z +0.226 mm``.
+    moved : bool
+        True if ``words`` replace a perturbation that the focal plane has.
+    downstream : bool
+        True if the +Z of the focal plane, which points toward the scene, is along the light.
     """
 
     before: FocalPlane
@@ -93,6 +103,10 @@ class Refocus:
     errors_before: np.ndarray
     errors_after: np.ndarray
     tilt: bool
+    motion: Motion
+    words: tuple[str, ...]
+    moved: bool
+    downstream: bool
 
 
 @dataclass(frozen=True, eq=False)
@@ -249,7 +263,7 @@ def run_camera(
     advance : Advance
         Called with the progress.
     refocus : bool
-        Find the best focal plane first and analyse the camera with it.
+        Find the best focal plane of the camera in its state first and analyse the camera with it.
     tilt : bool
         Allow a tilt of that plane about the line as well.
 
@@ -261,14 +275,9 @@ def run_camera(
     advance("focus", 0, 1)
     camera, refocused = setup.camera, None
     built = setup.instrument is not None and bool(setup.instrument.as_built)
-    if refocus and (setup.perturb or built):
-        what = "perturbed" if setup.perturb else "as built"
-        text = f"refocusing applies to a nominal camera, and this one is {what}"
-        raise InputError(Issue(text, found="--refocus", allowed="either --refocus or that state"))
-    if refocus:
-        refocused = find_focus(camera, backend, tilt)
+    if refocus and not (setup.perturb or built):
+        refocused = find_focus(CameraOptics.alone(camera, backend), tilt, setup.mounted)
         camera = with_plane(camera, refocused.after)
-    advance("focus", 1, 1)
     optics = CameraOptics.alone(camera, backend)
     quality, perturbed = None, None
     state: State = {}
@@ -280,8 +289,14 @@ def run_camera(
         if setup.perturb:
             job = checked_nodes(setup.job, instrument.nodes)
             state = job_state(job, ThermalModel(instrument))
+        if refocus and refocused is None:
+            plane = focal_plane_body(optics.path.root)
+            own = motions_of(job).get(plane) if setup.perturb else None
+            refocused = find_focus(optics.in_state(state), tilt, setup.mounted, own)
+            state = compose(state, {plane: refocused.motion}, {plane: instrument.assembly.tree[plane]})
         if setup.instrument is not None:
             quality = image_quality(instrument, backend, [state], QUALITY_FIELDS).cameras[mounted]
+    advance("focus", 1, 1)
     field = field_maps.field_grid(ERROR_GRID)
     where = tuple(map(tuple, field.reshape(-1, 2)))
     errors = (
@@ -292,6 +307,7 @@ def run_camera(
         perturbed = Perturbed(
             job, change, errors, _nyquist(optics) if errors.max() < MAX_WAVES_FOR_MTF else np.empty((0, 2))
         )
+    if state:
         optics = optics.in_state(state)
         errors = optics.errors(where).reshape(field.shape[:2])
     sharp, without_mtf = (
@@ -343,20 +359,63 @@ def _nyquist(optics: CameraOptics) -> np.ndarray:
         return np.empty((0, 2))
 
 
-def find_focus(camera: CameraSpec, backend: Backend, tilt: bool) -> Refocus:
+def find_focus(optics: CameraOptics, tilt: bool, mounted: str | None = None, own: Motion | None = None) -> Refocus:
     """Find the focal plane with the smallest mean square wavefront error over ``FIELDS``.
+
+    Parameters
+    ----------
+    optics : CameraOptics
+        Camera in its state.
+    tilt : bool
+        Allow a tilt about the line as well.
+    mounted : str or None
+        Name of the camera in its instrument; None for a camera alone.
+    own : Motion or None
+        Motion that the state gives the focal plane itself; None for none.
 
     Raises
     ------
     InputError
         Light does not pass, or has no focus after the last mirror.
     """
-    beams = FieldBeams.trace(CameraOptics.alone(camera, backend).model, backend, FIELDS, 6)
+    camera, model = optics.model.spec, optics.model
+    beams = optics.beams(FIELDS, 6)
     best, nominal = beams.best_plane(tilt), FocalPlane.of(camera)
     if not beams.reaches(best):
         problem = f"refocusing is not possible: the light has no focus after {list(camera.mirrors)[-1]}"
         raise camera.error(problem, ("mirrors",), allowed="mirrors that make a real image")
-    return Refocus(nominal, best, beams.errors(nominal), beams.errors(best), tilt)
+    frame = model.focal_plane
+    turn = np.array([0.0, best.tilt - nominal.tilt, 0.0])  # Y of the focal plane is x of the prescription
+    normal = frame.rotation @ rotation_matrix(turn)[:, 2]
+    distance = (np.array([0.0, 0.0, best.z]) - frame.translation) @ normal / (frame.rotation[:, 2] @ normal)
+    motion = Motion(triple(turn), (0.0, 0.0, float(distance)))
+    body, total = focal_plane_body(optics.path.root), motion
+    if own is not None:
+        total = compose({body: own}, {body: motion}, {body: optics.assembly.tree[body]})[body]
+    return Refocus(
+        nominal,
+        best,
+        beams.errors(nominal),
+        beams.errors(best),
+        tilt,
+        motion,
+        _motion_words(focal_plane_body(mounted or "").lstrip("/"), total),
+        own is not None,
+        bool(model.image_direction @ frame.rotation[:, 2] > 0.0),
+    )
+
+
+def _motion_words(node: str, motion: Motion) -> tuple[str, ...]:
+    """Return the motion of a body as texts that ``--perturb`` takes, without rotations below 0.01 arcsec and 10 nm."""
+    out = []
+    for axis, angle in zip("xyz", np.degrees(motion.rotate) * 3600.0, strict=True):
+        if abs(angle) >= 0.01:
+            out.append(f"{node} rotate {axis} {angle:+.4g} arcsec")
+    for axis, length in zip("xyz", motion.shift, strict=True):
+        size, unit = (1e3, "mm") if abs(length) >= 1e-5 else (1e6, "um")
+        if abs(length) >= 1e-8 or axis == "z":
+            out.append(f"{node} shift {axis} {size * round(length, 12):+.5g} {unit}")
+    return tuple(out)
 
 
 def verdict(run: CameraRun) -> tuple[str, ...]:
@@ -370,7 +429,10 @@ def verdict(run: CameraRun) -> tuple[str, ...]:
         text += f" (Mar\N{LATIN SMALL LETTER E WITH ACUTE}chal's limit is {SHARP:.3f})."
     elif worst <= BLURRED:
         share = float(np.mean(run.errors <= SHARP))
-        part = f"in {100.0 * share:.0f} % of" if share else "nowhere in"
+        part = "nowhere in"
+        if share:
+            percent = "less than 1" if share < 0.01 else "more than 99" if share > 0.99 else f"{100.0 * share:.0f}"
+            part = f"in {percent} % of"
         text = f"Diffraction limited {part} the field: the worst wavefront error is "
         text += f"{lead} (Mar\N{LATIN SMALL LETTER E WITH ACUTE}chal's limit is {SHARP:.3f})."
     else:
@@ -380,7 +442,11 @@ def verdict(run: CameraRun) -> tuple[str, ...]:
     if run.mtfs:
         low = min(float(np.min(mtf.at(run.optics.nyquist))) for mtf in run.mtfs)
         limit = max(float(np.interp(mtf.nyquist, mtf.frequency, row)) for mtf in run.mtfs for row in mtf.limit)
-        return text, f"The lowest MTF of the optics at Nyquist is {low:.2g}; the diffraction limit is {limit:.2f}."
+        text_mtf = (
+            f"The lowest MTF of the optics, without the pixel, at Nyquist is {low:.2g} over the field; the diffraction "
+            f"limit is {limit:.2f}."
+        )
+        return text, text_mtf
     return (text,)
 
 
@@ -394,13 +460,14 @@ def perturbed_text(run: CameraRun) -> str:
         f"{parameter.symbol} {parameter.per_si * value + 0.0:+.{parameter.decimals}f} {parameter.unit}"
         for parameter, value in changes
     )
+    state = "Perturbed and refocused" if run.refocus else "Perturbed"
     text = (
-        f"Perturbed: {perturbed.words}. The geometry changes by {change_text}; the worst wavefront error changes from "
+        f"{state}: {perturbed.words}. The geometry changes by {change_text}; the worst wavefront error changes from "
         f"{perturbed.errors.max():.3g} to {run.worst[0]:.3g} waves rms"
     )
     if len(perturbed.mtf) and run.mtfs:
         after = min(float(np.min(mtf.at(run.optics.nyquist))) for mtf in run.mtfs)
-        text += f", the lowest MTF at Nyquist from {float(np.min(perturbed.mtf)):.3f} to {after:.3f}"
+        text += f", the lowest MTF of the optics at Nyquist from {float(np.min(perturbed.mtf)):.3f} to {after:.3f}"
     return f"{text}. {_OF_THE_DRAWING}"
 
 
@@ -424,17 +491,13 @@ def refocus_text(run: CameraRun) -> str:
     refocused = run.refocus
     if refocused is None:
         return ""
-    shift = 1e3 * (refocused.after.z - refocused.before.z)
-    tilt_text = (
-        f" and tilts the plane by {np.degrees(refocused.after.tilt - refocused.before.tilt) * 60:+.3g} arcmin"
-        if refocused.tilt
-        else ""
-    )
+    along = "along" if refocused.downstream else "against"
+    instead = " in place of the focal plane's own perturbation" if refocused.moved else ""
     return (
-        f"Refocusing moves image.z by {shift:+.4g} mm{tilt_text}: the worst wavefront error changes from "
-        f"{refocused.errors_before.max():.3g} to {refocused.errors_after.max():.3g} waves rms, its rms over the field "
-        "from "
-        f"{np.sqrt(np.mean(refocused.errors_before**2)):.3g} to {np.sqrt(np.mean(refocused.errors_after**2)):.3g}."
+        f"Refocusing: {', '.join(refocused.words)}{instead} (+z points toward the scene, here {along} the light). The "
+        f"worst wavefront error changes from {refocused.errors_before.max():.3g} to {refocused.errors_after.max():.3g} "
+        f"waves rms, its rms over the field from {np.sqrt(np.mean(refocused.errors_before**2)):.3g} to "
+        f"{np.sqrt(np.mean(refocused.errors_after**2)):.3g}."
     )
 
 
@@ -455,7 +518,7 @@ _SPOT: Record[Spot] = Record(
     Quantity("spot_largest_um", lambda s: s.farthest, "largest distance of a ray from the centroid"),
 )
 _MTF: Record[Mtf] = Record(
-    "MTF of the optics alone at the pixels' Nyquist frequency.",
+    "MTF of the optics, without the pixel, at the Nyquist frequency.",
     Quantity("field", lambda m: m.field, "shares of the half field, along the line and along the track"),
     Quantity("along_line", lambda m: m.at(m.nyquist)[0]),
     Quantity("along_track", lambda m: m.at(m.nyquist)[1]),
@@ -483,6 +546,7 @@ _DISTORTION: Record[field_maps.Distortion] = Record(
 )
 _REFOCUS: Record[Refocus] = Record(
     "Focal plane before and after refocusing, with rms wavefront errors.",
+    Quantity("perturb", lambda r: list(r.words), "motion of the focal plane, as --perturb and a job's file take it"),
     Quantity("z_before_m", lambda r: r.before.z),
     Quantity("z_after_m", lambda r: r.after.z),
     Quantity("tilt_before_deg", lambda r: r.before.tilt),
@@ -506,7 +570,11 @@ _PERTURBED: Record[Perturbed] = Record(
         for k, parameter in enumerate(parameters.ESTIMATED)
     ),
     Quantity("worst_as_designed_waves", lambda p: p.errors.max(), "wavefront error of the worst field"),
-    Quantity("mtf_as_designed", lambda p: p.mtf, "MTF at Nyquist, along the line and along the track, field by field"),
+    Quantity(
+        "mtf_as_designed",
+        lambda p: p.mtf,
+        "MTF of the optics at Nyquist, along the line and along the track, field by field",
+    ),
 )
 
 
@@ -549,7 +617,7 @@ CAMERA: Record[CameraRun] = Record(
     ),
     Quantity("first_order", lambda run: run.first_order, record=FIRST_ORDER),
     Quantity("fields", _field_numbers, "wavefront and spot, field by field"),
-    Quantity("mtf_at_nyquist", lambda run: run.mtfs, record=_MTF),
+    Quantity("mtf_at_nyquist", lambda run: run.mtfs, "MTF of the optics, field by field", record=_MTF),
     Quantity("energy", lambda run: run.images, "energy of point images", record=ENERGY, where_known=True),
     Quantity(
         "third_order",
@@ -598,7 +666,7 @@ def camera_data(run: CameraRun) -> xr.Dataset:
         "through_focus_mtf": (
             ("mtf_field", "direction", "defocus"),
             run.focus.mtf,
-            named("modulation at the Nyquist frequency through focus"),
+            named("MTF of the optics at the Nyquist frequency through focus"),
         ),
         "distortion_line": (
             ("line",),
@@ -619,11 +687,11 @@ def camera_data(run: CameraRun) -> xr.Dataset:
         "mtf_field_share": (("mtf_field", "direction"), np.array(MTF_FIELDS), named(share)),
     }
     if run.mtfs:
-        data["mtf"] = (mtf, np.stack([m.values for m in run.mtfs]), named("modulation of the optics"))
+        data["mtf"] = (mtf, np.stack([m.values for m in run.mtfs]), named("MTF of the optics"))
         data["mtf_limit"] = (
             mtf,
             np.stack([m.limit for m in run.mtfs]),
-            named("modulation without wavefront error, the diffraction limit"),
+            named("MTF of the optics without wavefront error, the diffraction limit"),
         )
         axis_attributes = named("spatial frequency in the image, cycles per length", {"units": "1/m"})
         coords["frequency"] = ("frequency", run.mtfs[0].frequency, axis_attributes)

@@ -150,7 +150,7 @@ class Differences:
 def differences(project: str, folder: Path = FOLDER) -> Differences:
     """Compare the installed packages with the lock files.
 
-    Packages that setup.sh installs only with its options --live and --test may be missing.
+    Packages of the live page, and those that setup.sh installs only with --test, may be missing.
 
     Parameters
     ----------

@@ -58,7 +58,7 @@ def through_focus_svg(run: FocusRun) -> str:
                 axes.set_title(", ".join(part for part in (band, when) if part) or "all sites")
             for axes in panels.ravel()[len(bands) :]:
                 axes.set_visible(False)
-            panels[0, 0].set_ylabel("MTF (○ filled: along the line,\nopen: along the track)")
+            panels[0, 0].set_ylabel("MTF with the pixel (○ filled: along the line,\nopen: along the track)")
         for axes in grid[-1]:
             axes.set_xlabel("shift of the image [µm]")
         return svg.to_svg(figure)
@@ -166,7 +166,7 @@ def mtf_svg(run: SimulatedFocus) -> str:
             axes.axvline(PER_MM * ccd.band.nyquist, color=svg.GREY, lw=0.8, ls=":")
             axes.set(title=band, xlabel="cycles/mm", xlim=(0.0, PER_MM / ccd.band.pitch), ylim=(0.0, 1.02))
             svg.plain_axes(axes)
-        panels[0].set_ylabel("MTF")
+        panels[0].set_ylabel("MTF with the pixel")
         handles, labels = panels[0].get_legend_handles_labels()
         figure.legend(handles, labels, loc="outside upper center", ncols=3)
         return svg.to_svg(figure)
@@ -507,7 +507,7 @@ def _mtf_section(run: SimulatedFocus, data: Mapping[str, Any]) -> Section:
         for line in data["mtf_budget"]
     ]
     return Section(
-        "MTF at the Nyquist frequency",
+        "MTF with the pixel at the Nyquist frequency",
         (),
         (
             Table(

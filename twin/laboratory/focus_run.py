@@ -640,9 +640,15 @@ STATE: Record[SimulatedState] = Record(
 ROUND: Record[SimulatedState] = Record(
     "Measured state of the assembly on new shims, and the shims.",
     *STATE,
-    Quantity("mtf_nyquist", lambda s: _mtf(s, TRACK, 0), "band -> MTF along the track, mean of the fields"),
+    Quantity(
+        "mtf_nyquist", lambda s: _mtf(s, TRACK, 0), "band -> MTF with the pixel along the track, mean of the fields"
+    ),
     Quantity("mtf_nyquist_sigma", lambda s: _mtf(s, TRACK, 1), "band -> its standard deviation by noise"),
-    Quantity("mtf_nyquist_along_line", lambda s: _mtf(s, ALONG, 0), "band -> MTF along the line, mean of the fields"),
+    Quantity(
+        "mtf_nyquist_along_line",
+        lambda s: _mtf(s, ALONG, 0),
+        "band -> MTF with the pixel along the line, mean of the fields",
+    ),
     Quantity("mtf_nyquist_along_line_sigma", lambda s: _mtf(s, ALONG, 1), "band -> its standard deviation by noise"),
     Quantity("shims_um", lambda s: _holes(_ground(_shims(s).plan.thickness)), "thickness by hole", converted=False),
     Quantity(
@@ -674,7 +680,7 @@ TRUE_STATE: Record[SimulatedState] = Record(
     "True state of the assembly, by the exact trace.",
     Quantity("confocal_um_max", lambda s: np.max(np.abs(s.true_defocus)), "largest distance from best focus"),
     Quantity("line_level_arcmin", lambda s: s.true_level, "rotation of the line about Z'"),
-    Quantity("mtf_nyquist", lambda s: s.true_mtf, "band -> MTF along the track, mean of the fields"),
+    Quantity("mtf_nyquist", lambda s: s.true_mtf, "band -> MTF with the pixel along the track, mean of the fields"),
     Quantity(
         "rotation_arcmin", lambda s: rotation_vector(s.placement.pose.rotation), "rotation vector of the assembly"
     ),

@@ -19,8 +19,7 @@ PORT = 8790
 TOKEN = "TWIN_LIVE_TOKEN"
 """Environment variable with a token that stays valid when the server is restarted."""
 EXTRA = (
-    "the live twin needs starlette, uvicorn and websockets, which are not installed; install them with "
-    "`bash setup.sh --live`"
+    "the live twin needs starlette, uvicorn and websockets, which are not installed; install them with `bash setup.sh`"
 )
 """Error message if the optional packages of the live twin are not installed."""
 
@@ -72,7 +71,7 @@ def main(
     has it can adjust the knobs. The environment variable TWIN_LIVE_TOKEN sets a token that stays valid after a restart.
     The command ends ten seconds after the last page is closed, or with Ctrl-C.
 
-    It needs what the extra `live` installs: bash setup.sh --live
+    It needs what bash setup.sh installs; with pip it is the extra `live`.
 
     Exit codes: 0 ended, 2 bad input, 1 anything else.
     """

@@ -118,7 +118,7 @@ class CameraPictures:
         curve.axvline(0.5e-3 / bench.ccd.band.pitch, color=GREY, lw=0.8, ls=":")
         curve.set_xlabel("cycles/mm")
         curve.set_ylim(0.0, 1.05)
-        curve.set_title("MTF along the line")
+        curve.set_title("MTF with the pixel, along the line")
         curve.legend(fontsize=7)
 
     def _bench(self, camera: str) -> tuple[TargetCamera, TargetsSpec]:
@@ -177,7 +177,7 @@ def _mtf(figure: Figure, views: list[CameraView], field: float) -> None:
         mtf = one.mtf((field, 0.0))
         draw_mtf(axes, mtf)
         along, across = mtf.at(mtf.nyquist)
-        axes.set_title(f"{name}: {along:.3f} along, {across:.3f} across at Nyquist")
+        axes.set_title(f"optics {name}: {along:.3f} along, {across:.3f} across at Nyquist")
     figure.axes[0].legend(fontsize=7)
 
 
@@ -194,7 +194,7 @@ def _focus(figure: Figure, views: list[CameraView], field: float) -> None:
             axes.plot(1e6 * shift, values[:, column], color=ink, ls=style, label=f"{name}, {way}")
     axes.axvline(0.0, color=INK, lw=0.6)
     axes.set_xlabel(f"the line CCD moved downstream by [{UM}]")
-    axes.set_ylabel("MTF at Nyquist")
+    axes.set_ylabel("MTF of the optics at Nyquist")
     axes.set_title(f"through focus, field {field_text(views[0].model.spec, (field, 0.0))}")
     axes.set_ylim(bottom=0.0)
     axes.legend(fontsize=7)

@@ -52,8 +52,8 @@ IMAGES: Mapping[str, tuple[list[str], str]] = {
     "wavefront error": (["wfe_rms_waves"], "waves"),
     "worst wavefront error": (["wfe_worst_waves"], "waves"),
     "best focus − line CCD": (["defocus_um", "centre"], "µm"),
-    "MTF at Nyquist along the line": (["mtf_along_line", "centre"], ""),
-    "MTF at Nyquist along the track": (["mtf_along_track", "centre"], ""),
+    "MTF with the pixel at Nyquist along the line": (["mtf_along_line", "centre"], ""),
+    "MTF with the pixel at Nyquist along the track": (["mtf_along_track", "centre"], ""),
 }
 """Image quality quantities on the page of a camera without a monitor.
 

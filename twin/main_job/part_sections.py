@@ -46,7 +46,7 @@ def quality_section(run: JobRun, drawn: Mapping[str, str]) -> Section | None:
         first, last = (plain(1e9 * wavelength) for wavelength in camera.wavelengths)
         light = f"{first} nm" if first == last else f"{first} to {last} nm"
         nyquist = plain(1e-3 * camera.nyquist, 4)
-        bands[len(rows)] = f"Camera {name}, MTF with light of {light}, Nyquist {nyquist} cycles/mm"
+        bands[len(rows)] = f"Camera {name}, MTF with the pixel in light of {light}, Nyquist {nyquist} cycles/mm"
         rows += _quality_rows(name, camera, quality)
     bodies = "; ".join(f"in {name} {', '.join(camera.bodies) or 'nothing'}" for name, camera in quality.cameras.items())
     obstruction_text = (
@@ -55,8 +55,9 @@ def quality_section(run: JobRun, drawn: Mapping[str, str]) -> Section | None:
     caption = (
         "At fixed pixels of each line CCD, at its middle and at its left (+Y′) and right end. "
         f"Wavefront errors are rms over the pupil at {plain(1e9 * quality.wavelength)} nm, without piston and tilt. "
-        "Best focus is counted along the light: + is behind the CCD. The MTF is that of the traced pupil over the "
-        "named light, with the pixel and, where the camera describes them, charge diffusion and TDI. "
+        "Best focus is counted along the light: + is behind the CCD. The MTF with the pixel is that of the traced "
+        "pupil over the named light, times the pixel's and, where the camera describes them, those of charge "
+        "diffusion and TDI; `python -m twin.camera` has that of the optics alone. "
         f"{obstruction_text or f'{FREE[0].upper()}{FREE[1:]}.'} Means and worst values: "
         f"`quality.json`. The CSV has all {len(quality.fields)} fields."
     )
@@ -80,8 +81,9 @@ def quality_section(run: JobRun, drawn: Mapping[str, str]) -> Section | None:
         )
         parts.append(figure(drawn, "pupils", caption))
     share, where, change = sharpness_lost(quality)
-    loss_text = f"The MTF at Nyquist falls by at most {significant(100.0 * share, 2, floor=0.0)} %, {where}: {change}."
-    loss_text = loss_text if share > 0.0 else "The perturbation does not lower the MTF at Nyquist."
+    loss = significant(100.0 * share, 2, floor=0.0)
+    loss_text = f"The largest loss of MTF with the pixel at Nyquist is {loss} %, {where}: {change}."
+    loss_text = loss_text if share > 0.0 else "The perturbation does not lower the MTF with the pixel at Nyquist."
     return Section("Image quality", (loss_text,), tuple(parts), name="quality")
 
 
@@ -142,13 +144,13 @@ def target_section(run: JobRun, drawn: Mapping[str, str]) -> Section | None:
     if kinds:
         methods = ", ".join(METHODS[kind] for kind in kinds)
         about += (
-            f" The MTF is measured in these frames alone ({methods}) and compared with that of the traced pupil and "
-            "the detector."
+            f" The MTF with the pixel is measured in these frames alone ({methods}) and compared with that of the "
+            "traced pupil and the detector."
         )
     parts: list[Artefact] = [_mtf_table(targets, kinds)] if kinds else []
     curves = [name for name in targets.cameras if f"mtf {name}" in drawn]
     for k, name in enumerate(curves):
-        caption = f"Camera {name}: MTF along the edge's normal."
+        caption = f"Camera {name}: MTF with the pixel along the edge's normal."
         if k == 0:
             squares = ", squares: of the bars" if "bars" in kinds else ""
             caption += (
@@ -198,11 +200,21 @@ def _mtf_table(targets: TargetRun, kinds: list[str]) -> Table:
             " Bars are tilted at the Nyquist frequency; their fundamental is normalised by frames with the shutter "
             "closed and of uniform light, since in an area beside the bars diffraction tails lower the contrast by 1 %."
         )
-    heads = ["camera", "band", "place", "direction", "state", "target", "MTF at Nyquist", "sigma", "true"]
+    heads = [
+        "camera",
+        "band",
+        "place",
+        "direction",
+        "state",
+        "target",
+        "MTF with the pixel at Nyquist",
+        "sigma",
+        "true",
+    ]
     heads += ["along the line [cycles/px]", "along the track [cycles/px]", "true on the axis"]
     return Table(
         "mtf",
-        "MTF at the Nyquist frequency, measured (±1 σ from noise) and true; move of the image on the line CCD, traced",
+        "MTF with the pixel at Nyquist, measured (±1 σ from noise) and true; move of the image on the line CCD, traced",
         f"{caption} More: `mtf.json`.",
         ("Place, direction of the MTF", *("before", "true", "after", "true") * len(kinds), "image moves [µm]"),
         rows,

@@ -110,7 +110,7 @@ def _print_result(run: JobRun, console: Console) -> None:
 
 def _mtf_table(targets: TargetRun) -> Table | None:
     """Return the table of MTF at Nyquist from the knife edges, before -> after (true); None if there are none."""
-    title = f"MTF at the Nyquist frequency from the knife edge ({targets.frames} frames)"
+    title = f"MTF with the pixel at Nyquist from the knife edge ({targets.frames} frames)"
     title += "\nbefore -> after, true values below"
     table = result_table(title)
     for head in ("", *TARGET_PLACES):

@@ -84,7 +84,7 @@ def curves_svg(name: str, camera: CameraTargets) -> str:
                 axes.set(xlim=(0.0, 2.0 * nyquist), ylim=(0.0, 1.03))
                 axes.set_title(f"{place}, {DIRECTION_NAMES[direction]}", loc="left")
                 if column == 0:
-                    axes.set_ylabel("MTF")
+                    axes.set_ylabel("MTF with the pixel")
                     below.set_ylabel("error [10$^{-3}$]")
                 if row == len(DIRECTIONS) - 1:
                     below.set_xlabel("frequency [cycles/mm]")

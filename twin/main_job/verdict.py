@@ -125,7 +125,7 @@ def _changed(run: JobRun) -> tuple[str, str]:
         else:
             worst.append(f"the worst wavefront error{camera_text} is {significant(before, 3)} waves rms")
     share, _, change = sharpness_lost(run.quality)
-    mtf_text = f", the MTF at Nyquist at worst {change}" if moved and share > 0.0 else ""
+    mtf_text = f", the largest loss of MTF with the pixel at Nyquist is {change}" if moved and share > 0.0 else ""
     return text, f"{', '.join(worst)}{mtf_text}"
 
 
@@ -384,7 +384,7 @@ def _lost_light(run: RenderRun) -> str:
 
 
 def sharpness_lost(quality: ImageQuality) -> tuple[float, str, str]:
-    """Return the largest relative loss of MTF at Nyquist on the line CCDs.
+    """Return the largest relative loss of MTF with the pixel at Nyquist on the line CCDs.
 
     Its position and the values before and after are returned as two texts.
     """
@@ -407,7 +407,7 @@ def _blurred(run: RenderRun) -> str:
     if run.quality is None:
         return ""
     share, where, change = sharpness_lost(run.quality)
-    return f"the MTF at Nyquist {where}, falls {change}: see Image quality" if share > _SOFTER else ""
+    return f"the MTF with the pixel at Nyquist {where}, falls {change}: see Image quality" if share > _SOFTER else ""
 
 
 def alarm_limit(count: int) -> float:

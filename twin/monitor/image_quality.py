@@ -283,6 +283,7 @@ def _known(value: float | np.floating[Any]) -> float | None:
     return float(value) if np.isfinite(value) else None
 
 
+_WITH_PIXEL = "MTF of optics and line CCD, with its pixel, at Nyquist"
 _REFOCUSED, _TAKEN = (
     "wavefront error at each field's own best focus",
     "fraction of the light that bodies in the beam block",
@@ -294,8 +295,12 @@ AT_FIELDS: Record[CameraQuality] = Record(
         "wfe_rms_waves_focus_removed", lambda c: c.wfe_refocused, _REFOCUSED, "wavefront error at best focus [waves]", 4
     ),
     Quantity("defocus_um", lambda c: c.defocus, "best focus less line CCD, + downstream", "best focus − line CCD", 1),
-    Quantity("mtf_along_line", lambda c: c.mtf_along_line, "at Nyquist", "MTF at Nyquist along the line", 4),
-    Quantity("mtf_along_track", lambda c: c.mtf_along_track, "at Nyquist", "MTF at Nyquist along the track", 4),
+    Quantity(
+        "mtf_along_line", lambda c: c.mtf_along_line, _WITH_PIXEL, "MTF with the pixel at Nyquist along the line", 4
+    ),
+    Quantity(
+        "mtf_along_track", lambda c: c.mtf_along_track, _WITH_PIXEL, "MTF with the pixel at Nyquist along the track", 4
+    ),
     Quantity("light_lost", lambda c: c.light_lost, _TAKEN, "light blocked by bodies in the beam", 2, shown="percent"),
 )
 """Image quality quantities that are computed at every field point, with their keys, labels and units.
@@ -329,7 +334,7 @@ _CAMERA: Record[CameraState] = Record(
     Quantity("reason", lambda of: of.camera.reasons[of.number] or None, "why numbers are missing", where_known=True),
 )
 _LIGHT: Record[CameraQuality] = Record(
-    "Light and limit of the MTF.",
+    "Light and limit of the MTF with the pixel.",
     Quantity("nyquist_per_mm", lambda camera: camera.nyquist, "Nyquist frequency of the line CCD"),
     Quantity("spectrum_nm", lambda camera: camera.wavelengths, "first and last wavelength of the light"),
 )
@@ -344,7 +349,9 @@ QUALITY: Record[ImageQuality] = Record(
     Quantity(
         "fields", lambda quality: quality.fields, "field points as fractions of half the line, +1 at its left end"
     ),
-    Quantity("mtf", lambda quality: quality.cameras, "light and limit of the MTF by camera", record=_LIGHT),
+    Quantity(
+        "mtf", lambda quality: quality.cameras, "light and limit of the MTF with the pixel by camera", record=_LIGHT
+    ),
 )
 
 

@@ -305,6 +305,13 @@ def status(
         _show(data, console)
         if estimate_of_record is not None:
             show_estimate(estimate_of_record[1], rows, console)
+        elif call.history.plan() is None:
+            print_line(console, f"no estimate: {call.without_plan}")
+        else:
+            print_line(
+                console,
+                "no estimate: the record has no reading of the monitor; python -m twin.operate ingest adds readings",
+            )
         if power:
             show_power(power, console)
 

@@ -161,11 +161,16 @@ class Call:
 
         setup = stored_plan(self.history) if plan is None else read_plan(plan, self.history)
         if setup is None:
-            raise InputErrorText(
-                f"the record has no plan of operation; name one, or store one: python -m twin.operate init RECORD "
-                f"{self.history.name} --plan FILE"
-            )
+            raise InputErrorText(self.without_plan)
         return setup
+
+    @property
+    def without_plan(self) -> str:
+        """What to do where a command needs a plan of operation and the record has none."""
+        return (
+            f"the record has no plan of operation; name one, or store one: python -m twin.operate init RECORD "
+            f"{self.history.name} --plan FILE"
+        )
 
     def filtered_operation(self, setup: OperationSetup, history: History | None = None) -> Operation:
         """Return the estimate of the record under a plan from all readings; progress is printed.

@@ -398,6 +398,8 @@ def shown_merit(value: float, merit: Merit) -> float | None:
 def merit_head(merit: Merit) -> str:
     """Return the name of a merit with its unit, for the head of a column."""
     unit = merit_unit(merit)[0]
+    if merit.spec.kind == "mtf":
+        return f"{merit.name}, of the optics"
     return f"{merit.name} [{unit_for_reports(unit)}]" if unit else merit.name
 
 

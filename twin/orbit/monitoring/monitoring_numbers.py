@@ -238,8 +238,12 @@ FOCUS: Record[tuple[LoopRun, LoopOutcome, str]] = Record(
     Quantity("estimated_um", lambda of: _posterior_defocus(of)[0], "posterior mean"),
     Quantity("estimated_um_sigma", lambda of: _posterior_defocus(of)[1], "posterior standard deviation"),
     Quantity("defocus_rms_um", lambda of: rms(_defocus(of)), "RMS over the moments"),
-    Quantity("mtf_along_line", lambda of: of[1].mtf[of[2]][:, 0], "MTF at Nyquist, mean over the fields"),
-    Quantity("mtf_along_track", lambda of: of[1].mtf[of[2]][:, 1], "MTF at Nyquist, mean over the fields"),
+    Quantity(
+        "mtf_along_line", lambda of: of[1].mtf[of[2]][:, 0], "MTF with the pixel at Nyquist, mean over the fields"
+    ),
+    Quantity(
+        "mtf_along_track", lambda of: of[1].mtf[of[2]][:, 1], "MTF with the pixel at Nyquist, mean over the fields"
+    ),
 )
 MOMENTS: Record[LoopOutcome] = Record(
     "Errors of each moment.",
@@ -292,7 +296,13 @@ PASS: Record[tuple[LoopRun, LoopOutcome]] = Record(
     Quantity("height_sigma_rms_m", lambda of: rms(of[1].posterior(of[1].slopes)[1]), "by the posterior", "σ", 3),
     Quantity("height_rms_m", lambda of: of[1].heights.height_rms, "RMS of all errors in height", "all errors", 3),
     Quantity("defocus_rms_um", _foci, "defocus of the pair's cameras together", "defocus", 2),
-    Quantity("mtf_least", lambda of: min(float(of[1].mtf[n].min()) for n in of[0].pair), "at Nyquist", "least MTF", 3),
+    Quantity(
+        "mtf_least",
+        lambda of: min(float(of[1].mtf[n].min()) for n in of[0].pair),
+        "with the pixel, at Nyquist",
+        "least MTF",
+        3,
+    ),
     Quantity("heights", lambda of: SUMMARY(of[1].heights), "errors at the check points", converted=False),
     Quantity("focus", lambda of: {name: (*of, name) for name in of[0].model.cameras}, "by camera", record=FOCUS),
     Quantity("series", lambda of: of[1], "over the moments", record=MOMENTS),

@@ -546,7 +546,8 @@ def _loop_summary(run: LoopRun) -> Table:
         "loop",
         "Errors with the loop open and closed",
         "RMS over the moments. Height: mean over the points, by the cameras alone; all errors: of each point, with "
-        "those of image points, orbit and attitude; σ: predicted by the posterior; MTF at Nyquist, smallest value.",
+        "those of image points, orbit and attitude; σ: predicted by the posterior; MTF with the pixel at Nyquist, "
+        "smallest value.",
         {"loop open": numbers.PASS((run, run.open)), "loop closed": numbers.PASS((run, run.closed))},
         numbers.PASS.headed,
         "course",
