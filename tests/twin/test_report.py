@@ -53,6 +53,14 @@ def page(run) -> str:
     return render_report(run, scene=scene_bytes(instrument, run.state, paths))
 
 
+def test_the_colour_of_a_verdict_follows_unmet_requirements_and_warnings() -> None:
+    report = Report("Title", "It is so.", (), (), Table("t", "", "", ("a",), [[1.0]]), ())
+    how = RunFacts("", "twin.lab", 0.0, 1.0, "cpu")
+    cases = ((report, "answer"), (replace(report, warnings=("w",)), "answer warned"))
+    for one, name in (*cases, (replace(report, warnings=("w",), unmet=True), "answer unmet")):
+        assert f'<p class="{name}">It is so.</p>' in whole_page("focus", one, how)
+
+
 @pytest.mark.second
 def test_a_page_needs_nothing_else_and_misses_nothing(page):
     """No script, link, font or picture from outside; tags are closed in order, and no number is missing."""

@@ -400,6 +400,19 @@ def print_paths(console: Console, target: Path) -> None:
     console.print(f"report:     {target / 'report.html'}", markup=False, highlight=False, soft_wrap=True)
 
 
-def print_verdict(console: Console, verdict: str) -> None:
-    """Print the verdict of a result."""
-    console.print(verdict, style="bold", markup=False, highlight=False, soft_wrap=True)
+def print_verdict(console: Console, verdict: str, unmet: bool = False, warned: bool = False) -> None:
+    """Print the verdict of a result: red if a requirement is not met, yellow if there are warnings.
+
+    Parameters
+    ----------
+    console : Console
+        Terminal.
+    verdict : str
+        Verdict, one or two sentences.
+    unmet : bool
+        True if a requirement is not met or an alarm is open.
+    warned : bool
+        True if the result has warnings.
+    """
+    style = "bold red" if unmet else "bold yellow" if warned else "bold"
+    console.print(verdict, style=style, markup=False, highlight=False, soft_wrap=True)

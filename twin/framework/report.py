@@ -101,6 +101,9 @@ class Report:
         Contents of files that no page shows, by path in the run folder.
     checks : tuple of SelfCheck
         Self-checks of the run; empty to take those in its numbers.
+    unmet : bool
+        True if a requirement of the run is not met or an alarm is open; the verdict is then red, with warnings only
+        yellow.
     """
 
     title: str
@@ -116,6 +119,7 @@ class Report:
     conclusions: tuple[str, ...] = ()
     files: Mapping[str, bytes] = field(default_factory=FrozenMap)
     checks: tuple[SelfCheck, ...] = ()
+    unmet: bool = False
 
     @property
     def artefacts(self) -> tuple[Artefact, ...]:

@@ -86,7 +86,7 @@ def _numbers(run: JobRun) -> dict[str, Any]:
 def _print_result(run: JobRun, console: Console) -> None:
     """Print the verdict, the result table, remarks and warnings."""
     judgement = judge(run)
-    print_verdict(console, judgement.verdict)
+    print_verdict(console, judgement.verdict, warned=bool(judgement.warnings))
     remarks = list(judgement.more)
     if isinstance(run, RenderRun):
         print_whole(console, _table(run, console.width >= _WIDE))

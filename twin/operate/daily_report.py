@@ -210,10 +210,11 @@ def daily_report(history: History, overview: Overview, end: int) -> Report:
     result = overview.filter_result
     begin = end - DAY
     last = min(end, overview.time)
+    first, *others = overview.headline()
     verdict, lead = answer(
-        overview.state_sentence(),
+        first,
         overview.change_sentence(begin, end, f"on {day_text(begin)}"),
-        *overview.break_sentences(),
+        *others,
         overview.score_sentence(),
         _explained_sentence(overview),
     )
@@ -242,6 +243,7 @@ def daily_report(history: History, overview: Overview, end: int) -> Report:
         state_table(overview),
         tuple(section for section in sections if section is not None),
         warnings=_warnings(overview, end),
+        unmet=overview.unmet,
     )
 
 

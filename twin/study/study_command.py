@@ -142,5 +142,5 @@ def _show(numbers: dict[str, Any], console: Console) -> None:
         table.add_column(head, justify="left" if head in ("response", "unit") else "right", no_wrap=True)
     for name, r in numbers["responses"].items():
         table.add_row(name, r["unit"], *(cell_text(r[key]) for key in ("mean", "std", "p95", "p997")))
-    cli.print_verdict(console, numbers["verdict"])
+    cli.print_verdict(console, numbers["verdict"], warned=bool(numbers["warnings"]))
     cli.print_whole(console, table)

@@ -148,6 +148,10 @@ its sigma from the observations alone.
 """
 
 
+_FAR_BELOW = 0.5
+"""Ratio of observed to predicted errors below which the report says why the observed ones are so small."""
+
+
 def block_report(run: BlockRun) -> Report:
     """Return the report of a block adjustment: accuracy on the ground, contribution of each sensor, and tests."""
     return Report(
@@ -166,13 +170,17 @@ def _verdict(run: BlockRun) -> tuple[str, tuple[str, ...]]:
             f"Errors grow most {plan} in plan ({losses[plan][0]:.2f}-fold) and {height} in height"
             f" ({losses[height][1]:.2f}-fold)"
         )
+    where = f"{predicted.count} {'tie' if observed is None else 'check'} points"
     checked = ""
     if observed is not None:
-        checked = f"; at {observed.count} check points, {observed.ce90:.2f} m and {observed.le90:.2f} m"
+        checked = f"; observed are {observed.ce90:.2f} m and {observed.le90:.2f} m"
+        largest = max(observed.ce90 / predicted.ce90, observed.le90 / predicted.le90)
+        if largest < _FAR_BELOW:
+            checked += f", at most {largest:.1g} of the prediction, which covers errors common to all points"
     control = "with" if "control" in run.used else "without"
     return answer(
-        f"Predicted 90% errors on the ground are {predicted.ce90:.2f} m in plan and {predicted.le90:.2f} m in height,"
-        f" {control} ground control{checked}",
+        f"{control} ground control, predicted 90% errors at {where} are {predicted.ce90:.2f} m in plan and"
+        f" {predicted.le90:.2f} m in height{checked}",
         contribution,
         f"chi-square of the residuals is {run.adjustment.chi_square:.0f} for {run.adjustment.degrees_of_freedom}"
         f" degrees of freedom (p = {run.adjustment.p_value:.2g})",
