@@ -15,6 +15,7 @@ from analysis.monitor.parameters import CAMERA_PARAMETERS as PARAMETERS
 from scenes.specs.resolved import resolve
 from tests.twin.policed_page import Policed, breaches
 from tests.twin.study_bench import REFUSED
+from twin.framework import svg
 from twin.framework.artefact import (
     FAR,
     Marked,
@@ -77,6 +78,27 @@ def test_a_page_needs_nothing_else_and_misses_nothing(page):
         ET.fromstring(drawing.replace("<svg ", '<svg xmlns="http://www.w3.org/2000/svg" ', 1))
     words = re.sub(r"<(style|script).*?</\1>|<[^>]+>", " ", page, flags=re.DOTALL)
     assert not re.search(r"(?<![A-Za-z])(nan|NaN|None|inf|np\.float64)(?![A-Za-z])", words)
+
+
+@pytest.mark.second
+def test_the_first_screen_shows_the_spots_beside_one_estimator(page, run):
+    """All spots before and after with their shifts, and one reading of each change; other estimators on a click."""
+    first = page[page.index('<section id="result"') : page.index('<details id="setup">')]
+    assert first.count("<image") == 2 * len(run.experiment.path.channels)
+    assert "Recovered by the posterior" in first
+    assert first.count("<tr>") - 1 == len(run.reading.table.of(run.judged))
+    assert "paper" not in re.sub(r"<a .*?>", "", first)
+    rest = page[page.index("<summary>All estimators</summary>") :]
+    assert "paper joint" in rest[: rest.index("</details>")]
+
+
+@pytest.mark.second
+def test_drawings_follow_the_dark(page) -> None:
+    """The style sheet of pages names the ink, the greys and the blue of drawings, which Matplotlib writes as styles."""
+    for colour in (svg.INK, svg.GREY, svg.LIGHT, svg.SHADE, svg.BLUE.lower()):
+        assert f'[style*="fill: {colour}"]' in page
+        assert colour == svg.SHADE or f'[style*="stroke: {colour}"]' in page
+    assert ".card { overflow-x: auto; border-radius: 3px; }" in page
 
 
 @pytest.mark.second

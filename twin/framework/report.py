@@ -101,6 +101,8 @@ class Report:
         Contents of files that no page shows, by path in the run folder.
     checks : tuple of SelfCheck
         Self-checks of the run; empty to take those in its numbers.
+    glance : Artefact | None
+        Figure shown beside the main table; None for none.
     unmet : bool
         True if a requirement of the run is not met or an alarm is open; the verdict is then red, with warnings only
         yellow.
@@ -119,12 +121,14 @@ class Report:
     conclusions: tuple[str, ...] = ()
     files: Mapping[str, bytes] = field(default_factory=FrozenMap)
     checks: tuple[SelfCheck, ...] = ()
+    glance: Artefact | None = None
     unmet: bool = False
 
     @property
     def artefacts(self) -> tuple[Artefact, ...]:
         """All artefacts, the main table first."""
-        return (self.summary, *(artefact for section in self.sections for artefact in section.artefacts))
+        first = (self.summary,) if self.glance is None else (self.summary, self.glance)
+        return (*first, *(artefact for section in self.sections for artefact in section.artefacts))
 
     def with_verdict(self, numbers: Mapping[str, Any]) -> dict[str, Any]:
         """Return the numbers of the run with the verdict and the warnings.
