@@ -52,6 +52,8 @@ def test_errors_of_check_points_are_those_predicted_and_every_sensor_helps(run):
     report, observed = block_report(run), run.contributions[ALL].observed
     assert report.warnings == ()
     assert f"; observed are {observed.ce90:.2f} m and {observed.le90:.2f} m" in report.verdict
+    (ground,) = (section for section in report.sections if section.name == "ground")
+    assert [artefact.file for artefact in ground.artefacts] == ["artefacts/ground.svg"]
     small = replace(observed, ce90=0.2 * full.ce90, le90=0.1 * full.le90)
     found = replace(run.contributions[ALL], observed=small)
     verdict = block_report(replace(run, contributions={**run.contributions, ALL: found})).verdict

@@ -27,6 +27,7 @@ from twin.framework.artefact import (
     plain,
     residual_text,
     significant,
+    typeset,
 )
 from twin.framework.page import FIGURES, RunFacts, checksum, inline, page_policy
 from twin.framework.page import render_report as whole_page
@@ -60,6 +61,34 @@ def test_the_colour_of_a_verdict_follows_unmet_requirements_and_warnings() -> No
     cases = ((report, "answer"), (replace(report, warnings=("w",)), "answer warned"))
     for one, name in (*cases, (replace(report, warnings=("w",), unmet=True), "answer unmet")):
         assert f'<p class="{name}">It is so.</p>' in whole_page("focus", one, how)
+
+
+def test_every_section_is_in_the_navigation_and_long_tables_are_folded() -> None:
+    short, long = (Table(f"t{n}", f"Of {n}", "", ("a",), [[1.0]] * n) for n in (20, 21))
+    sections = (Section("First", (), (short, long)), Section("Second", (), (), name="own"))
+    report = Report("Title", "It is so.", (), (), Table("t", "", "", ("a",), [[1.0]]), sections)
+    page = whole_page("focus", report, RunFacts("", "twin.lab", 0.0, 1.0, "cpu"))
+    for anchor, title in (("section-1", "First"), ("own", "Second")):
+        assert f'<a href="#{anchor}">{title}</a>' in page
+        assert f'<section id="{anchor}">' in page
+    assert "<summary>Of 21, 21 rows</summary>" in page
+    assert "<h3>Of 20</h3>" in page
+
+
+@pytest.mark.parametrize(
+    ("text", "shown"),
+    [
+        ("at (0.08, -0.01) deg", "at (0.08, −0.01) deg"),
+        ("-2.53e-05 mm", "−2.53e−5 mm"),
+        ("3e+08", "3e8"),
+        ("2028-03-05, runs/a-1, 3-4 and --seed -1", "2028-03-05, runs/a-1, 3-4 and --seed −1"),
+        ("`shift: -1` moves by -1", "`shift: -1` moves by −1"),
+    ],
+)
+def test_one_minus_sign(text: str, shown: str) -> None:
+    assert typeset(text) == shown
+    report = Report("Title", "It is so.", (text,), (), Table("t", "", "", ("a",), [[1.0]]), (), warnings=(text,))
+    assert (report.lead, report.warnings) == ((shown,), (shown,))
 
 
 @pytest.mark.second

@@ -11,7 +11,7 @@ import numpy as np
 
 from optics.numerics.extension_table import ExtensionTable
 from optics.numerics.number_tree import FrozenMap
-from twin.framework.artefact import Artefact, Table
+from twin.framework.artefact import Artefact, Table, typeset
 from twin.framework.data_files import FrameFacts
 from twin.framework.provenance import SelfCheck
 
@@ -49,11 +49,11 @@ MOST_SENTENCES = 2
 
 
 def sentence(statement: str) -> str:
-    """Return a statement as a sentence with a full stop and, where suitable, an initial capital.
+    """Return a statement as a sentence with a full stop, typographic minus signs and, where suitable, a capital.
 
     Only a first word of lower-case letters gets a capital; a path or a symbol stays as it is.
     """
-    text = statement.strip().rstrip(".")
+    text = typeset(statement.strip().rstrip("."))
     return f"{text[:1].upper() + text[1:] if re.match(r'[a-z]+[ ,:;]', text) else text}."
 
 
@@ -150,7 +150,10 @@ class Report:
         return {**numbers, **added}
 
     def __post_init__(self) -> None:
-        """Raise ValueError for a verdict of more than two sentences, or artefacts with equal names."""
+        """Typeset all sentences; raise ValueError for a verdict of over two sentences, or artefacts of equal names."""
+        for name in ("lead", "warnings", "conclusions"):
+            object.__setattr__(self, name, tuple(map(typeset, getattr(self, name))))
+        object.__setattr__(self, "verdict", typeset(self.verdict))
         if not self.verdict.endswith(".") or len(re.findall(r"[.!?]\s+[A-Z]", self.verdict)) >= MOST_SENTENCES:
             raise ValueError(f"a verdict must be one or two sentences: {self.verdict!r}")
         names = [artefact.name for artefact in self.artefacts if artefact.within is None]

@@ -312,7 +312,7 @@ def _changed_section(overview: Overview, begin: int, end: int) -> Section:
     """Return the section on the changes of the day."""
     occurrences = [occurrence for occurrence in overview.changed(begin, end) if not occurrence.again]
     lines = tuple(f"{minute_text(one.time)}: {one.text}" for one in occurrences)
-    what = f"Between {minute_text(begin)} and {minute_text(end)} UTC.{'' if lines else ' Nothing occurrences.'}"
+    what = f"Between {minute_text(begin)} and {minute_text(end)} UTC.{'' if lines else ' Nothing happened.'}"
     shown = (Text("changed", "", "", lines[-MOST_SHOWN:], within=""),) if lines else ()
     return Section("What changed", (what,), shown, name="changed")
 

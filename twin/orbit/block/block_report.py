@@ -6,20 +6,24 @@ the error laws that the file specifies.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from analysis.block.block_adjustment import LawTest
 from analysis.block.network import DatumTest, Network, OpenCombination
 from analysis.block.reweighting import GroupTest
-from analysis.orbit.forward_intersection import Accuracy
-from twin.framework.artefact import Table
+from analysis.orbit.forward_intersection import Accuracy, level_axes
+from twin.framework import svg
+from twin.framework.artefact import SvgFigure, Table
 from twin.framework.record import Quantity, Record
 from twin.framework.report import Report, Section, answer
 from twin.orbit.block.block_run import ALL, DATUM_ALARM, BlockRun, CameraChange, SensorContribution
 from twin.orbit.measured.pass_measurements import duplicates, listed
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 ACCURACY: Record[Accuracy] = Record(
     "90% errors on the ground.",
@@ -248,11 +252,64 @@ def _sections(run: BlockRun) -> tuple[Section, ...]:
         (None, 3, 3, 3, 3, 3, 3),
     )
     return (
+        *_ground_section(run),
         Section("Tests of the stated errors", (), (groups,)),
         Section("Cameras", (), (cameras,)),
         Section("Weakly observable combinations", (), (weak,)),
         Section("Check points", (), (points,), folded=1),
     )
+
+
+def _ground_section(run: BlockRun) -> tuple[Section, ...]:
+    """Return the section with the map of the errors at check points and the residuals at control points, if any."""
+    where, errors, _ = run.check
+    block = run.adjustment.assembly.block
+    control = np.flatnonzero((block.points.role == "control") & np.isfinite(run.adjustment.ground).all(axis=1))
+    residuals = np.einsum(
+        "nij,nj->ni",
+        level_axes(run.adjustment.ground[control]),
+        run.adjustment.ground[control] - block.points.start[control],
+    )
+    cases = (("check points, adjusted minus true", where, errors), ("control points, adjusted minus given", control,
+             residuals))  # fmt: skip
+    shown = [case for case in cases if len(case[1])]
+    if not shown:
+        return ()
+    caption = "Arrows: error in plan. Colours: error in height. Dots: all adjusted points."
+    drawing = svg.drawn("block-ground", _ground_figure, run.adjustment.ground, shown)
+    return (Section("Residuals on the ground", (), (SvgFigure("ground", "", caption, drawing),), name="ground"),)
+
+
+def _ground_figure(ground: np.ndarray, cases: Sequence[tuple[str, np.ndarray, np.ndarray]]) -> Figure:
+    """Draw errors at points on maps, one for each case.
+
+    Parameters
+    ----------
+    ground : (m, 3) ndarray
+        Adjusted coordinates of all points, ITRS, metres; NaN without an adjusted position.
+    cases : sequence of (str, (k,) ndarray, (k, 3) ndarray)
+        Title, indices of the points, and errors east, north and up, in metres.
+    """
+    known = ground[np.isfinite(ground).all(axis=1)]
+    middle = known.mean(axis=0)
+    axes_of_map = level_axes(middle[None])[0, :2]
+    east, north = 1e-3 * axes_of_map @ (ground - middle).T
+    figure = svg.new_figure(5.4)
+    for axes, (title, where, errors) in zip(figure.subplots(1, len(cases), squeeze=False)[0], cases, strict=True):
+        size = float(f"{max(float(np.sqrt(np.mean(np.sum(errors[:, :2] ** 2, axis=1)))), 1e-6):.1g}")
+        extent = float(np.abs(errors[:, 2]).max()) or 1.0
+        axes.plot(east, north, ".", color=svg.GREY, ms=2.0, alpha=0.6)
+        arrows = axes.quiver(
+            east[where], north[where], *errors.T, cmap="viridis", clim=(-extent, extent), width=0.005, scale=12.0 * size
+        )
+        axes.quiverkey(arrows, 0.8, 1.03, size, f"{size:g} m in plan", labelpos="E", coordinates="axes")
+        axes.set_title(f"{len(where)} {title}", loc="left", pad=20)
+        axes.set(xlabel="east [km]", ylabel="north [km]")
+        axes.set_aspect("equal", adjustable="datalim")
+        axes.margins(0.1)
+        svg.gridded(axes)
+        figure.colorbar(arrows, ax=axes, shrink=0.75, label="error in height [m]", location="bottom")
+    return figure
 
 
 def _warnings(run: BlockRun) -> tuple[str, ...]:
