@@ -270,8 +270,11 @@ def _ground_section(run: BlockRun) -> tuple[Section, ...]:
         level_axes(run.adjustment.ground[control]),
         run.adjustment.ground[control] - block.points.start[control],
     )
-    cases = (("check points, adjusted minus true", where, errors), ("control points, adjusted minus given", control,
-             residuals))  # fmt: skip
+    reference = "given" if run.drawn is None else "true"
+    cases = (
+        (f"check points, adjusted minus {reference}", where, errors),
+        ("control points, adjusted minus given", control, residuals),
+    )
     shown = [case for case in cases if len(case[1])]
     if not shown:
         return ()
