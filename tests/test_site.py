@@ -113,7 +113,6 @@ def test_on_a_phone_every_column_of_a_node_has_its_own_name() -> None:
     style = (HERE / "static" / "site.css").read_text("utf-8")
     for k, name in enumerate((*ACTIONS, "pivots"), 2):
         assert f'table.nodes td:nth-child({k})::before {{ content: "{name} "; }}' in style
-    assert style.count("table.nodes td:nth-child(") == len(ACTIONS) + 1
     assert f"nth-child(-n + {len(ACTIONS) + 1})" in style
 
 
