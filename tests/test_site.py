@@ -108,6 +108,14 @@ def test_every_node_stands_in_the_reference(gf7_pair) -> None:
         assert set(re.findall(r"`(\w+)`", cells[-1])) == {"origin", *info.pivots}
 
 
+def test_on_a_phone_every_column_of_a_node_has_its_own_name() -> None:
+    """The style sheet names the cells of a row by their position."""
+    style = (HERE / "static" / "site.css").read_text("utf-8")
+    for k, name in enumerate((*ACTIONS, "pivots"), 2):
+        assert f'table.nodes td:nth-child({k})::before {{ content: "{name} "; }}' in style
+    assert f"nth-child(-n + {len(ACTIONS) + 1})" in style
+
+
 def test_every_command_and_every_option_stands_in_the_reference() -> None:
     page = command_page()
     assert {"twin.render", "twin.lab", "twin.orbit", "twin.study", "twin.design", "twin.validate", "twin.doctor",

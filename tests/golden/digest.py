@@ -26,7 +26,7 @@ LONG = 80
 """Characters of a text that is kept as it is."""
 DIGITS = 11
 """Significant digits of numbers that are kept: some thousand times finer than what is compared."""
-PRINTED = re.compile(r"[-−+]?(?:\d+\.\d+(?:e[-+]?\d+)?|\d+e[-+]?\d+)")
+PRINTED = re.compile(r"[-−+]?(?:\d+\.\d+(?:e[-−+]?\d+)?|\d+e[-−+]?\d+)")
 """A number with decimals or an exponent in a text; whole numbers are text, to be equal."""
 
 

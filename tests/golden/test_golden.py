@@ -16,7 +16,7 @@ from typer.testing import CliRunner
 
 from tests.golden.__main__ import app
 from tests.golden.compare import BITWISE, CLOSE, DIFFERENT, EXCEPTIONS, allowed, compare, limits, printed_close
-from tests.golden.digest import condensed, flattened, is_number
+from tests.golden.digest import condensed, flattened, is_number, skeleton
 from tests.golden.golden import FOLDER, check, golden_file
 from tests.golden.jobs import ALL, BY_NAME, Done, Printed, Runner
 from tests.golden.snapshot import Reader
@@ -142,6 +142,11 @@ RECORD = """{"d_f_um": 2.0, "d_f_um_sigma": 0.5, "d_f_um_true": 2.0, "d_f_um_sig
 LIMITS = """{"d_f_um": 5e-4, "d_f_um_sigma": 5e-8, "d_f_um_true": 2.5e-4, "row[0]": 1e-4, "row[1]": 2e-4, "value": 1e-4,
 "row_sigma[0]": 2e-8, "plain": 4e-7, "list[0]": 5e-7, "cameras / #each / x[1]": 2e-4, "small": 1e-6,
 "cameras / #each / x_sigma[0]": 1e-8}"""
+
+
+def test_numbers_of_reports_are_numbers_with_either_minus_sign() -> None:
+    assert skeleton("p = 9e−82, −2.5e−5 mm, 3e-43, 1.0") == ("p = #, # mm, #, #", ["9e−82", "−2.5e−5", "3e-43", "1.0"])
+    assert printed_close("9e−82", "8.9e−82") == printed_close("9e-82", "8.9e-82")
 
 
 def test_limits_are_a_thousandth_of_sigma_or_1e_7_of_the_number() -> None:

@@ -9,6 +9,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 from typer.testing import CliRunner
 
 from optics.design.merit_function import Operands
@@ -26,6 +27,7 @@ from tests.scenes.refusals.tables import good
 from tests.twin.commands import edited_copy, invoke, refused
 from tests.twin.study_bench import REFUSED, TEXTS, refusals
 from tests.twin.test_blurred_cameras import GF7, gf7_with
+from twin.camera import camera_plots
 from twin.camera.__main__ import app
 from twin.camera.camera_optics import CameraOptics
 from twin.camera.camera_plots import distortion_figure
@@ -57,7 +59,7 @@ def test_distortion_is_that_of_the_papers_formula(gf7_alone) -> None:
     away = (found.places - found.ideal).reshape(-1, 2)
     np.testing.assert_allclose(away.mean(axis=0), 0.0, atol=1e-12)
     # as drawn: a grid whose departures stay within half of its spacing, and the line's in millimetres and micrometres
-    left, right, *_ = distortion_figure(SimpleNamespace(distortion=found)).axes
+    left, right, *_ = camera_plots.distortion_figure(SimpleNamespace(distortion=found)).axes
     reach = np.abs(np.concatenate([line.get_xydata() for line in left.lines])).max(axis=0)
     np.testing.assert_allclose(reach, 1e3 * np.abs(found.ideal).max(axis=(0, 1)), rtol=0.3)
     np.testing.assert_allclose(right.lines[0].get_xydata(), np.stack([1e3 * found.position, 1e6 * found.residual], -1))
@@ -408,3 +410,16 @@ def test_what_a_constraint_is_worth(tmp_path) -> None:
 def test_what_is_wrong_with_a_file(tmp_path, old: str, new: str, message: str) -> None:
     with pytest.raises(InputError, match=message):
         CameraDesignSetup.read(edited_copy(EXAMPLE, tmp_path, (old, new)))
+
+
+def test_directions_are_tangential_and_sagittal_only_about_an_axis() -> None:
+    """On the axis of a centred camera, T and S are along the line and the track; a field about square is drawn so."""
+    for on_axis, first in ((True, "along the line (T, tangential)"), (False, "along the line")):
+        axis = SimpleNamespace(on_axis=on_axis)
+        run = SimpleNamespace(optics=SimpleNamespace(model=SimpleNamespace(axis=axis)))
+        assert camera_plots._directions(run)[0] == first
+    figure = Figure()
+    square, strip = figure.subplots(1, 2)
+    camera_plots._same_scale(square, np.array([-1.0, 1.0]), np.array([-0.9, 0.9]))
+    camera_plots._same_scale(strip, np.array([-1.0, 1.0]), np.array([-0.1, 0.1]))
+    assert (square.get_aspect(), strip.get_aspect()) == (1.0, "auto")

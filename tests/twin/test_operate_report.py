@@ -5,6 +5,7 @@ from __future__ import annotations
 import html
 import json
 import re
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -58,8 +59,10 @@ def test_the_first_sentence_is_the_state_and_the_second_what_changed(history, ov
         "1 of 2 requirements does not hold: Δα of forward is 1.014 ± 0.050 arcsec, limit 0.4 arcsec"
     )
     assert second.endswith("One event was recorded and one alarm was raised on 2026-01-20.")
+    assert first.endswith("; 1 alarm is open")
+    assert made.unmet
     assert made.lead[0].startswith(
-        "Δθ between the cameras is expected to violate its requirement of 20 arcsec on 2026-01-29"
+        "Δθ between the cameras is expected to violate its requirement of 20 arcsec on 2026-01-29, 9 days after"
     )
     assert any("alarm is open" in one for one in made.warnings)
     assert "all sigmas are inflated by a factor of 1.5" in made.warnings[0]
@@ -70,6 +73,31 @@ def test_the_first_sentence_is_the_state_and_the_second_what_changed(history, ov
     ):
         end = end_of_day(day, 0)
         assert overview.change_sentence(end - DAY, end, "on it") == text
+
+
+@pytest.mark.parametrize(
+    ("holds", "breaks", "opened", "first", "unmet"),
+    [
+        (True, None, 0, "Both requirements hold now", False),
+        (True, None, 5, "5 alarms are open; both requirements hold now", True),
+        (True, 36 * HOUR, 0, "Δα of forward is expected to violate its requirement of 0.4 arcsec on", True),
+        (False, None, 2, "2 of 2 requirements do not hold", True),
+    ],
+)
+def test_the_headline_leads_with_what_is_urgent(overview, holds, breaks, opened, first, unmet) -> None:
+    result = overview.filter_result
+    when = None if breaks is None else overview.time + breaks
+    needs = [replace(one, holds_now=holds, breaks_us=when) for one in result.requirements]
+    alarms = tuple({"acknowledged": None, "time_us": k, "text": "", "kind": "jump"} for k in range(opened))
+    asked = replace(overview, filter_result=replace(result, requirements=needs), alarms=alarms)
+    sentences = asked.headline()
+    assert sentences[0].startswith(first)
+    assert asked.unmet == unmet
+    if breaks is not None:
+        assert sentences[0].endswith("36 h after the newest reading")
+        assert any(one.startswith("Both requirements hold now") for one in sentences[1:])
+    elif opened and not holds:
+        assert sentences[0].endswith("; 2 alarms are open")
 
 
 def test_the_table_has_every_quantity_with_its_requirement(overview):
@@ -251,7 +279,7 @@ def test_the_command_writes_the_report_of_the_newest_day(life, tmp_path):
     said = json.loads(told.stdout)
     page = (tmp_path / "r.html").read_text("utf-8")
     assert said["verdict"] in html.unescape(page)
-    assert said["verdict"].startswith("The requirement holds: Δθ between the cameras is ")
+    assert said["verdict"].startswith("1 alarm is open; the requirement holds: Δθ between the cameras is ")
     assert breaches(page) == []
     for words in ("base/backward/M2", "safe mode, which may step settling", "monitor_pair in operation, 2026-05-16"):
         assert shown(page, words), words

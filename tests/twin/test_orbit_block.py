@@ -1,5 +1,7 @@
 """``twin.orbit adjust``: what the command says of blocks that are right, and of blocks that are not."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -47,7 +49,15 @@ def test_errors_of_check_points_are_those_predicted_and_every_sensor_helps(run):
     assert run.contributions["without control"].predicted.ce90 > 2 * full.ce90
     assert run.contributions[TIES_ALONE].predicted.le90 > 3 * full.le90
     assert run.adjustment.p_value > 1e-4
-    assert block_report(run).warnings == ()
+    report, observed = block_report(run), run.contributions[ALL].observed
+    assert report.warnings == ()
+    assert f"; observed are {observed.ce90:.2f} m and {observed.le90:.2f} m" in report.verdict
+    (ground,) = (section for section in report.sections if section.name == "ground")
+    assert [artefact.file for artefact in ground.artefacts] == ["artefacts/ground.svg"]
+    small = replace(observed, ce90=0.2 * full.ce90, le90=0.1 * full.le90)
+    found = replace(run.contributions[ALL], observed=small)
+    verdict = block_report(replace(run, contributions={**run.contributions, ALL: found})).verdict
+    assert "at most 0.2 of the prediction, which covers errors common to all points" in verdict
 
 
 @pytest.mark.second

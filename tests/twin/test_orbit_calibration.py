@@ -20,6 +20,7 @@ from scenes.specs.orbit.setup import CalibrationSetup
 from tests.twin.strip_prediction import predicted
 from twin.orbit.calibration import campaign_adjustment
 from twin.orbit.calibration.calibration_numbers import CALIBRATION
+from twin.orbit.calibration.calibration_report import calibration_report
 from twin.orbit.calibration.calibration_run import run_calibration, true_values
 from twin.orbit.calibration.campaign import Campaign, PassData, image_sigma, interior_names, line_model
 from twin.orbit.calibration.campaign_adjustment import GAUGE, fit_latitude, rate_priors, simultaneous
@@ -61,6 +62,17 @@ def setup_with(thermal: bool = True, effects: EffectsSpec = NO_LIGHT, **errors) 
 def full():
     """The example as it is."""
     return run_calibration(SETUP, None, 1)
+
+
+@pytest.mark.second
+def test_the_verdict_says_where_calibration_makes_errors_larger(full) -> None:
+    """With parameters of the laboratory that were right, meeting the limits is no merit of the calibration."""
+    assert calibration_report(full).verdict.startswith("Calibration makes the errors at check points smaller: from 1")
+    one = next(iter(full.schemes.values()))
+    better = {name: replace(errors, plan_rms=0.2, height_rms=0.3) for name, errors in one.items()}
+    verdict = calibration_report(replace(full, before=better)).verdict
+    assert "larger in plan and height: from 0.200 m in plan and 0.300 m in height to" in verdict
+    assert "in every field, as the laboratory's parameters alone do: see" in verdict
 
 
 def interior_of_the_file() -> dict[str, float]:

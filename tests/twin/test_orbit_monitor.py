@@ -25,7 +25,7 @@ from twin.monitor.image_quality import image_quality
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.monitor.truth import trace_truth
 from twin.orbit.flight.line_camera import traced_line_cameras
-from twin.orbit.monitoring import closed_loop
+from twin.orbit.monitoring import closed_loop, monitoring_report
 from twin.orbit.monitoring.closed_loop import FOCUS_FIELDS, Commands, Corrector, LoopCourse, LoopModel, defocus
 from twin.orbit.monitoring.loop_run import LoopRun
 from twin.orbit.monitoring.monitoring_numbers import CORRECTION, LOOP
@@ -224,6 +224,18 @@ def test_smoothed_heights(stated) -> None:
     chosen = stated.smoothing[1200.0]
     assert chosen.factor > 1.1
     assert chosen.case.camera_height_rms == stated.cases["smoothed"].camera_height_rms
+    assert "the predicted sigma" in " ".join(monitor_report(stated).lead)
+    # an error of some hundredths of its sigma is no agreement
+    tiny = replace(chosen, error=0.01 * chosen.sigma)
+    large = replace(chosen, error=1.1 * chosen.limit * chosen.sigma)
+    for smoothing, words in (
+        (tiny, "is conservative: the errors are 0.01 σ RMS"),
+        (replace(chosen, error=chosen.sigma), "this agrees with the predicted sigma"),
+        (large, "this contradicts the predicted sigma"),
+    ):
+        run = replace(stated)
+        run.__dict__["smoothing"] = {**stated.smoothing, stated.spec.every: smoothing}
+        assert words in monitoring_report._gain(run)
     assert chosen.factor == stated.cases["interval"].camera_height_rms / stated.cases["smoothed"].camera_height_rms
     # the linear error is the intersected one but for products of two arcseconds
     assert chosen.error == pytest.approx(chosen.case.camera, abs=2e-3)

@@ -15,6 +15,7 @@ from analysis.monitor.parameters import CAMERA_PARAMETERS as PARAMETERS
 from scenes.specs.resolved import resolve
 from tests.twin.policed_page import Policed, breaches
 from tests.twin.study_bench import REFUSED
+from twin.framework import svg
 from twin.framework.artefact import (
     FAR,
     Marked,
@@ -26,6 +27,7 @@ from twin.framework.artefact import (
     plain,
     residual_text,
     significant,
+    typeset,
 )
 from twin.framework.page import FIGURES, RunFacts, checksum, inline, page_policy
 from twin.framework.page import render_report as whole_page
@@ -53,6 +55,42 @@ def page(run) -> str:
     return render_report(run, scene=scene_bytes(instrument, run.state, paths))
 
 
+def test_the_colour_of_a_verdict_follows_unmet_requirements_and_warnings() -> None:
+    report = Report("Title", "It is so.", (), (), Table("t", "", "", ("a",), [[1.0]]), ())
+    how = RunFacts("", "twin.lab", 0.0, 1.0, "cpu")
+    cases = ((report, "answer"), (replace(report, warnings=("w",)), "answer warned"))
+    for one, name in (*cases, (replace(report, warnings=("w",), unmet=True), "answer unmet")):
+        assert f'<p class="{name}">It is so.</p>' in whole_page("focus", one, how)
+
+
+def test_every_section_is_in_the_navigation_and_long_tables_are_folded() -> None:
+    short, long = (Table(f"t{n}", f"Of {n}", "", ("a",), [[1.0]] * n) for n in (20, 21))
+    sections = (Section("First", (), (short, long)), Section("Second", (), (), name="own"))
+    report = Report("Title", "It is so.", (), (), Table("t", "", "", ("a",), [[1.0]]), sections)
+    page = whole_page("focus", report, RunFacts("", "twin.lab", 0.0, 1.0, "cpu"))
+    for anchor, title in (("section-1", "First"), ("own", "Second")):
+        assert f'<a href="#{anchor}">{title}</a>' in page
+        assert f'<section id="{anchor}">' in page
+    assert "<summary>Of 21, 21 rows</summary>" in page
+    assert "<h3>Of 20</h3>" in page
+
+
+@pytest.mark.parametrize(
+    ("text", "shown"),
+    [
+        ("at (0.08, -0.01) deg", "at (0.08, −0.01) deg"),
+        ("-2.53e-05 mm", "−2.53e−5 mm"),
+        ("3e+08", "3e8"),
+        ("2028-03-05, runs/a-1, 3-4 and --seed -1", "2028-03-05, runs/a-1, 3-4 and --seed −1"),
+        ("`shift: -1` moves by -1", "`shift: -1` moves by −1"),
+    ],
+)
+def test_one_minus_sign(text: str, shown: str) -> None:
+    assert typeset(text) == shown
+    report = Report("Title", "It is so.", (text,), (), Table("t", "", "", ("a",), [[1.0]]), (), warnings=(text,))
+    assert (report.lead, report.warnings) == ((shown,), (shown,))
+
+
 @pytest.mark.second
 def test_a_page_needs_nothing_else_and_misses_nothing(page):
     """No script, link, font or picture from outside; tags are closed in order, and no number is missing."""
@@ -69,6 +107,27 @@ def test_a_page_needs_nothing_else_and_misses_nothing(page):
         ET.fromstring(drawing.replace("<svg ", '<svg xmlns="http://www.w3.org/2000/svg" ', 1))
     words = re.sub(r"<(style|script).*?</\1>|<[^>]+>", " ", page, flags=re.DOTALL)
     assert not re.search(r"(?<![A-Za-z])(nan|NaN|None|inf|np\.float64)(?![A-Za-z])", words)
+
+
+@pytest.mark.second
+def test_the_first_screen_shows_the_spots_beside_one_estimator(page, run):
+    """All spots before and after with their shifts, and one reading of each change; other estimators on a click."""
+    first = page[page.index('<section id="result"') : page.index('<details id="setup">')]
+    assert first.count("<image") == 2 * len(run.experiment.path.channels)
+    assert "Recovered by the posterior" in first
+    assert first.count("<tr>") - 1 == len(run.reading.table.of(run.judged))
+    assert "paper" not in re.sub(r"<a .*?>", "", first)
+    rest = page[page.index("<summary>All estimators</summary>") :]
+    assert "paper joint" in rest[: rest.index("</details>")]
+
+
+@pytest.mark.second
+def test_drawings_follow_the_dark(page) -> None:
+    """The style sheet of pages names the ink, the greys and the blue of drawings, which Matplotlib writes as styles."""
+    for colour in (svg.INK, svg.GREY, svg.LIGHT, svg.SHADE, svg.BLUE.lower()):
+        assert f'[style*="fill: {colour}"]' in page
+        assert colour == svg.SHADE or f'[style*="stroke: {colour}"]' in page
+    assert ".card { overflow-x: auto; border-radius: 3px; }" in page
 
 
 @pytest.mark.second

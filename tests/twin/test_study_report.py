@@ -116,3 +116,10 @@ def test_a_figure_that_cannot_be_drawn_costs_nothing_else(monkeypatch) -> None:
     page_text = html.unescape(made.contents["report.html"].decode())
     assert told in page_text  # among the warnings
     assert f"T{told[1:]}." in page_text  # where it would stand
+
+
+def test_few_points_are_large() -> None:
+    """Points of 30 runs are seen, and those of 5000 do not become one blot."""
+    assert study_plots.dot_size(30) == 7.0
+    assert study_plots.dot_size(5000) == 2.5
+    assert study_plots.dot_size(150) == pytest.approx(60.0 / np.sqrt(150.0))

@@ -19,14 +19,13 @@ from scenes.yaml.yaml_file import YamlFile, dump_yaml, read_yaml
 from tests.twin.study_bench import TEXTS, budget, refusals
 from twin.camera.camera_optics import CameraOptics
 from twin.monitor.monitor_experiment import MonitorExperiment
-from twin.tolerance import allocation, given_warnings, merit_models, samples, tolerance_run
+from twin.tolerance import allocation, given_warnings, merit_models, samples, tolerance_report, tolerance_run
 from twin.tolerance.allocation import CostCurve
 from twin.tolerance.merit_models import MeritModel, inverse_limits, sensitivities
 from twin.tolerance.monitor_merit import Merit
 from twin.tolerance.samples import Workforce, draw_samples
 from twin.tolerance.tolerance_bench import Adjustments, ToleranceBench
-from twin.tolerance.tolerance_report import tolerance_report
-from twin.tolerance.tolerance_run import Yield, run_tolerance, worst_jobs
+from twin.tolerance.tolerance_run import MeritResult, Yield, run_tolerance, worst_jobs
 from twin.tolerance.variations import spectrum_shares, states_of, tolerance_parameters
 
 
@@ -374,6 +373,27 @@ def test_margins_losses_and_verdicts_of_merits() -> None:
     assert shares[0] > shares[-1]
 
 
+def test_the_verdict_names_a_design_that_misses_its_requirement_and_the_cause_of_the_spread() -> None:
+    """No tolerance helps where the designed camera has 0.293 of 0.3; causes are named by merit."""
+    mtf, error = merit_of("mtf", at_least=0.3), merit_of("wavefront", at_most=0.05)
+    rest = {"mean": 0.0, "deviation": 0.1, "levels": (), "linear": (), "quadratic": (), "model_passing": (0.0, 0.0)}
+    few = Yield.count(np.arange(100) < 50)
+    shares = {"M1_figure": 0.99, "M2_tilt": 0.004}, {"M1_figure": 0.3, "M2_tilt": 0.6}
+    results = [
+        MeritResult(merit=merit, nominal=value, passing=few, shares=share, **rest)
+        for merit, value, share in zip((mtf, error), (0.293, 0.04), shares, strict=True)
+    ]
+    run = SimpleNamespace(merits=results, bench=SimpleNamespace(entries=shares[0]))
+    assert tolerance_report._designed(run).startswith(
+        "The designed camera itself, without errors, misses the requirement on mtf (0.293, at least 0.3 is required)"
+    )
+    assert tolerance_report._causes(run) == (
+        "M1_figure causes 99 % of the spread (variance) of mtf",
+        "M2_tilt 60 % and M1_figure 30 % are the largest causes of the spread (variance) of wavefront",
+    )
+    assert tolerance_report._designed(SimpleNamespace(merits=results[1:])) == ""
+
+
 def test_models_of_scaled_tolerances_are_the_model_of_scaled_draws() -> None:
     """Two tolerances of two and one numbers; derivatives by the logarithms of the scales against differences."""
     rng = np.random.default_rng(6)
@@ -444,7 +464,7 @@ def test_warnings_of_instrument_and_engine_reach_the_report(backend, tmp_path, m
         "in 10 of the 10 worst cameras, left: M2 has moved and would take 3 rays",
     )
     assert told == ["a line is corrupt"]
-    assert tolerance_report(run).warnings == run.warnings
+    assert tolerance_report.tolerance_report(run).warnings == run.warnings
 
 
 def test_a_camera_whose_own_parts_stand_in_its_beam_is_told(backend, tmp_path) -> None:

@@ -259,6 +259,12 @@ def test_what_is_stated_stands_in_the_sentence(job) -> None:
     )
     assert "Noise and disturbances hide changes below" in all_of(told)
     assert "more frames do not lower this limit" in all_of(told)
+    # what a share of 100 % means, and which numbers are the prior's alone
+    assert run.reading.repeats_prior == ()
+    assert "only as good as the prior, and more frames do not reduce them" in assumed(run.reading)
+    fixed = replace(run.reading)
+    fixed.__dict__["repeats_prior"] = ("forward Δf",)
+    assert assumed(fixed).endswith("the spots do not measure forward Δf: these numbers repeat the prior")
     found = re.search(r"Motions of (\S+) cause (\d+) % of the variance of Δθ \(σ (\S+) arcsec\)", all_of(told))
     assert found is not None
     body, share, size = found.groups()

@@ -10,7 +10,17 @@ from matplotlib.figure import Figure
 from optics.numerics.number_tree import FrozenMap
 from twin.asbuilt.asbuilt_run import ALONG, AsBuiltRun, MeritPrediction, motions, moves_plain, responses
 from twin.asbuilt.built_instrument import CORRELATION, POSTERIOR, instrument_text, posterior_files
-from twin.framework.artefact import CameraFile, Cell, CsvFile, DecimalNumber, SvgFigure, Table, plain, significant
+from twin.framework.artefact import (
+    CameraFile,
+    Cell,
+    CsvFile,
+    DecimalNumber,
+    SvgFigure,
+    Table,
+    plain,
+    significant,
+    unit_for_reports,
+)
 from twin.framework.report import Report, Section, answer
 from twin.framework.svg import (
     BLUE,
@@ -97,7 +107,8 @@ def asbuilt_report(run: AsBuiltRun) -> Report:
         ("truth", "simulated" if run.true is not None else "not known"),
     )
     title = f"{run.bench.camera} as built"
-    return Report(title, verdict, more, facts, _summary(run), sections, warnings=run.warnings)
+    unmet = any(prediction.meets <= 1.0 - _CERTAIN for prediction in run.predictions)
+    return Report(title, verdict, more, facts, _summary(run), sections, warnings=run.warnings, unmet=unmet)
 
 
 def _percent(share: float) -> str:
@@ -158,7 +169,7 @@ def _short(amount: str | float) -> str:
     """Return the amount of an actuator move as text with four significant digits."""
     if isinstance(amount, str):
         number, _, unit = amount.partition(" ")
-        return f"{plain(float(number), 4)} {unit}"
+        return f"{plain(float(number), 4)} {unit_for_reports(unit)}"
     return plain(amount, 4)
 
 

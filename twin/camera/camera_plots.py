@@ -12,10 +12,25 @@ from twin.camera.camera_results import Field
 from twin.camera.camera_run import GRID, SHARP, CameraRun
 from twin.camera.camera_view import LINE, TRACK, draw_mtf, draw_spot, draw_wavefront
 from twin.framework.artefact import plain
-from twin.framework.svg import BLUE, GREEN, GREY, INK, LIGHT, ORANGE, PURPLE, SKY, VERMILION, new_figure, plain_axes
+from twin.framework.svg import (
+    BLUE,
+    GREEN,
+    GREY,
+    INK,
+    LIGHT,
+    ORANGE,
+    PURPLE,
+    SKY,
+    VERMILION,
+    new_figure,
+    plain_axes,
+    shared_legend,
+)
 
 MICRO = "\N{MICRO SIGN}m"
 _FIELD_COLOURS = (INK, SKY, BLUE, VERMILION, ORANGE)
+_STRIP = 4.0
+"""Ratio of a field's sides above which its map is not drawn to the same scale in both directions."""
 _FIRST_TERMS = range(4, 23)
 """Noll indices of the Zernike terms in the bar chart."""
 
@@ -164,6 +179,7 @@ def error_figure(run: CameraRun) -> Figure:
     left, right = figure.subplots(1, 2, gridspec_kw={"width_ratios": [1.35, 1.0]})
     x, y = (np.degrees(run.field[..., k] * h) for k, h in enumerate((run.camera.field.x, run.camera.field.y)))
     filled = left.contourf(x, y, run.errors, levels=12, cmap="YlGnBu")
+    _same_scale(left, x, y)
     figure.colorbar(filled, ax=left, label="waves rms", shrink=0.95)
     worst = run.worst[1]
     left.plot(
@@ -196,22 +212,34 @@ def error_figure(run: CameraRun) -> Figure:
     return figure
 
 
+def _same_scale(axes: Axes, x: np.ndarray, y: np.ndarray) -> None:
+    """Draw both directions to the same scale, unless the field is a narrow strip."""
+    sides = sorted((float(np.ptp(x)), float(np.ptp(y))))
+    if sides[1] < _STRIP * sides[0]:
+        axes.set_aspect("equal", adjustable="box")
+
+
+def _directions(run: CameraRun) -> tuple[str, str]:
+    """Return the names of the directions along line and track; on the axis of a centred camera also T and S."""
+    if run.optics.model.axis.on_axis:
+        return "along the line (T, tangential)", "along the track (S, sagittal)"
+    return "along the line", "along the track"
+
+
 def mtf_figure(run: CameraRun) -> Figure:
     """Draw MTF curves of five fields, each with its diffraction limit, and the MTF at Nyquist along the line."""
     figure = new_figure(6.4)
     axes = np.ravel(figure.subplots(2, 3, sharey=True))
     for k, (panel, mtf) in enumerate(zip(axes, run.mtfs, strict=False)):
-        draw_mtf(panel, mtf, label=k == 0)
+        draw_mtf(panel, mtf, _directions(run) if k == 0 else None)
         panel.set_title(degrees_text(run, mtf.field))
-        if k == 0:
-            panel.legend(fontsize=7.5, loc="upper right", bbox_to_anchor=(1.0, 0.93))
     last = axes[-1]
     x = np.degrees(run.curves.share * run.camera.field.x)
-    for k, (colour, name) in enumerate(((LINE, "along the line"), (TRACK, "along the track"))):
-        last.plot(x, run.curves.mtf[:, k], color=colour, lw=1.4, label=name)
+    for k, colour in enumerate((LINE, TRACK)):
+        last.plot(x, run.curves.mtf[:, k], color=colour, lw=1.4)
     last.set_title("at Nyquist, along the line")
     last.set_xlabel("field, degrees")
-    last.legend(fontsize=7.5, loc="lower left")
+    shared_legend(figure, axes[0])
     plain_axes(last)
     axes[0].set_ylabel("MTF of the optics")
     axes[3].set_ylabel("MTF of the optics")
@@ -275,7 +303,7 @@ def light_mtf_figure(run: CameraRun) -> Figure:
     rows = figure.subplots(2, len(run.colours.fields))
     for k, (mtf, psf) in enumerate(zip(run.colours.mtfs, run.colours.psfs, strict=True)):
         upper, lower = rows[:, k]
-        draw_mtf(upper, mtf, label=k == 0)
+        draw_mtf(upper, mtf, _directions(run) if k == 0 else None)
         upper.set_title(degrees_text(run, mtf.field), fontsize=8.5)
         um = 1e6 * psf.position
         lower.pcolormesh(
@@ -290,7 +318,7 @@ def light_mtf_figure(run: CameraRun) -> Figure:
         lower.set_xlabel(MICRO)
         for panel in (upper, lower):
             panel.tick_params(labelsize=7)
-    rows[0, 0].legend(fontsize=6.5)
+    shared_legend(figure, rows[0, 0])
     rows[0, 0].set_ylabel("MTF of the optics")
     rows[1, 0].set_ylabel(f"along the track, {MICRO}")
     return figure
@@ -310,8 +338,8 @@ def focus_figure(run: CameraRun) -> Figure:
     axes[0].set_ylabel("waves rms")
     axes[0].set_title("wavefront error")
     axes[0].set_ylim(0.0, None)
-    axes[0].legend(fontsize=7.0, title="field", title_fontsize=7.5)
-    for panel, name in zip(axes[1:], ("along the line", "along the track"), strict=False):
+    shared_legend(figure, axes[0], title="field")
+    for panel, name in zip(axes[1:], _directions(run), strict=False):
         panel.set_title(f"MTF of the optics at Nyquist {name}")
         panel.set_ylim(0.0, None)
     for panel in axes:
@@ -326,9 +354,10 @@ def curves_figure(run: CameraRun) -> Figure:
     curves = run.curves
     figure = new_figure(3.2)
     left, right = figure.subplots(1, 2)
+    along, across = _directions(run)
     x = np.degrees(curves.share * run.camera.field.x)
-    left.plot(x, 1e6 * curves.focus_line, color=LINE, lw=1.4, label="fans along the line")
-    left.plot(x, 1e6 * curves.focus_track, color=TRACK, lw=1.4, label="fans along the track")
+    left.plot(x, 1e6 * curves.focus_line, color=LINE, lw=1.4, label=f"fans {along}")
+    left.plot(x, 1e6 * curves.focus_track, color=TRACK, lw=1.4, label=f"fans {across}")
     left.plot(x, 1e6 * curves.focus, color=INK, lw=1.0, ls=(0, (4, 2)), label="whole beam")
     left.axhline(0.0, color=LIGHT, lw=0.8, zorder=0)
     left.set_title("Field curvature and astigmatism")
@@ -340,7 +369,7 @@ def curves_figure(run: CameraRun) -> Figure:
     right.set_ylim(min(98.0, low - 1.0), 100.0 + max(0.5, 100.0 * float(curves.illumination.max()) - 100.0 + 0.3))
     right.set_title("Illumination")
     right.set_ylabel("percent of the middle")
-    right.legend(fontsize=7.5, loc="lower left")
+    right.legend(fontsize=7.5)
     for panel in (left, right):
         panel.set_xlabel("field along the line, degrees")
         plain_axes(panel)
@@ -358,6 +387,7 @@ def distortion_figure(run: CameraRun) -> Figure:
     for places, colour, width in ((d.ideal, GREY, 0.6), (d.ideal + factor * away, BLUE, 1.0)):
         for line in (*places, *np.swapaxes(places, 0, 1)):
             left.plot(1e3 * line[:, 0], 1e3 * line[:, 1], color=colour, lw=width)
+    _same_scale(left, *np.moveaxis(d.ideal, -1, 0)[:2])
     left.set_title(f"Grid of fields, distortion × {factor:g}")
     left.set_xlabel("along the line [mm]")
     left.set_ylabel("along the track [mm]")

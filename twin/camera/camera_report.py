@@ -18,7 +18,7 @@ from twin.camera.camera_run import CameraRun, built_text, camera_data, perturbed
 from twin.camera.colour import Colours
 from twin.camera.first_order_data import FIRST_ORDER, unmodelled_obscuration
 from twin.camera.layout_plot import layout_figure
-from twin.framework.artefact import Artefact, CameraFile, Cell, SvgFigure, Table, fixed, plain
+from twin.framework.artefact import Artefact, CameraFile, Cell, SvgFigure, Table, fixed, significant
 from twin.framework.data_files import netcdf
 from twin.framework.report import Report, Section, answer
 from twin.framework.svg import look, to_svg
@@ -402,8 +402,9 @@ def _field(run: CameraRun) -> Section:
         f"{fixed(1e3 * point, 3)} mm off.",
         f"Over the whole field: the best-fitting distortion-free camera has f {d.distance:.6f} m and its principal "
         "point at "
-        f"({plain(1e3 * d.point[0], 4)}, {plain(1e3 * d.point[1], 6)}) mm from the line's middle, near the parent "
-        f"axis; distortion relative to it is {1e6 * d.rms:.3g} µm rms, at most {1e6 * d.largest:.3g} µm.",
+        f"({fixed(1e3 * d.point[0], 3)}, {fixed(1e3 * d.point[1], 3)}) mm from the line's middle, near the parent "
+        f"axis; distortion relative to it is {significant(1e6 * d.rms)} µm rms, at most "
+        f"{significant(1e6 * d.largest)} µm.",
     )
     x = np.degrees(curves.share * run.camera.field.x)
     rows: list[list[Cell]] = [

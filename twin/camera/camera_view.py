@@ -80,15 +80,24 @@ def draw_spot(axes: Axes, spot: Spot, half: float | None = None) -> None:
     axes.set_ylim(-reach, reach)
 
 
-def draw_mtf(axes: Axes, mtf: Mtf, label: bool = True) -> None:
-    """Draw the MTF along line and track over cycles/mm, with the diffraction limit and the Nyquist frequency."""
+def draw_mtf(axes: Axes, mtf: Mtf, labels: tuple[str, str] | None = ("along the line", "along the track")) -> None:
+    """Draw the MTF along line and track over cycles/mm, with the diffraction limit and the Nyquist frequency.
+
+    Parameters
+    ----------
+    axes : Axes
+        Axes to draw into.
+    mtf : Mtf
+        MTF at one field.
+    labels : tuple of str, optional
+        Names of the two directions for a legend; None for none.
+    """
     frequency = 1e-3 * mtf.frequency
-    for values, limit, colour, name in zip(
-        mtf.values, mtf.limit, (LINE, TRACK), ("along the line", "along the track"), strict=True
-    ):
-        axes.plot(frequency, values, color=colour, lw=1.4, label=name if label else None)
+    names = labels or (None, None)
+    for values, limit, colour, name in zip(mtf.values, mtf.limit, (LINE, TRACK), names, strict=True):
+        axes.plot(frequency, values, color=colour, lw=1.4, label=name)
         axes.plot(frequency, limit, color=INK, lw=0.7, ls=(0, (4, 3)), zorder=4)
-    if label:
+    if labels is not None:
         axes.plot([], [], color=INK, lw=0.7, ls=(0, (4, 3)), label="diffraction limit")
     axes.axvline(1e-3 * mtf.nyquist, color=GREY, lw=0.8, ls=":")
     axes.annotate(

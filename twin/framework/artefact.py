@@ -22,6 +22,8 @@ SYMBOLS = {"d_alpha": "Δα", "d_beta": "Δβ", "d_gamma": "Δγ", "d_f": "Δf"}
 """Symbols of the changes of a camera in tables, figures and sentences. The unit follows in brackets, with the micro
 sign: Δα [arcsec], Δf [µm]. Keys of files are plain letters with the unit at the end: d_alpha_arcsec, d_f_um.
 """
+LONG_TABLE = 20
+"""Number of rows above which a page folds a table."""
 FAR = 3.0
 """Residuals beyond this many sigma are marked in tables."""
 
@@ -29,6 +31,25 @@ FAR = 3.0
 def unit_for_reports(unit: str) -> str:
     """Return a unit as reports spell it, from its name in files: ``µm`` for ``um``, ``%`` for ``percent``."""
     return unit.replace("um", "µm").replace("percent", "%")
+
+
+def typeset(text: str) -> str:
+    """Return a text with typographic minus signs before numbers and in powers of ten; code between backticks is kept.
+
+    A hyphen within a word, a date or a range stays.
+    """
+    parts = text.split("`")
+    parts[::2] = [_POWER.sub(_power_text, _NEGATIVE.sub(MINUS, part)) for part in parts[::2]]
+    return "`".join(parts)
+
+
+_NEGATIVE = re.compile(r"(?<![\w.,)\]\-\N{MINUS SIGN}+/])-(?=\.?\d)")
+_POWER = re.compile(r"(?<=\d)e([-+])0*(?=\d)")
+
+
+def _power_text(power: re.Match[str]) -> str:
+    """Return the exponent of a power of ten as reports write it."""
+    return f"e{MINUS}" if power[1] == "-" else "e"
 
 
 def _typeset(text: str) -> str:
@@ -262,6 +283,11 @@ class Artefact:
         return self.full
 
     @property
+    def long(self) -> bool:
+        """True for a table that a page shows only on request."""
+        return False
+
+    @property
     def shown_caption(self) -> str:
         """Caption shown in the report; for a figure that could not be drawn, a note instead."""
         return self.caption
@@ -359,6 +385,12 @@ class Table(Artefact):
         ]
 
     @property
+    def long(self) -> bool:
+        """True if the table has more than `LONG_TABLE` rows, unless its texts are what the page is about."""
+        texts = any(isinstance(cell, Marked) and "how" in cell.look for row in self.rows for cell in row)
+        return len(self.rows) > LONG_TABLE and not texts
+
+    @property
     def cells(self) -> list[list[Marked]]:
         """Rows as the text of cells with their styles, for an HTML page."""
         return [[cell if isinstance(cell, Marked) else Marked(cell_text(cell)) for cell in row] for row in self.shown()]
@@ -392,7 +424,7 @@ def cell_text(value: Cell) -> str:
     if value is None:
         return ""
     if isinstance(value, str):
-        return value
+        return typeset(value)
     return plain(value) if isinstance(value, int) else significant(value, 6, floor=0.0)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import math
 import signal
 import threading
 import time
@@ -18,6 +19,7 @@ import typer
 from rich import box, progress
 from rich.console import Console
 from rich.table import Table
+from rich.text import Text
 from typer.core import TyperGroup
 
 from optics.numerics.backend import NAMES
@@ -336,18 +338,25 @@ class WorkProgress:
     total: int = 1
     begun: float = field(default_factory=time.monotonic)
     before: int = 0
+    shortest: float = math.inf
 
     def advance(self, part: str, done: int, total: int) -> None:
         """Record that ``done`` of ``total`` steps of a part of the work are done."""
         if part != self.part or done < self.done:
-            self.begun, self.before = time.monotonic(), done
+            self.begun, self.before, self.shortest = time.monotonic(), done, math.inf
         self.part, self.done, self.total = part, done, total
 
     @property
     def left(self) -> float:
-        """Remaining time of the current part, in seconds, estimated from its speed so far; 0 if no step is done."""
+        """Remaining time of the current part, in seconds, estimated from its speed so far; 0 if no step is done.
+
+        It never grows: where the work becomes slower, it stays at its shortest estimate.
+        """
         spent, pieces = time.monotonic() - self.begun, self.done - self.before
-        return spent * (self.total - self.done) / pieces if pieces > 0 else 0.0
+        if pieces <= 0:
+            return 0.0
+        self.shortest = min(self.shortest, spent * (self.total - self.done) / pieces)
+        return self.shortest
 
     @property
     def long(self) -> bool:
@@ -371,6 +380,24 @@ def time_text(seconds: float | None) -> str:
     return f"{seconds / 60.0:.0f} min" if seconds < 7200.0 else f"{seconds / 3600.0:.1f} h"
 
 
+class FallingTime(progress.TimeRemainingColumn):
+    """Remaining time of a task, which stays at its shortest estimate where the work becomes slower."""
+
+    def __init__(self) -> None:
+        """Begin without an estimate of any task."""
+        super().__init__()
+        self._shortest: dict[tuple[int, float | None], float] = {}
+
+    def render(self, task: progress.Task) -> Text:
+        """Return the remaining time as text."""
+        if task.time_remaining is None or task.total is None:
+            return super().render(task)
+        key = task.id, task.total
+        shown = self._shortest[key] = min(self._shortest.get(key, math.inf), task.time_remaining)
+        hours, minutes = divmod(int(shown) // 60, 60)
+        return Text(f"{hours}:{minutes:02d}:{int(shown) % 60:02d}", style="progress.remaining")
+
+
 def progress_columns(width: int) -> tuple[progress.ProgressColumn, ...]:
     """Return the columns of a progress display: description of ``width`` letters, bar, elapsed and remaining time."""
     return (
@@ -379,7 +406,7 @@ def progress_columns(width: int) -> tuple[progress.ProgressColumn, ...]:
         progress.BarColumn(),
         progress.TimeElapsedColumn(),
         progress.TextColumn("left"),
-        progress.TimeRemainingColumn(),
+        FallingTime(),
     )
 
 
@@ -400,6 +427,19 @@ def print_paths(console: Console, target: Path) -> None:
     console.print(f"report:     {target / 'report.html'}", markup=False, highlight=False, soft_wrap=True)
 
 
-def print_verdict(console: Console, verdict: str) -> None:
-    """Print the verdict of a result."""
-    console.print(verdict, style="bold", markup=False, highlight=False, soft_wrap=True)
+def print_verdict(console: Console, verdict: str, unmet: bool = False, warned: bool = False) -> None:
+    """Print the verdict of a result: red if a requirement is not met, yellow if there are warnings.
+
+    Parameters
+    ----------
+    console : Console
+        Terminal.
+    verdict : str
+        Verdict, one or two sentences.
+    unmet : bool
+        True if a requirement is not met or an alarm is open.
+    warned : bool
+        True if the result has warnings.
+    """
+    style = "bold red" if unmet else "bold yellow" if warned else "bold"
+    console.print(verdict, style=style, markup=False, highlight=False, soft_wrap=True)

@@ -314,7 +314,7 @@ def print_report(report: Report, console: Console) -> None:
     """Print the verdict, the main table, the lead and the warnings of a report."""
     from twin.framework.artefact import cell_text
 
-    cli.print_verdict(console, report.verdict)
+    cli.print_verdict(console, report.verdict, report.unmet, bool(report.warnings))
     summary = report.summary
     table = cli.result_table(report.title)
     for k, head in enumerate(summary.heads):

@@ -25,7 +25,7 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined, Template
 from markupsafe import Markup, escape
 
 from twin.framework import data_files, provenance, reference_frames, run_folder
-from twin.framework.artefact import Artefact
+from twin.framework.artefact import Artefact, typeset
 from twin.framework.report import Report, further_sections
 
 FIGURES = "*{stroke-linejoin: round; stroke-linecap: butt}"
@@ -73,8 +73,8 @@ def policy(directives: Mapping[str, str]) -> str:
 
 
 def inline(text: str) -> Markup:
-    """Return a text as escaped HTML, with words between backticks as code."""
-    return text if isinstance(text, Markup) else Markup(_CODE.sub(r"<code>\1</code>", str(escape(text))))
+    """Return a text as escaped HTML, with typographic minus signs, and words between backticks as code."""
+    return text if isinstance(text, Markup) else Markup(_CODE.sub(r"<code>\1</code>", str(escape(typeset(text)))))
 
 
 _CODE = re.compile("`([^`]+)`")

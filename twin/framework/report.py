@@ -11,7 +11,7 @@ import numpy as np
 
 from optics.numerics.extension_table import ExtensionTable
 from optics.numerics.number_tree import FrozenMap
-from twin.framework.artefact import Artefact, Table
+from twin.framework.artefact import Artefact, Table, typeset
 from twin.framework.data_files import FrameFacts
 from twin.framework.provenance import SelfCheck
 
@@ -49,11 +49,11 @@ MOST_SENTENCES = 2
 
 
 def sentence(statement: str) -> str:
-    """Return a statement as a sentence with a full stop and, where suitable, an initial capital.
+    """Return a statement as a sentence with a full stop, typographic minus signs and, where suitable, a capital.
 
     Only a first word of lower-case letters gets a capital; a path or a symbol stays as it is.
     """
-    text = statement.strip().rstrip(".")
+    text = typeset(statement.strip().rstrip("."))
     return f"{text[:1].upper() + text[1:] if re.match(r'[a-z]+[ ,:;]', text) else text}."
 
 
@@ -101,6 +101,11 @@ class Report:
         Contents of files that no page shows, by path in the run folder.
     checks : tuple of SelfCheck
         Self-checks of the run; empty to take those in its numbers.
+    glance : Artefact | None
+        Figure shown beside the main table; None for none.
+    unmet : bool
+        True if a requirement of the run is not met or an alarm is open; the verdict is then red, with warnings only
+        yellow.
     """
 
     title: str
@@ -116,11 +121,14 @@ class Report:
     conclusions: tuple[str, ...] = ()
     files: Mapping[str, bytes] = field(default_factory=FrozenMap)
     checks: tuple[SelfCheck, ...] = ()
+    glance: Artefact | None = None
+    unmet: bool = False
 
     @property
     def artefacts(self) -> tuple[Artefact, ...]:
         """All artefacts, the main table first."""
-        return (self.summary, *(artefact for section in self.sections for artefact in section.artefacts))
+        first = (self.summary,) if self.glance is None else (self.summary, self.glance)
+        return (*first, *(artefact for section in self.sections for artefact in section.artefacts))
 
     def with_verdict(self, numbers: Mapping[str, Any]) -> dict[str, Any]:
         """Return the numbers of the run with the verdict and the warnings.
@@ -142,7 +150,10 @@ class Report:
         return {**numbers, **added}
 
     def __post_init__(self) -> None:
-        """Raise ValueError for a verdict of more than two sentences, or artefacts with equal names."""
+        """Typeset all sentences; raise ValueError for a verdict of over two sentences, or artefacts of equal names."""
+        for name in ("lead", "warnings", "conclusions"):
+            object.__setattr__(self, name, tuple(map(typeset, getattr(self, name))))
+        object.__setattr__(self, "verdict", typeset(self.verdict))
         if not self.verdict.endswith(".") or len(re.findall(r"[.!?]\s+[A-Z]", self.verdict)) >= MOST_SENTENCES:
             raise ValueError(f"a verdict must be one or two sentences: {self.verdict!r}")
         names = [artefact.name for artefact in self.artefacts if artefact.within is None]

@@ -328,7 +328,7 @@ def turntable_report(run: TurntableRun) -> Report:
     keys = ("repeat_rms_arcsec", "chauvenet_rms_arcsec", "averaging_alone_rms_arcsec", "mean_rms_arcsec")
     rows = [
         *TURNTABLE.lines(data, (*keys, "repeatability_arcsec")),
-        ("compensated angle, σ, mean over the readings [arcsec]", DecimalNumber(sigma, 3)),
+        ("compensated angle, σ, RMS over the readings [arcsec]", DecimalNumber(sigma, 3)),
     ]
     for name in data["ranking"]:
         head = f"{FIT_NAMES[name]} {by}{', chosen' if name == chosen else ''} [arcsec]"

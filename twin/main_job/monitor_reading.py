@@ -13,7 +13,7 @@ import numpy as np
 from analysis.arrays import shows
 from analysis.monitor.disturbances import FALSE_ALARM, Consistency, Disturbances, chi_squares, consistency
 from analysis.monitor.estimators import Estimator, applicable, preferred_estimator
-from analysis.monitor.limits import Quantity, posterior_sigma, quantities, unchanged_quantities
+from analysis.monitor.limits import Quantity, posterior_sigma, quantities, split, unchanged_quantities
 from analysis.monitor.monitor_formulas import GroundGeometry
 from analysis.monitor.parameters import CameraCalibration
 from analysis.monitor.recovery import NONLINEAR_SIGMAS, Recovery
@@ -176,6 +176,19 @@ class MonitorReading:
             missing = (quantity.group, quantity.key) in unchanged
             out.setdefault(quantity.group, {})[quantity.key] = None if missing else share
         return out
+
+    @cached_property
+    def repeats_prior(self) -> tuple[str, ...]:
+        """Names of the quantities whose standard deviation the spots reduce by less than 5 %.
+
+        Empty without a prior and without noise.
+        """
+        prior, noise = self.disturbances, self.recovery.shift_covariance[0]
+        if prior is None or not np.any(noise):
+            return ()
+        parts = split(np.stack([one.row for one in self._quantities]), prior, noise, prior.best_gain(noise))
+        unmeasured = (parts.sigma_before > 0.0) & (parts.sigma > UNMEASURED * parts.sigma_before)
+        return tuple(short_text(one) for one, repeated in zip(self._quantities, unmeasured, strict=True) if repeated)
 
     @cached_property
     def consistency(self) -> Consistency | None:
@@ -386,6 +399,8 @@ def worst_checks(readings: Iterable[MonitorReading]) -> tuple[SelfCheck, ...]:
     return tuple(out.values())
 
 
+UNMEASURED = 0.95
+"""Ratio of posterior to prior sigma above which the spots count as not measuring a quantity."""
 SHARE_DECIMALS, OFF_DECIMALS = 3, 1
 """Decimals to which fractions of variances, and linearity errors in sigmas, are rounded in results.
 

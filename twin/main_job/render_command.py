@@ -13,6 +13,7 @@ from rich.table import Table
 from optics.numerics.backend import one_blas_thread
 from scenes.specs.course import moment
 from scenes.specs.resolved import ResolvedJob
+from twin.framework.artefact import decimals_for, fixed, residual_text
 from twin.framework.cli import print_verdict, print_whole, result_table
 from twin.framework.command import Result, print_warnings
 from twin.framework.procedure import Session
@@ -86,7 +87,7 @@ def _numbers(run: JobRun) -> dict[str, Any]:
 def _print_result(run: JobRun, console: Console) -> None:
     """Print the verdict, the table of results, notes and warnings of a run."""
     judgement = judge(run)
-    print_verdict(console, judgement.verdict)
+    print_verdict(console, judgement.verdict, warned=bool(judgement.warnings))
     remarks = list(judgement.more)
     if isinstance(run, RenderRun):
         print_whole(console, _table(run, console.width >= _WIDE))
@@ -151,7 +152,7 @@ def _changes(run: JobRun) -> Table:
         if of != group:
             group = of
             table.add_row(f"[bold]{escape(group)}[/]")
-        table.add_row(escape(one.label), f"{round(value, one.decimals) + 0.0:+.{one.decimals}f}")
+        table.add_row(escape(one.label), fixed(value, one.decimals, sign=True))
     if run.quality is None:
         return table
     for name, camera in run.quality.cameras.items():
@@ -181,20 +182,20 @@ def _table(run: RenderRun, wide: bool) -> Table:
 
     group = ""
     for rows in run.reading.table.by_change():
-        judged_row, p = next(row for row in rows if row.estimator == judged), rows[0].parameter
+        judged_row = next(row for row in rows if row.estimator == judged)
         if judged_row.where != group:
             group = judged_row.where
             table.add_row(f"[bold]{escape(group)}[/]")
-        values = [
-            judged_row.true,
-            *(row.value for row in rows),
-            judged_row.sigma,
-            *([judged_row.noise] if wide else []),
+        finest = min((row.sigma for row in rows if row.sigma > 0.0), default=0.0)
+        cells = [
+            fixed(judged_row.true, decimals_for(finest)),
+            *(_DASH if math.isnan(row.value) else row.shown(row.value) for row in rows),
+            judged_row.shown(judged_row.sigma),
+            *([fixed(judged_row.noise, decimals_for(judged_row.noise))] if wide else []),
+            judged_row.shown(judged_row.error, sign=True),
+            residual_text(judged_row.ratio),
         ]
-        # adding 0.0 after rounding avoids a negative zero
-        cells = [_DASH if math.isnan(value) else f"{round(value, p.decimals) + 0.0:.{p.decimals}f}" for value in values]
-        last_cells = [f"{judged_row.error:+.{p.decimals}f}", f"{round(judged_row.ratio, 1) + 0.0:+.1f}"]
         if math.isnan(judged_row.sigma):
-            last_cells = [_DASH, _DASH]
-        table.add_row(escape(judged_row.parameter.label), *cells, *last_cells)
+            cells[-2:] = [_DASH, _DASH]
+        table.add_row(escape(judged_row.parameter.label), *cells)
     return table

@@ -42,6 +42,8 @@ from twin.main_job.result_sections import (
     done_table,
     facts,
     figure,
+    glance_figure,
+    glance_table,
     residual_section,
     result_tables,
     setup_section,
@@ -157,10 +159,15 @@ def render_report(
         pieces = instrument_drawings(experiment.instrument, experiment.backend, run.state) | drawings(run)
         drawn, _ = without_failed({name: draw() for name, draw in pieces.items() if name not in APART})
     summary, *course_tables = result_tables(run)
+    monitored = run if isinstance(run, RenderRun) else None
+    estimators = None
+    if monitored is not None:
+        estimators = Section("All estimators", (), (summary,), closed=True, name="estimators")
+        summary = glance_table(monitored)
     perturbation, judgement = done_table(run), judge(run)
     bodies = ", ".join(str(row[0]) for row in perturbation.rows)
-    monitored = run if isinstance(run, RenderRun) else None
     parts = (
+        estimators,
         *(course_sections(monitored, drawn, *course_tables) if course_tables and monitored else ()),
         Section(f"What was done{shown_time(run)}", (), (perturbation,), name="done") if perturbation.rows else None,
         setup_section(run),
@@ -187,6 +194,7 @@ def render_report(
             summary,
             tuple(section for section in parts if section is not None),
             warnings=judgement.warnings,
+            glance=glance_figure(monitored, drawn) if monitored else None,
         ),
         _repeat_command(run, backend, bool(pictures)),
         [("Again", AGAIN), ("Backend", f"{backend}, float64")],
@@ -338,6 +346,7 @@ def _of_monitor(run: RenderRun) -> dict[str, Callable[[], Any]]:
         out["temperatures"] = _drawing("series_plots:temperatures_svg", series)
         if series.smoothed is not None:
             out["smoothed"] = _drawing("series_plots:smoothed_svg", series)
+    out["glance"] = _drawing("spot_plots:glance_svg", run)
     out[SUMMARY] = _drawing("spot_plots:summary_png", run)
     out["residuals"] = _drawing("spot_plots:residuals_svg", run)
     return out

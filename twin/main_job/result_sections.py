@@ -229,6 +229,41 @@ def _course_table(run: RenderRun, series: TimeSeries) -> Table:
     )
 
 
+def glance_figure(run: RenderRun, drawn: Mapping[str, str]) -> SvgFigure:
+    """Return the figure of all spots before and after, for the first screen of the page."""
+    caption = (
+        f"Mean of {run.frames} frames. Crosses: measured centres before (light blue) and after (orange-red), "
+        "with their shift below. All images have the same scale and stretch."
+    )
+    return figure(drawn, "glance", caption, f"Spots before and after{shown_time(run)}")
+
+
+def glance_table(run: RenderRun) -> Table:
+    """Return the table of true and recovered changes by the estimator that the verdict uses.
+
+    For a time series it has RMS values over all times.
+    """
+    over, estimator = run.series is not None, run.estimators[run.judged]
+    readings = run.series.readings.rms if run.series is not None else run.reading.table
+    rows: list[list[Cell]] = []
+    bands: dict[int, str] = {}
+    for reading in readings.of(run.judged):
+        heading = part_title(run, reading, nominal=False)
+        if heading not in bands.values():
+            bands[len(rows)] = heading
+        label = Marked(reading.parameter.label, "", "text", hint=reading.parameter.meaning)
+        shown = reading.shown(reading.error if over else reading.value)
+        ratio = residual(reading.error, reading.sigma)
+        cell = residual_cell(f"{shown} ± {reading.shown(reading.sigma)}", ratio, "")
+        rows.append([label, Marked(reading.shown(reading.true), "", "truth"), cell])
+    over_text = "Root mean squares over all times, of errors and of σ. " if over else "± is one σ. "
+    caption = f"{over_text}● within {FAR:g} σ of the truth, ▲ beyond."
+    heads = ("Parameter", "true, RMS" if over else "true", f"error by {estimator.title}" if over else estimator.title)
+    title = f"Recovered by the {estimator.title}"
+    full = _all_digits(run, "glance", readings, over)
+    return Table("glance-table", title, caption, heads, rows, bands=bands, within=IN_PAGE, full=full)
+
+
 def _range(values: np.ndarray, places: int) -> str:
     low, high = (fixed(float(end), places) for end in (values.min(), values.max()))
     low, high = low.strip(MINUS) if not low.strip(f"{MINUS}0.") else low, high

@@ -15,7 +15,7 @@ from matplotlib.ticker import MaxNLocator
 
 from analysis.monitor.estimators import ESTIMATORS
 from twin.framework import svg
-from twin.framework.artefact import FAR, SAME, Marked, Table, residual, significant, tick_text, unit_for_reports
+from twin.framework.artefact import FAR, MINUS, SAME, Marked, Table, residual, significant, tick_text, unit_for_reports
 from twin.framework.frame_store import mean_of
 from twin.framework.report import sentence
 from twin.main_job.render_results import RenderRun
@@ -258,10 +258,66 @@ def _motion_panel(axes: Axes, values: np.ndarray, names: Sequence[str], norm: Sy
     axes.spines[:].set_visible(False)
     deep = np.abs(np.asarray(norm(values)) - 0.5) * 2.0
     for (row, column), value in np.ndenumerate(values):
-        colour = "white" if deep[row, column] > _STRONG else svg.INK
+        # on the colours of the map in the dark, too, where INK would become light
+        colour = "white" if deep[row, column] > _STRONG else "black"
         text = significant(float(value), 2, floor=SAME)
         # the text is inside its panel and must not affect the layout
         axes.text(column, row, text, ha="center", va="center", fontsize=7, color=colour, in_layout=False)
+
+
+GLANCE = 5.9
+"""Width of the figure beside the main table of the page, in inches."""
+
+
+def glance_svg(run: RenderRun) -> str:
+    """Draw the cores of all spots before and after with their shifts, a column for each channel."""
+    with svg.look("glance"):
+        channels = run.experiment.path.channels
+        before, after = mean_images(run)
+        norm = stretch(before)
+        starts, ends = run.recovery.before[0], run.recovery.after[0]
+        windows, half = _windows(run)
+        across = min(max(len(channels), 1), 4)
+        lines = -(-len(channels) // across)
+        figure = svg.new_figure(lines * (2.0 * GLANCE / across + 0.82), {"w_pad": 0.02, "h_pad": 0.02, "wspace": 0.01})
+        figure.set_figwidth(GLANCE)
+        grid = figure.subplots(2 * lines, across, squeeze=False)
+        for axes in grid.ravel():
+            axes.set_axis_off()
+        for i, channel in enumerate(channels):
+            row, column, _ = windows[i]
+            for k, (image, when) in enumerate(((before[i], "before"), (after[i], "after"))):
+                axes = grid[2 * (i // across) + k, i % across]
+                axes.set_axis_on()
+                axes.set_anchor("NS"[k == 0])
+                _core(axes, image, norm, (row, column, half), when)
+                cross(axes, starts[i], svg.BEFORE, 0.22 * half)
+            cross(axes, ends[i], svg.AFTER, 0.22 * half)
+            _scale_bar(axes, run, column, row, half)
+            moved = ends[i] - starts[i]
+            text = f"row {moved[0]:+.3f} px\ncolumn {moved[1]:+.3f} px".replace("-", MINUS)
+            axes.set_xlabel(text, fontsize=9.5)
+            grid[2 * (i // across), i % across].set_title(f"{channel.camera}\n{channel.name}", fontsize=9.5)
+        return svg.to_svg(figure)
+
+
+def _windows(run: RenderRun) -> tuple[list[tuple[float, float, float]], float]:
+    """Return the window on the core of each channel, and the half-width that all pictures share, in pixels."""
+    radius = REACH * airy_radius(run) / 0.75
+    windows = [core_window(*ends, radius) for ends in zip(run.recovery.before[0], run.recovery.after[0], strict=True)]
+    return windows, max((window[2] for window in windows), default=1.0)
+
+
+def _core(axes: Axes, image: np.ndarray, norm: Normalize, window: tuple[float, float, float], when: str) -> None:
+    """Draw the part of a frame in a window (centre and half-width, pixels), labelled with its time."""
+    row, column, half = window
+    first = [max(int(np.floor(centre - half)), 0) for centre in (row, column)]
+    last = [int(np.ceil(centre + half)) + 1 for centre in (row, column)]
+    part = image[first[0] : last[0], first[1] : last[1]]
+    extent = (first[1] - 0.5, first[1] + part.shape[1] - 0.5, first[0] + part.shape[0] - 0.5, first[0] - 0.5)
+    axes.imshow(part, cmap=svg.GRAY, norm=norm, interpolation="none", extent=extent)
+    axes.set(xlim=(column - half, column + half), ylim=(row + half, row - half), xticks=[], yticks=[])
+    axes.text(0.03, 0.97, when, color="white", transform=axes.transAxes, fontsize=9.5, va="top")
 
 
 WIDTH, DPI = 14.0, 100
@@ -293,8 +349,7 @@ def _drawn_summary(run: RenderRun) -> Figure:
     norm = stretch(before)
     positions = run.recovery.before[0], run.recovery.after[0]
     height = picture / sum(heights)
-    windows = [core_window(b, a, REACH * airy_radius(run) / 0.75) for b, a in zip(*positions, strict=True)]
-    half = max(window[2] for window in windows)  # one scale for all pictures
+    windows, half = _windows(run)
     for i, channel in enumerate(channels):
         row, column, _ = windows[i]
         for k, (image, when) in enumerate(((before[i], "before"), (after[i], "after"))):

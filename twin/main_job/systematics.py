@@ -267,12 +267,18 @@ def assumed(reading: MonitorReading) -> str:
 
 
 def _prior_share_text(reading: MonitorReading) -> str:
-    """Return which fractions of the posterior variances are due to the prior, as a range in text."""
+    """Return the shares of the posterior's variances that are due to the prior, and what they mean, as text."""
     shares = [share for group in reading.from_statement.values() for share in group.values() if share is not None]
     if not shares:
         return ""
     ends = list(dict.fromkeys(plain(math.floor(1e3 * end) / 10.0, 4) for end in (min(shares), max(shares))))
-    return f"; {' to '.join(ends)} % of the posterior variances is fixed by the prior: the spots cannot reduce it"
+    text = (
+        f"; {' to '.join(ends)} % of the posterior variances comes from motions that the spots cannot separate: these "
+        "sigmas are only as good as the prior, and more frames do not reduce them"
+    )
+    if reading.repeats_prior:
+        text += f"; the spots do not measure {', '.join(reading.repeats_prior)}: these numbers repeat the prior"
+    return text
 
 
 def contradiction(run: RenderRun) -> tuple[str, ...]:

@@ -28,6 +28,7 @@ from twin.operate.estimate_commands import (
     products,
     report,
     show_estimate,
+    show_headline,
     show_power,
     write_report,
 )
@@ -302,6 +303,8 @@ def status(
     data = {**contents, "warnings": _record_warnings(contents), "estimate": estimate, "open_alarms": opened}
 
     def show(console: Console) -> None:
+        if estimate_of_record is not None:
+            show_headline(call.history, estimate_of_record[0], console)
         _show(data, console)
         if estimate_of_record is not None:
             show_estimate(estimate_of_record[1], rows, console)

@@ -210,10 +210,11 @@ def daily_report(history: History, overview: Overview, end: int) -> Report:
     result = overview.filter_result
     begin = end - DAY
     last = min(end, overview.time)
+    first, *others = overview.headline()
     verdict, lead = answer(
-        overview.state_sentence(),
+        first,
         overview.change_sentence(begin, end, f"on {day_text(begin)}"),
-        *overview.break_sentences(),
+        *others,
         overview.score_sentence(),
         _explained_sentence(overview),
     )
@@ -242,6 +243,7 @@ def daily_report(history: History, overview: Overview, end: int) -> Report:
         state_table(overview),
         tuple(section for section in sections if section is not None),
         warnings=_warnings(overview, end),
+        unmet=overview.unmet,
     )
 
 
@@ -317,7 +319,7 @@ def _changed_section(overview: Overview, begin: int, end: int) -> Section:
     """Return the section on the changes of the day."""
     occurrences = [occurrence for occurrence in overview.changed(begin, end) if not occurrence.again]
     lines = tuple(f"{minute_text(one.time)}: {one.text}" for one in occurrences)
-    what = f"Between {minute_text(begin)} and {minute_text(end)} UTC.{'' if lines else ' Nothing occurrences.'}"
+    what = f"Between {minute_text(begin)} and {minute_text(end)} UTC.{'' if lines else ' Nothing happened.'}"
     shown = (Text("changed", "", "", lines[-MOST_SHOWN:], within=""),) if lines else ()
     return Section("What changed", (what,), shown, name="changed")
 

@@ -234,7 +234,7 @@ def report(
     data = {"report": str(out), "verdict": made.verdict, "warnings": list(made.warnings)}
 
     def show(console: Console) -> None:
-        print_verdict(console, made.verdict)
+        print_verdict(console, made.verdict, unmet=made.unmet, warned=bool(made.warnings))
         print_line(console, f"report: {out}")
 
     call.print_result(data, show)
@@ -289,6 +289,26 @@ def alarm_line(row: Mapping[str, Any]) -> str:
     return f"alarm {row['id']}, {row['time_utc']}, {row['kind']} ({state}): {row['text']}"
 
 
+def show_headline(history: History, operation: Operation, console: Console) -> None:
+    """Print whether the requirements hold, the next violation and the open alarms, the most urgent first.
+
+    Parameters
+    ----------
+    history : History
+        Record of the instrument in operation.
+    operation : Operation
+        Its estimate.
+    console : Console
+        The terminal.
+    """
+    from twin.framework.report import answer
+    from twin.operate.overview import Overview
+
+    overview = Overview.of(history, operation)
+    verdict, _ = answer(*overview.headline())
+    print_verdict(console, verdict, unmet=overview.unmet, warned=bool(overview.filter_result.warnings))
+
+
 def show_estimate(result: FilterResult, rows: Sequence[Mapping[str, Any]], console: Console) -> None:
     """Print the estimate: present values, quality of the predictions, jumps, sensors, excluded entries and alarms.
 
@@ -304,7 +324,7 @@ def show_estimate(result: FilterResult, rows: Sequence[Mapping[str, Any]], conso
     from twin.operate.record.entries import utc_text
 
     scores, count = result.scores, result.readings
-    print_verdict(console, f"estimate at {utc_text(result.time)} from {count} readings of the monitor")
+    print_line(console, f"estimate at {utc_text(result.time)} from {count} readings of the monitor")
     _show_course(result.now, console)
     show_requirements(result, console)
     if scores.components:

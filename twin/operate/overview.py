@@ -340,7 +340,31 @@ class Overview:
         if broken:
             verb, link = ("does", "") if len(broken) == 1 else ("do", "the worst is ")
             return f"{len(broken)} of {len(requirements)} requirements {verb} not hold: {link}{which}"
-        return f"All {len(requirements)} requirements hold; the most critical: {which}"
+        count = "Both" if len(requirements) == 2 else f"All {len(requirements)}"
+        return f"{count} requirements hold now; the most critical: {which}"
+
+    def headline(self) -> tuple[str, ...]:
+        """Return the sentences on requirements and alarms, the most urgent first.
+
+        The first sentence is on a requirement that does not hold, otherwise on the next one to be violated, otherwise
+        on alarms or on the requirements that hold. It includes the number of open alarms.
+        """
+        state, *breaks = (self.state_sentence(), *self.break_sentences())
+        broken = any(not requirement.holds_now for requirement in self.filter_result.requirements)
+        sentences = [state, *breaks] if broken or not breaks else [*breaks, state]
+        if waiting := len(self.open_alarms()):
+            count = f"{waiting} alarms are open" if waiting > 1 else "1 alarm is open"
+            first = sentences[0]
+            urgent = broken or bool(breaks)
+            sentences[0] = f"{first}; {count}" if urgent else f"{count}; {first[0].lower()}{first[1:]}"
+        return tuple(sentences)
+
+    @property
+    def unmet(self) -> bool:
+        """True if a requirement does not hold or is expected to be violated, or an alarm is open."""
+        requirements = self.filter_result.requirements
+        coming = any(not one.holds_now or one.breaks_us is not None for one in requirements)
+        return coming or bool(self.open_alarms())
 
     def change_sentence(self, begin: int, end: int, when: str) -> str:
         """Return the sentence on the changes in a span, counted by kind.
@@ -371,7 +395,7 @@ class Overview:
         ]
         return [
             f"{_capital(self._name(one))} is expected to violate its requirement of {_limit(one)} on "
-            f"{day_text(one.breaks_us or 0)}"
+            f"{day_text(one.breaks_us or 0)}, {_days_text((one.breaks_us or 0) - self.time)} after the newest reading"
             for one in sorted(coming, key=lambda one: one.breaks_us or 0)
         ]
 
@@ -419,6 +443,12 @@ _COUNTED: Mapping[str, tuple[str, str]] = FrozenMap(
 
 def _count_text(count: int, one: str, many: str) -> str:
     return one if count == 1 else many.format(count)
+
+
+def _days_text(span: int) -> str:
+    """Return a span of microseconds in days, or in hours below two days."""
+    days = span / DAY
+    return f"{days:.0f} days" if days >= 2.0 else f"{24.0 * days:.0f} h"
 
 
 def _capital(text: str) -> str:

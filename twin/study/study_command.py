@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -135,12 +136,17 @@ def run_study(
 
 
 def _show(numbers: dict[str, Any], console: Console) -> None:
-    from twin.framework.artefact import cell_text
+    from twin.framework.artefact import cell_text, decimals_for, fixed, unit_for_reports
 
     table = cli.result_table(f"{numbers['name']}: {numbers['runs']} runs, {numbers['failed']} failed")
     for head in ("response", "unit", "mean", "std", "95%", "99.7%"):
         table.add_column(head, justify="left" if head in ("response", "unit") else "right", no_wrap=True)
     for name, r in numbers["responses"].items():
-        table.add_row(name, r["unit"], *(cell_text(r[key]) for key in ("mean", "std", "p95", "p997")))
-    cli.print_verdict(console, numbers["verdict"])
+        # as many digits as the standard error of the mean justifies
+        known = r["std"] is not None and r["std"] > 0.0
+        places = decimals_for(r["std"] / math.sqrt(numbers["runs"])) if known else None
+        values = (r[key] for key in ("mean", "std", "p95", "p997"))
+        cells = (cell_text(v) if v is None or places is None else fixed(v, places) for v in values)
+        table.add_row(name, unit_for_reports(r["unit"]), *cells)
+    cli.print_verdict(console, numbers["verdict"], warned=bool(numbers["warnings"]))
     cli.print_whole(console, table)

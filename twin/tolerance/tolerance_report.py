@@ -29,6 +29,8 @@ from twin.tolerance.tolerance_run import EXACT, LEVELS, MeritResult, ToleranceRu
 
 _FEW = 3
 """Number of tolerances that the verdict names."""
+_MAIN = 0.05
+"""Share of a merit's variance from which the report names a tolerance as a cause of its spread."""
 _LITTLE = 0.01
 """Fraction of the variance of every merit below which the report says that a tolerance may be loosened."""
 _MOST_CURVES = 6
@@ -43,7 +45,7 @@ def tolerance_report(run: ToleranceRun) -> Report:
     with look("tolerance"):
         curves = to_svg(_yield_figure(run))
         bars = to_svg(_share_figure(run))
-    verdict, more = answer(_verdict(run), _dear(run), *_further(run))
+    verdict, more = answer(_designed(run), _verdict(run), *_causes(run), _loose(run), *_further(run))
     sections = (
         Section(
             "Yield",
@@ -103,7 +105,8 @@ def tolerance_report(run: ToleranceRun) -> Report:
         ("seed", str(test.seed)),
     )
     title = f"Tolerances of {run.bench.camera}"
-    return Report(title, verdict, more, facts, _summary(run), sections, warnings=run.warnings)
+    unmet = any(result.passing.judged(result.merit.spec.probability) == "missed" for result in run.merits)
+    return Report(title, verdict, more, facts, _summary(run), sections, warnings=run.warnings, unmet=unmet)
 
 
 def _light(run: ToleranceRun) -> str:
@@ -122,6 +125,25 @@ def _interval(passing: Yield) -> str:
     return f"{_percent(passing.share)} ({100.0 * passing.low:.1f} to {100.0 * passing.high:.1f} %)"
 
 
+def _designed(run: ToleranceRun) -> str:
+    """Return a sentence on the requirements that the designed camera itself misses; empty if it meets all."""
+    missed = []
+    for result in run.merits:
+        spec = result.merit.spec
+        margin = result.nominal - spec.requirement if spec.more_is_better else spec.requirement - result.nominal
+        if margin < 0.0:
+            unit, size = merit_unit(result.merit)
+            limit = f"{'at least' if spec.more_is_better else 'at most'} {plain(spec.requirement / size)}"
+            value = f"{plain(result.nominal / size, 3)} {unit_for_reports(unit)}".rstrip()
+            missed.append(f"{result.merit.name} ({value}, {limit} is required)")
+    if not missed:
+        return ""
+    return (
+        f"The designed camera itself, without errors, misses the requirement on {' and '.join(missed)}: tighter "
+        "tolerances do not help, change the design or the requirement"
+    )
+
+
 def _verdict(run: ToleranceRun) -> str:
     judged = [(result.merit.name, result.passing.judged(result.merit.spec.probability)) for result in run.merits]
     missed, undecided = ([name for name, how in judged if how == status] for status in ("missed", "open"))
@@ -133,26 +155,40 @@ def _verdict(run: ToleranceRun) -> str:
     return text if missed or undecided else f"{text}, and enough meet each single requirement"
 
 
-def _dear(run: ToleranceRun) -> str:
-    """Return a sentence naming the tolerances that cause most of the variance, and those that could be loosened."""
+def _causes(run: ToleranceRun) -> tuple[str, ...]:
+    """Return a sentence for each merit that not every camera meets: the tolerances that cause its spread."""
+    out = []
+    for result in _tight(run):
+        order = sorted(result.shares, key=lambda name: -result.shares[name])
+        dear = [name for name in order[:_FEW] if result.shares[name] >= _MAIN]
+        named = [f"{100.0 * result.shares[name]:.0f} %" for name in dear]
+        spread = f"of the spread (variance) of {result.merit.name}"
+        if len(dear) == 1:
+            out.append(f"{dear[0]} causes {named[0]} {spread}")
+        elif dear:
+            parts = [f"{name} {share}" for name, share in zip(dear, named, strict=True)]
+            out.append(f"{', '.join(parts[:-1])} and {parts[-1]} are the largest causes {spread}")
+    return tuple(out)
+
+
+def _loose(run: ToleranceRun) -> str:
+    """Return a sentence on the tolerances that could be loosened; empty without any."""
     worst = _importance(run)
-    order = sorted(worst, key=lambda name: -worst[name])
-    dear = [f"{name} ({100.0 * worst[name]:.0f} %)" for name in order[:_FEW] if worst[name] > 0.0]
-    loose = [name for name in order if worst[name] < _LITTLE][::-1]
-    text = f"Largest shares of a merit's variance: {', '.join(dear)}" if dear else "No tolerance changes a merit"
-    if loose:
-        named = ", ".join(loose[:_FEW]) + (f" and {len(loose) - _FEW} more" if len(loose) > _FEW else "")
-        text += f"; {named} contribute little and could be loosened"
-    return text
+    loose = sorted((name for name in worst if worst[name] < _LITTLE), key=lambda name: worst[name])
+    if not loose:
+        return ""
+    named = ", ".join(loose[:_FEW]) + (f" and {len(loose) - _FEW} more" if len(loose) > _FEW else "")
+    return f"{named} {'contributes' if len(loose) == 1 else 'contribute'} little and could be loosened"
+
+
+def _tight(run: ToleranceRun) -> list[MeritResult]:
+    """Return the merits that not every camera meets; all merits if every camera meets them."""
+    return [result for result in run.merits if result.passing.share < 1.0] or list(run.merits)
 
 
 def _importance(run: ToleranceRun) -> dict[str, float]:
-    """Return tolerance -> the largest fraction of the variance of any merit that it causes.
-
-    Merits that every camera meets are left out.
-    """
-    tight = [result for result in run.merits if result.passing.share < 1.0] or list(run.merits)
-    return {name: max(result.shares[name] for result in tight) for name in run.bench.entries}
+    """Return each tolerance's largest share of the variance of a merit, over the merits that not every camera meets."""
+    return {name: max(result.shares[name] for result in _tight(run)) for name in run.bench.entries}
 
 
 def _further(run: ToleranceRun) -> list[str]:

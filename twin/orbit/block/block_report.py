@@ -1,4 +1,4 @@
-"""Report and result keys (block.json) of a block adjustment.
+"""Report of a block adjustment.
 
 The report begins with the errors on the ground in metres, then gives the contribution of each sensor and the tests of
 the error laws that the file specifies.
@@ -6,146 +6,25 @@ the error laws that the file specifies.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Sequence
 
 import numpy as np
+from matplotlib.figure import Figure
 
-from analysis.block.block_adjustment import LawTest
-from analysis.block.network import DatumTest, Network, OpenCombination
-from analysis.block.reweighting import GroupTest
-from analysis.orbit.forward_intersection import Accuracy
-from twin.framework.artefact import Table
-from twin.framework.record import Quantity, Record
+from analysis.orbit.forward_intersection import level_axes
+from twin.framework import svg
+from twin.framework.artefact import SvgFigure, Table
 from twin.framework.report import Report, Section, answer
-from twin.orbit.block.block_run import ALL, DATUM_ALARM, BlockRun, CameraChange, SensorContribution
+from twin.orbit.block.block_numbers import ALARM, CHANGE, CONTRIBUTION, GROUP
+from twin.orbit.block.block_run import ALL, DATUM_ALARM, BlockRun
 from twin.orbit.measured.pass_measurements import duplicates, listed
-
-ACCURACY: Record[Accuracy] = Record(
-    "90% errors on the ground.",
-    Quantity("ce90_m", lambda accuracy: accuracy.ce90, "circular error in plan, 90%", "CE90", 3),
-    Quantity("le90_m", lambda accuracy: accuracy.le90, "linear error in height, 90%", "LE90", 3),
-    Quantity("points", lambda accuracy: accuracy.count, "number of points"),
-)
-ALARM = 1e-3
-"""p-value below which one of a run's tests (about ten) raises a warning."""
-CONTRIBUTION: Record[SensorContribution] = Record(
-    "90% errors of the check points with some of the block's sensors.",
-    Quantity("excluded", lambda case: list(case.excluded), "sensors that were not used"),
-    Quantity("predicted", lambda case: case.predicted, "by the points' covariances", "predicted", record=ACCURACY),
-    Quantity("observed", lambda case: case.observed, "by the check points' errors", "observed", record=ACCURACY),
-    Quantity("plan_ratio", lambda case: case.plan, "predicted CE90 over that with all sensors", "plan ×", 2),
-    Quantity("height_ratio", lambda case: case.height, "predicted LE90 over that with all sensors", "height ×", 2),
-    Quantity(
-        "normalised_squared_error",
-        lambda case: case.normalised_squared_error,
-        "mean square of errors over sigmas (chi-square per degree of freedom); 1 where the sigmas are right",
-        "χ²/dof",
-        2,
-    ),
-)
-GROUP: Record[GroupTest] = Record(
-    "Test of a group of observations, or of a law of errors, after the adjustment.",
-    Quantity("observations", lambda group: group.count, "number of observations", "observations"),
-    Quantity("redundancy", lambda group: group.redundancy, "sum of the redundancy numbers", "redundancy", 1),
-    Quantity(
-        "variance_ratio",
-        lambda group: group.ratio if np.isfinite(group.ratio) else None,
-        "variance of the residuals over that expected from the sigmas",
-        "variance ratio",
-        2,
-    ),
-    Quantity("p_value", lambda group: group.p_value, "two-sided p-value of the residuals, approximate", "p", 3),
-    Quantity("factor", lambda group: group.factor, "variance factor, estimated where asked for", "factor", 2),
-)
-LAW: Record[LawTest] = Record(
-    "Test of the independence of errors of readings that the stated law assumes.",
-    Quantity("law", lambda test: test.kind, "stated law"),
-    Quantity("excess_sigma", lambda test: test.excess, "products of neighbouring errors less their expectation, in σ"),
-    Quantity("p_value", lambda test: test.p_value, "probability of an excess at least as large"),
-)
-OPEN: Record[OpenCombination] = Record(
-    "A combination of unknowns that the observations determine less well than the prior.",
-    Quantity("unknowns", lambda combination: list(combination.names), "unknowns of the combination"),
-    Quantity("change", lambda combination: list(combination.change), "change of each for one prior σ, metres, radians"),
-    Quantity(
-        "sigma_ratio", lambda combination: combination.sigma_ratio, "prior σ over the σ of the observations alone"
-    ),
-)
-DATUM: Record[DatumTest] = Record(
-    "Common shift of the control points against the rest of the block: given minus adjusted.",
-    Quantity("east_m", lambda datum: datum.east, "shift east"),
-    Quantity("north_m", lambda datum: datum.north, "shift north"),
-    Quantity("up_m", lambda datum: datum.up, "shift up"),
-    Quantity("sigma_m", lambda datum: list(datum.sigma), "standard deviations of east, north and up"),
-    Quantity("chi_square", lambda datum: datum.chi_square, "chi-square of the shift, three degrees of freedom"),
-)
-NETWORK: Record[Network] = Record(
-    "Connections between the scenes of the block.",
-    Quantity("parts", lambda network: [list(part) for part in network.parts], "scenes connected by shared points"),
-    Quantity("controlled", lambda network: list(network.controlled), "true if the part has control or footprints"),
-    Quantity("alone", lambda network: list(network.alone), "scenes that share no point with another"),
-    Quantity("empty", lambda network: list(network.empty), "scenes without image points"),
-)
-
-
-def _four(get: Callable[[CameraChange], np.ndarray | None], k: int) -> Callable[[CameraChange], Any]:
-    def value(change: CameraChange) -> Any:
-        row = get(change)
-        return None if row is None else row[k]
-
-    return value
-
-
-CHANGE: Record[CameraChange] = Record(
-    "Change of a camera in one scene since its calibration.",
-    *(
-        Quantity(f"{name}_{unit}{end}", _four(get, k), f"{name}{words}", f"{name}{words}", decimals)
-        for k, (name, unit, decimals) in enumerate(
-            (("d_alpha", "arcsec", 3), ("d_beta", "arcsec", 3), ("d_gamma", "arcsec", 3), ("d_f", "um", 2))
-        )
-        for end, words, get in (
-            ("", "", lambda one: one.value),
-            ("_sigma", ", sigma", lambda one: one.sigma),
-            ("_sigma_before", ", prior sigma", lambda one: one.before),
-            ("_true", ", true", lambda one: one.truth),
-        )
-    ),
-)
-BLOCK: Record[BlockRun] = Record(
-    "Content of block.json: the adjustment of a block of scenes.",
-    Quantity(
-        "check_points",
-        lambda run: run.contributions,
-        "case -> check points by the sensors of the case",
-        record=CONTRIBUTION,
-    ),
-    Quantity("sensors", lambda run: list(run.used), "sensors that were used"),
-    Quantity("chi_square", lambda run: run.adjustment.chi_square, "chi-square of all observations and priors"),
-    Quantity("degrees_of_freedom", lambda run: run.adjustment.degrees_of_freedom, "degrees of freedom of chi-square"),
-    Quantity("p_value", lambda run: run.adjustment.p_value, "probability of a chi-square at least as large"),
-    Quantity("agrees", lambda run: run.adjustment.p_value >= ALARM, "true if residuals agree with their sigmas"),
-    Quantity("unknowns", lambda run: len(run.adjustment.x), "number of unknowns beside the points"),
-    Quantity("points", lambda run: int(np.isfinite(run.adjustment.ground[:, 0]).sum()), "number of adjusted points"),
-    Quantity("groups", lambda run: run.adjustment.groups, "group of observations, or law -> its test", record=GROUP),
-    Quantity(
-        "laws",
-        lambda run: {law.group: law for law in run.laws},
-        "law with a course in time -> test of the readings' independence",
-        record=LAW,
-    ),
-    Quantity("datum", lambda run: run.datum, "a common shift of the control points", record=DATUM),
-    Quantity("network", lambda run: run.network, "connections between the scenes", record=NETWORK),
-    Quantity("open", lambda run: list(run.open), "combinations that the priors determine", record=OPEN),
-    Quantity("cameras", lambda run: run.cameras, "scene -> change of its camera", record=CHANGE),
-    Quantity("rejected", lambda run: [list(point) for point in run.rejected], "point and scene of each gross error"),
-)
-
 
 _WEAK = 0.1
 """Observability (prior sigma divided by the sigma from the observations alone) below which a combination of unknowns is
 listed as determined by the priors.
 """
+_FAR_BELOW = 0.5
+"""Ratio of observed to predicted errors below which the report says why the observed ones are so small."""
 
 
 def block_report(run: BlockRun) -> Report:
@@ -166,13 +45,17 @@ def _verdict(run: BlockRun) -> tuple[str, tuple[str, ...]]:
             f"Errors grow most {plan} in plan ({losses[plan][0]:.2f}-fold) and {height} in height"
             f" ({losses[height][1]:.2f}-fold)"
         )
+    where = f"{predicted.count} {'tie' if observed is None else 'check'} points"
     checked = ""
     if observed is not None:
-        checked = f"; at {observed.count} check points, {observed.ce90:.2f} m and {observed.le90:.2f} m"
+        checked = f"; observed are {observed.ce90:.2f} m and {observed.le90:.2f} m"
+        largest = max(observed.ce90 / predicted.ce90, observed.le90 / predicted.le90)
+        if largest < _FAR_BELOW:
+            checked += f", at most {largest:.1g} of the prediction, which covers errors common to all points"
     control = "with" if "control" in run.used else "without"
     return answer(
-        f"Predicted 90% errors on the ground are {predicted.ce90:.2f} m in plan and {predicted.le90:.2f} m in height,"
-        f" {control} ground control{checked}",
+        f"{control} ground control, predicted 90% errors at {where} are {predicted.ce90:.2f} m in plan and"
+        f" {predicted.le90:.2f} m in height{checked}",
         contribution,
         f"chi-square of the residuals is {run.adjustment.chi_square:.0f} for {run.adjustment.degrees_of_freedom}"
         f" degrees of freedom (p = {run.adjustment.p_value:.2g})",
@@ -240,11 +123,67 @@ def _sections(run: BlockRun) -> tuple[Section, ...]:
         (None, 3, 3, 3, 3, 3, 3),
     )
     return (
+        *_ground_section(run),
         Section("Tests of the stated errors", (), (groups,)),
         Section("Cameras", (), (cameras,)),
         Section("Weakly observable combinations", (), (weak,)),
         Section("Check points", (), (points,), folded=1),
     )
+
+
+def _ground_section(run: BlockRun) -> tuple[Section, ...]:
+    """Return the section with the map of the errors at check points and the residuals at control points, if any."""
+    where, errors, _ = run.check
+    block = run.adjustment.assembly.block
+    control = np.flatnonzero((block.points.role == "control") & np.isfinite(run.adjustment.ground).all(axis=1))
+    residuals = np.einsum(
+        "nij,nj->ni",
+        level_axes(run.adjustment.ground[control]),
+        run.adjustment.ground[control] - block.points.start[control],
+    )
+    reference = "given" if run.drawn is None else "true"
+    cases = (
+        (f"check points, adjusted minus {reference}", where, errors),
+        ("control points, adjusted minus given", control, residuals),
+    )
+    shown = [case for case in cases if len(case[1])]
+    if not shown:
+        return ()
+    caption = "Arrows: error in plan. Colours: error in height. Dots: all adjusted points."
+    drawing = svg.drawn("block-ground", _ground_figure, run.adjustment.ground, shown)
+    return (Section("Residuals on the ground", (), (SvgFigure("ground", "", caption, drawing),), name="ground"),)
+
+
+def _ground_figure(ground: np.ndarray, cases: Sequence[tuple[str, np.ndarray, np.ndarray]]) -> Figure:
+    """Draw errors at points on maps, one for each case.
+
+    Parameters
+    ----------
+    ground : (m, 3) ndarray
+        Adjusted coordinates of all points, ITRS, metres; NaN without an adjusted position.
+    cases : sequence of (str, (k,) ndarray, (k, 3) ndarray)
+        Title, indices of the points, and errors east, north and up, in metres.
+    """
+    known = ground[np.isfinite(ground).all(axis=1)]
+    middle = known.mean(axis=0)
+    axes_of_map = level_axes(middle[None])[0, :2]
+    east, north = 1e-3 * axes_of_map @ (ground - middle).T
+    figure = svg.new_figure(5.4)
+    for axes, (title, where, errors) in zip(figure.subplots(1, len(cases), squeeze=False)[0], cases, strict=True):
+        size = float(f"{max(float(np.sqrt(np.mean(np.sum(errors[:, :2] ** 2, axis=1)))), 1e-6):.1g}")
+        extent = float(np.abs(errors[:, 2]).max()) or 1.0
+        axes.plot(east, north, ".", color=svg.GREY, ms=2.0, alpha=0.6)
+        arrows = axes.quiver(
+            east[where], north[where], *errors.T, cmap="viridis", clim=(-extent, extent), width=0.005, scale=12.0 * size
+        )
+        axes.quiverkey(arrows, 0.8, 1.03, size, f"{size:g} m in plan", labelpos="E", coordinates="axes")
+        axes.set_title(f"{len(where)} {title}", loc="left", pad=20)
+        axes.set(xlabel="east [km]", ylabel="north [km]")
+        axes.set_aspect("equal", adjustable="datalim")
+        axes.margins(0.1)
+        svg.gridded(axes)
+        figure.colorbar(arrows, ax=axes, shrink=0.75, label="error in height [m]", location="bottom")
+    return figure
 
 
 def _warnings(run: BlockRun) -> tuple[str, ...]:

@@ -10,6 +10,7 @@ from analysis.orbit.calibration_parameters import OFFSET
 from analysis.orbit.three_line_model import BIAS, misclosure
 from twin.framework import svg
 from twin.orbit.calibration.calibration_run import CalibrationRun
+from twin.orbit.calibration.campaign import FieldPass
 from twin.orbit.calibration.flown_campaign import true_bias
 from twin.orbit.calibration.schemes import RMS, FieldErrors, Monitoring, values_of
 
@@ -176,27 +177,61 @@ def _correlation_figure(run: CalibrationRun) -> Figure:
     return figure
 
 
+def _residuals(run: CalibrationRun, flight: FieldPass, line: str) -> np.ndarray:
+    """Return the residuals of a field's control points in one line after the adjustment, (n, 2), px in x and y."""
+    adjustment, rays = run.together, flight.control.rays[line]
+    names = (f"{flight.name} offset {axis}" for axis in OFFSET)
+    offset = np.array([adjustment.value(name) if name in adjustment.names else 0.0 for name in names])
+    residual = misclosure(
+        adjustment.cameras[line],
+        rays,
+        adjustment.ground[flight.name][rays.point],
+        adjustment.bias(flight.name),
+        flight.control.axes @ offset,
+    )
+    return np.asarray(residual / flight.data.pitch[line])
+
+
+_BINS = 12
+"""Number of parts of a line over which residuals are averaged."""
+
+
+def _along_figure(run: CalibrationRun) -> Figure:
+    """Draw the residuals of all fields' control points over the pixels of each line, with means of its parts."""
+    lines = list(dict.fromkeys(line for flight in run.campaign.passes for line in flight.control.rays))
+    figure = svg.new_figure(4.6)
+    grid = figure.subplots(2, len(lines), sharex="col", sharey="row", squeeze=False)
+    for column, line in zip(grid.T, lines, strict=True):
+        flights = [flight for flight in run.campaign.passes if line in flight.control.rays]
+        pixel = np.concatenate([flight.control_images[line].pixel for flight in flights])
+        residual = np.concatenate([_residuals(run, flight, line) for flight in flights])
+        edges = np.linspace(pixel.min(), pixel.max(), _BINS + 1)
+        part = np.clip(np.digitize(pixel, edges) - 1, 0, _BINS - 1)
+        filled = [k for k in range(_BINS) if np.sum(part == k) > 1]
+        middle = 0.5 * (edges[1:] + edges[:-1])[filled]
+        for axes, values in zip(column, residual.T, strict=True):
+            axes.axhline(0.0, color=svg.GREY, lw=0.7)
+            axes.plot(pixel, values, ".", color=svg.SKY, ms=3.0, alpha=0.7, label="control points of all fields")
+            mean = np.array([values[part == k].mean() for k in filled])
+            error = np.array([values[part == k].std(ddof=1) / np.sqrt(np.sum(part == k)) for k in filled])
+            axes.errorbar(middle, mean, error, fmt="o", color=svg.BLUE, ms=4.0, lw=1.0, label="mean of a part, ±σ")
+            svg.gridded(axes)
+        column[0].set_title(line, loc="left")
+        column[1].set_xlabel("pixel along the line")
+    grid[0, 0].set_ylabel("x, along the track [px]")
+    grid[1, 0].set_ylabel("y, along the line [px]")
+    svg.shared_legend(figure, grid[0, 0])
+    return figure
+
+
 def _residual_figure(run: CalibrationRun) -> Figure:
     """Draw the residuals of the first field's control points in the images of the lines, in pixels."""
     flight = run.campaign.passes[0]
-    adjustment = run.together
-    offset = [
-        adjustment.value(n) if n in adjustment.names else 0.0
-        for n in (f"{flight.name} offset {axis}" for axis in OFFSET)
-    ]
     figure = svg.new_figure(3.9)
     shown = tuple(flight.control.rays)
     panels = figure.subplots(1, len(shown), sharex=True, squeeze=False)[0]
     for axes, line in zip(panels, shown, strict=True):
-        rays, pitch = flight.control.rays[line], flight.data.pitch[line]
-        residual = misclosure(
-            adjustment.cameras[line],
-            rays,
-            adjustment.ground[flight.name][rays.point],
-            adjustment.bias(flight.name),
-            flight.control.axes @ np.array(offset),
-        )
-        residual = residual / pitch
+        residual = _residuals(run, flight, line)
         images = flight.control_images[line]
         arrows = axes.quiver(
             images.pixel,
@@ -268,5 +303,6 @@ FIGURES = {
     "bias-latitude": _latitude_figure,
     "correlation-matrix": _correlation_figure,
     "residuals": _residual_figure,
+    "residuals-along": _along_figure,
     "check-points": _check_figure,
 }

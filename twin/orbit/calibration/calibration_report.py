@@ -9,13 +9,14 @@ import numpy as np
 from analysis.arrays import ARCSEC
 from scenes.specs.orbit.setup import MeasuredCalibrationSetup
 from scenes.yaml.units import ANGLE, LENGTH, format_quantity
+from twin.framework.artefact import decimals_for
 from twin.framework.report import Report, answer
 from twin.orbit.calibration import calibration_sections
 from twin.orbit.calibration.calibration_numbers import CALIBRATION
 from twin.orbit.calibration.calibration_run import CalibrationRun, unit
 from twin.orbit.calibration.campaign import any_effect, light_effects
 from twin.orbit.calibration.influences import UNEXPECTED_SIGMAS, drift_warnings, step_warnings
-from twin.orbit.calibration.schemes import values_of
+from twin.orbit.calibration.schemes import meets, values_of
 from twin.orbit.calibration.screening import intersection_fit
 from twin.orbit.images.simulate_report import changes_text
 from twin.orbit.measured.pass_measurements import duplicates, listed
@@ -43,12 +44,17 @@ def calibration_report(run: CalibrationRun) -> Report:
     # the scheme that averages most fields; in the last one each field uses its own parameters
     scheme = list(run.schemes)[-2:][0]
     after = [values_of(run.schemes[scheme], what).mean() for what in ("plan_rms", "height_rms")]
+    worse = [what for what, was, now in zip(("plan", "height"), (plan, height), after, strict=True) if now > was]
+    how = f"larger in {' and '.join(worse)}" if worse else "smaller"
+    before = decimals_for(min(plan, height), 3)
+    without = "" if not (worse and meets(run.before, limits)) else ", as the laboratory's parameters alone do"
     verdict, more = answer(
-        f"Calibration changes the errors at check points from {plan:.0f} m in plan and {height:.0f} m in height to "
-        f"{after[0]:.2f} m and {after[1]:.2f} m (scheme {scheme}, mean of the fields' RMS)",
+        f"Calibration makes the errors at check points {how}: from {plan:.{before}f} m in plan and "
+        f"{height:.{before}f} m in height to {after[0]:.2f} m and {after[1]:.2f} m "
+        f"(scheme {scheme}, mean of the fields' RMS)",
         f"{('schemes ' if len(good) > 1 else 'scheme ') + ', '.join(good) if good else 'no scheme'} "
         f"{'meet' if len(good) > 1 else 'meets'} the limits of {limits.plan:g} m in plan and {limits.height:g} m in "
-        "height, assumed for 1:50 000, in every field: see the table of schemes",
+        f"height, assumed for 1:50 000, in every field{without}: see the table of schemes",
     )
     lead = (
         *more,
@@ -64,6 +70,7 @@ def calibration_report(run: CalibrationRun) -> Report:
         calibration_sections.summary(run),
         calibration_sections.sections(run, CALIBRATION(run)),
         warnings=_warnings(run),
+        unmet=not good,
     )
 
 

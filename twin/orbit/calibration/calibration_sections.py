@@ -448,7 +448,14 @@ def _parameters(run: CalibrationRun, data: Mapping[str, Any]) -> Section:
     )
     title = f"Residuals of the control points in the images, {campaign.passes[0].name}"
     caption = "Titles: RMS of x and y. The residuals contain noise of the image and of the attitude."
-    return Section("Parameters", (text,), (table, steps, _figure(run, "residuals", title, caption)))
+    along = _figure(
+        run,
+        "residuals-along",
+        "Residuals along the lines, all fields",
+        "A mean that leaves zero over part of a line is an error that the parameters of the interior orientation do "
+        "not describe.",
+    )
+    return Section("Parameters", (text,), (along, table, steps, _figure(run, "residuals", title, caption)))
 
 
 def _fields(run: CalibrationRun) -> Section:

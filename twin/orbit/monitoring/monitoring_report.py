@@ -48,6 +48,11 @@ _DRAWN_PART = 5e-3
 _COLOURS = (svg.BLUE, svg.VERMILION, svg.GREEN, svg.PURPLE, svg.ORANGE, svg.SKY)
 _BESIDE = {"loc": "upper left", "bbox_to_anchor": (1.0, 1.0)}
 """Position of a legend beside the axes, where it does not hide curves."""
+_CONSERVATIVE = 0.5
+"""RMS of errors over their predicted sigmas below which the report calls the sigma conservative.
+
+Errors of one course are correlated, but rarely fall below half of a right sigma at all times.
+"""
 _BODIES, _MOTIONS = 3, 3
 """Largest numbers of bodies, and of motions of each, that the report names for an unobservable mode."""
 _LEAST = 1e-6
@@ -295,11 +300,11 @@ def _verdict(run: MonitorRun) -> tuple[str, tuple[str, ...]]:
     none, chosen, floor = cases["none"], cases["interval"], cases["true"]
     gain = none.height_rms - chosen.height_rms
     others = floor.height_rms**2 > 0.5 * chosen.height_rms**2
-    limit = "images, orbit and attitude" if others else "the remaining errors of the monitor"
+    limit = "images, orbit and attitude" if others else _largest_part(run)
     verdict, more = answer(
         f"Monitoring every {moment(spec.every)} changes the height error from {none.height_rms:.2f} m to "
         f"{chosen.height_rms:.2f} m RMS{'' if gain > 0.0 else ', which is no gain'}",
-        f"with the true cameras {floor.height_rms:.2f} m would remain, so that {limit} cause most of the error",
+        f"with the true cameras {floor.height_rms:.2f} m would remain: most of the error comes from {limit}",
         f"the intersection angle changes by {np.ptp(run.angle_change) / ARCSEC:.2g} arcsec: see the errors over the "
         "course",
         _gain(run),
@@ -324,12 +329,25 @@ def _gain(run: MonitorRun) -> str:
     if not run.smoothing:
         return ""
     chosen = run.smoothed
-    fits = "agrees with" if chosen.agrees else "contradicts"
+    sigma, size = f"{rms(chosen.sigma):.2g} m", rms(chosen.ratios)
+    if not chosen.agrees:
+        fits = (
+            f"this contradicts the predicted sigma of {sigma}: the largest error is {chosen.largest_ratio:.1f} σ, "
+            f"limit {chosen.limit:.1f} σ"
+        )
+    elif size < _CONSERVATIVE:
+        fits = f"the predicted sigma of {sigma} is conservative: the errors are {size:.2g} σ RMS"
+    else:
+        fits = f"this agrees with the predicted sigma of {sigma}: the errors are {size:.2g} σ RMS"
     return (
-        f"smoothing the same measurements reduces the height error by the cameras to "
-        f"{chosen.case.camera_height_rms:.2f} m, {_times(chosen.factor, 'less')} than linear interpolation; this "
-        f"{fits} the predicted sigma of {rms(chosen.sigma):.2f} m"
+        f"smoothing the same measurements changes the height error by the cameras to "
+        f"{chosen.case.camera_height_rms:.2g} m, {_times(chosen.factor, 'less')} than linear interpolation; {fits}"
     )
+
+
+def _largest_part(run: MonitorRun) -> str:
+    """Return the largest part of the monitored cameras' height error in words."""
+    return PARTS[max(run.parts, key=lambda name: rms(run.parts[name]))][0]
 
 
 def _table(run: MonitorRun) -> Table:
@@ -437,9 +455,9 @@ def _rest(run: MonitorRun) -> Section:
         [numbers.CAUSE((run, cause)) for cause in run.causes],
         ("what", "node", "height_without_monitoring_m", "height_left_by_monitor_m"),
     )
-    largest = max(run.parts, key=lambda name: rms(run.parts[name]))
+    size = max(map(rms, run.parts.values()))
     text = (
-        f"Most of the remaining error comes from {PARTS[largest][0]}, {rms(run.parts[largest]):.2g} m RMS. With the "
+        f"Most of the remaining error comes from {_largest_part(run)}, {size:.2g} m RMS. With the "
         f"true four parameters, {1e3 * rms(run.parts['beyond_parameters']):.2g} mm RMS in height and "
         f"{run.residual / ARCSEC:.2g} arcsec at the worst point of a line would remain.",
         *_worse(run),

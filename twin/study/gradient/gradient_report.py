@@ -379,7 +379,7 @@ def _work(setup: StudySetup, session: procedure.Session) -> command.Result:
 
 
 def _print_result(gradient: Gradient, warnings: Sequence[str], console: Console) -> None:
-    cli.print_verdict(console, verdict(gradient)[0])
+    cli.print_verdict(console, verdict(gradient)[0], warned=bool(warnings))
     table = cli.result_table(f"{len(gradient.responses)} responses by {len(gradient.factors)} factors")
     picked = [0, 1, 2, 3, 4, 5, 8]
     heads = ("response", "strongest factor", "derivative", "unit", "per spread", "all, rss", "AD-diff.")

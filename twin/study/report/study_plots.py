@@ -78,6 +78,11 @@ def thinned(good: np.ndarray, most: int = MOST_POINTS) -> np.ndarray:
     return indices if len(indices) <= most else indices[np.linspace(0, len(indices) - 1, most).astype(int)]
 
 
+def dot_size(count: int) -> float:
+    """Return the size of each of so many points, in points: large for few, small where many overlap."""
+    return float(np.clip(60.0 / np.sqrt(max(count, 1)), 2.5, 7.0))
+
+
 def jitter(series: Series, seed: int) -> np.ndarray:
     """Return random offsets of plotted points, (runs,), that keep points with the same text from hiding each other."""
     if not series.numeric:
@@ -212,7 +217,8 @@ def _partner(factor: Factor, factors: Sequence[Factor]) -> Factor | None:
 def _binned(axes: Axes, factor: Factor, response: Response) -> None:
     """Plot runs, means of neighbouring runs with their intervals, and the middle 68 % of the runs."""
     shown = thinned(response.good)
-    axes.plot(factor.values[shown], response.values[shown], ".", color=GREY, ms=2.0, alpha=0.5, zorder=1)
+    size = dot_size(len(shown))
+    axes.plot(factor.values[shown], response.values[shown], ".", color=GREY, ms=size, alpha=0.7, zorder=1)
     groups = list(bins(factor, response.good))
     if len(groups) < 2 or min(len(group) for group in groups) < 3:
         return
@@ -288,10 +294,10 @@ def scatter_figure(analysis: StudyAnalysis, pairs: Sequence[tuple[str, str]]) ->
     return figure
 
 
-def _points(axes: Axes, x: Series, y: Series, seed: int, size: float = 3.0) -> None:
+def _points(axes: Axes, x: Series, y: Series, seed: int) -> None:
     x_positions, y_positions = positions(x) + jitter(x, seed), positions(y) + jitter(y, seed + 1)
     shown = thinned(np.isfinite(x_positions) & np.isfinite(y_positions))
-    axes.plot(x_positions[shown], y_positions[shown], ".", color=BLUE, ms=size, alpha=0.6)
+    axes.plot(x_positions[shown], y_positions[shown], ".", color=BLUE, ms=dot_size(len(shown)), alpha=0.7)
 
 
 _WAYS = {"min": "small is good", "max": "large is good"}
@@ -303,7 +309,15 @@ def pareto_figure(analysis: StudyAnalysis) -> Figure:
     for axes, front in zip(grid, analysis.fronts, strict=True):
         x, y = analysis.runs.find(front.spec.x), analysis.runs.find(front.spec.y)
         shown = thinned(front.ranks > 0, 1000)
-        axes.plot(x.values[shown], y.values[shown], ".", color=GREY, ms=3.5, alpha=0.6, label="dominated runs")
+        axes.plot(
+            x.values[shown],
+            y.values[shown],
+            ".",
+            color=GREY,
+            ms=dot_size(len(shown)),
+            alpha=0.7,
+            label="dominated runs",
+        )
         if len(front.runs):
             # nothing is known between two runs of the front, so it is drawn as steps
             axes.step(front.x, front.y, where="post", color=BLUE, lw=1.0)
