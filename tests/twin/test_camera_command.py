@@ -30,7 +30,6 @@ from tests.twin.test_blurred_cameras import GF7, gf7_with
 from twin.camera import camera_plots
 from twin.camera.__main__ import app
 from twin.camera.camera_optics import CameraOptics
-from twin.camera.camera_plots import distortion_figure
 from twin.camera.camera_run import aberration_name, find_focus, perturbed_text, refocus_text, run_camera, verdict
 from twin.camera.field_maps import distortion
 from twin.design.__main__ import app as design_app

@@ -279,7 +279,7 @@ def _third_order(run: CameraRun) -> Section:
     text = (
         "Seidel sums of the nominal camera about its axis, as wavefront coefficients at the rim of the stop and the "
         "corner of the field that is farthest from the axis. Surfaces with large terms of opposite signs are sensitive "
-        f"to alignment. Petzval curvature {plain(third.sums.petzval, 4)} /m."
+        f"to alignment. Petzval curvature {significant(third.sums.petzval, 4, floor=1e-9)} /m."
     )
     table = Table("third-order", "Coefficients by surface", "Waves.", heads, rows, (None, *[3] * (len(heads) - 1)))
     return Section(title, (text,), (table,))

@@ -23,7 +23,9 @@ from optics.geometry.tree import ORIGIN, State
 from optics.numerics.backend import Backend, load_backend
 from optics.numerics.number_tree import FrozenMap
 from scenes.models.camera_design import with_plane
+from scenes.models.camera_model import focal_plane_body
 from scenes.models.camera_sharpness import blur_warnings
+from scenes.models.job_state import motions_of
 from scenes.specs.course import noll
 from scenes.specs.job import JobSpec, PerturbationSpec, checked_nodes, with_tables
 from scenes.specs.load import INSTRUMENTS, find_disturbances, is_path, library_names
@@ -34,6 +36,7 @@ from scenes.specs.resolved import ResolvedJob, resolve, resolve_job
 from scenes.yaml.errors import InputError, Issue, Problem, names_text, nearest, shown, unknown
 from scenes.yaml.spec import validate
 from scenes.yaml.yaml_file import YamlFile, read_yaml
+from twin.camera.camera_optics import CameraOptics
 from twin.camera.camera_run import find_focus
 from twin.camera.camera_view import CameraView
 from twin.camera.first_order_data import FIRST_ORDER, first_order_data
@@ -141,7 +144,7 @@ class CameraTwin(CameraView):
         Raises
         ------
         InputError
-            The camera is perturbed or as built, or its light has no focus after the last mirror.
+            The camera's light has no focus after the last mirror.
         """
         return CameraTwin.of(self.twin.refocused(self.name, tilt), self.name, self.obstruction)
 
@@ -521,7 +524,8 @@ class InstrumentTwin:
     def refocused(self, camera: str = "", tilt: bool = False) -> InstrumentTwin:
         """Return this instrument with the image plane of a camera at the least mean square error over its field.
 
-        The plane of the prescription moves, in every camera of the instrument that has this prescription.
+        In the nominal state the plane of the prescription moves, in every camera of the instrument that has this
+        prescription. In another state the camera's focal plane moves, which ``perturbed_by`` then lists.
 
         Parameters
         ----------
@@ -533,16 +537,21 @@ class InstrumentTwin:
         Raises
         ------
         InputError
-            There is no such camera, the instrument is perturbed or as built, or the light has no focus.
+            There is no such camera, or the light has no focus.
         """
-        resolved, mounted = self.resolved, self.resolved.instrument.cameras[self._camera_name(camera)].camera
-        if resolved.job.perturb or resolved.instrument.as_built:
-            text = "refocusing applies to a nominal camera, and this one is perturbed or as built"
-            raise InputError(Issue(text, found=self.perturbed_by or "as built", allowed="a nominal instrument"))
-        design, backend = resolved.cameras[mounted], self._bench.backend
-        moved = with_plane(design, find_focus(design, backend, tilt).after)
-        cameras = FrozenMap({**resolved.cameras, mounted: moved})
-        return InstrumentTwin.of(resolved.model_copy(update={"cameras": cameras}), self._bench.name)
+        name, resolved, backend = self._camera_name(camera), self.resolved, self._bench.backend
+        mounted = resolved.instrument.cameras[name].camera
+        if not resolved.job.perturb and not resolved.instrument.as_built:
+            design = resolved.cameras[mounted]
+            moved = with_plane(design, find_focus(CameraOptics.alone(design, backend), tilt).after)
+            cameras = FrozenMap({**resolved.cameras, mounted: moved})
+            return InstrumentTwin.of(resolved.model_copy(update={"cameras": cameras}), self._bench.name)
+        optics = self.camera(name)
+        plane = focal_plane_body(optics.path.root)
+        own = motions_of(checked_nodes(resolved.job, self._nodes)).get(plane)
+        others = {node: keys for node, keys in dict(self._plain.get("perturb") or {}).items() if node != plane}
+        unmoved = self._with_job({**self._plain, "perturb": others}) if own is not None else self
+        return unmoved.perturbed(*find_focus(optics, tilt, name, own).words)
 
     def to_yaml(self) -> str:
         """Return the text of a self-contained job file for this instrument, for `load` and the commands."""
