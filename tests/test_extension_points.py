@@ -15,6 +15,7 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, fields, replace
 from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, ClassVar
 
 import numpy as np
@@ -33,6 +34,8 @@ from analysis.arrays import ARCSEC
 from analysis.monitor import recovery
 from analysis.monitor.estimators import Estimator
 from analysis.monitor.parameters import CameraCalibration, Parameter
+from analysis.monitor.recovery import measure_spots
+from analysis.spots import Centroid
 from analysis.spots.centroid import gaussian_fit, mean_frames
 from analysis.spots.noise import NoiseModel
 from optics.geometry.aperture import Circle
@@ -245,6 +248,9 @@ def test_a_centroid(monkeypatch: pytest.MonkeyPatch) -> None:
     add(monkeypatch, CENTROIDS, "again", AGAIN)
     assert validate(JobSpec, parse_yaml(job)).analysis.centroid == "again"
     assert json_schema("job")["$defs"]["AnalysisSpec"]["properties"]["centroid"]["enum"][-1] == "again"
+    add(monkeypatch, CENTROIDS, "bare", Centroid("bare", lambda *_: SimpleNamespace(gain_maps=None, light_dn=None)))
+    with pytest.raises(EntryPointError, match="the centroid 'bare' returns positions without gain_maps"):
+        measure_spots(np.zeros((1, 8, 8)), 1, SimpleNamespace(noise=None, template=None), "bare")
 
 
 READINGS = "analysis.monitor.parameters.CAMERA_PARAMETERS"

@@ -116,7 +116,7 @@ def examine(quick: bool = False) -> list[Check]:
         )
     if not quick:
         checks.append(_gpu())
-    return [*checks, *_versions(), *_lock()]
+    return [*checks, *_versions(), *_lock(), *_extensions()]
 
 
 def _python() -> Check:
@@ -218,6 +218,26 @@ def _versions() -> list[Check]:
         checks.append(
             Check(spec.name, *(("ok", version) if good else ("note", f"{version}, required {spec.specifier}")))
         )
+    return checks
+
+
+def _extensions() -> list[Check]:
+    """Name the entries that other installed distributions add to tables; no check without any.
+
+    An entry of a group that no table has is never read, so that a misspelt group would go unnoticed.
+    """
+    from optics.numerics.extension_table import GROUPS, PREFIX, entries
+    from scenes.yaml.errors import nearest
+
+    checks = []
+    for entry in entries():
+        group = entry.group.removeprefix(PREFIX)
+        if group in GROUPS:
+            checks.append(Check("extension", "ok", str(entry)))
+        else:
+            near = nearest(group, GROUPS)
+            hint = f"did you mean {PREFIX}{near}?" if near else f"allowed: {', '.join(GROUPS)}"
+            checks.append(Check("extension", "note", f"{entry} is not used, no such group of entry points; {hint}"))
     return checks
 
 

@@ -43,6 +43,7 @@ from analysis.spots import CENTROIDS
 from analysis.spots.centroid import mean_frames
 from analysis.spots.likelihood import FALSE_ALARM, FitStates, fit_states, require_convergence, widened
 from analysis.spots.spot_positions import NoiseParts, SpotPositions, difference_covariance, noise_parts
+from optics.numerics.extension_table import EntryPointError
 
 ALIKE = 2.0
 """Largest ratio of a spot core's chi-square per degree of freedom to the variance of the frames' noise (in units of the
@@ -577,12 +578,18 @@ def measure_spots(
     ------
     SpotError
         A spot cannot be measured, or its fit does not converge.
+    EntryPointError
+        The method of another distribution returns positions without `gain_maps` and `light_dn`.
     """
     if centroid not in CENTROIDS:
         raise ValueError(f"recovery: no centroid {centroid!r}; there are {', '.join(CENTROIDS)}")
-    return require_convergence(
-        CENTROIDS[centroid].measure(mean, frames, calibration.noise, calibration.template, threads)
-    )
+    positions = CENTROIDS[centroid].measure(mean, frames, calibration.noise, calibration.template, threads)
+    if positions.gain_maps is None or positions.light_dn is None:
+        raise EntryPointError(
+            f"the centroid {centroid!r} returns positions without gain_maps or light_dn, from which the covariances of "
+            "all readings follow; its method has to return both"
+        )
+    return require_convergence(positions)
 
 
 def judged_spots(

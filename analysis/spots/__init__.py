@@ -31,7 +31,8 @@ class Centroid:
         Name shown to readers.
     measure : callable
         Function of the mean frames of B spots ((B, H, W), DN), the number of frames averaged into each, the detector's
-        noise model, the calibrated spot shapes and the number of threads, that returns the spots' positions.
+        noise model, the calibrated spot shapes and the number of threads, that returns the spots' positions with their
+        `gain_maps` and `light_dn`.
     """
 
     title: str

@@ -13,6 +13,12 @@ from typing import Any, TypeVar
 PREFIX = "space_camera_twin" + "."
 """First part of the names of entry-point groups that extend a table; the name of the table follows."""
 
+GROUPS = (
+    "camera_parameters", "centroids", "check_groups", "estimators", "forces", "frame_formats", "noise_terms",
+    "procedures", "reflectors", "report_sections", "sag_terms", "samplers", "study_formats", "table_formats", "targets",
+)  # fmt: skip
+"""Names of all tables, which are those of the groups of entry points without ``PREFIX``."""
+
 Value = TypeVar("Value")
 
 
@@ -67,6 +73,7 @@ class ExtensionTable(UserDict[str, Value]):
     """
 
     def __init__(self, name: str, own: Mapping[str, Value], kind: Any = Callable) -> None:
+        assert name in GROUPS, name
         self.group = PREFIX + name
         self._own, self._kind = own, kind
 

@@ -236,7 +236,8 @@ def foreign_minus(text: str) -> Problem:
 def format_quantity(value: float, kind: Kind, within: float = 0.0) -> str:
     """Return text for an SI value that `parse_quantity` reads back to exactly the same float.
 
-    A unit in which the number lies between 1 and 1000 is preferred, then one with few digits, then the earlier one.
+    A unit in which the number lies between 1 and 1000 is preferred, then one without a power of ten, then one with few
+    digits, then the earlier one.
 
     Parameters
     ----------
@@ -260,9 +261,9 @@ def format_quantity(value: float, kind: Kind, within: float = 0.0) -> str:
         number = _shortest_number(value, unit, kind, within)
         if number is not None:
             handy = number == "0" or 1.0 <= abs(float(number)) < 1000.0
-            choices.append((not handy, len(number.strip("-").replace(".", "")), f"{number} {unit}"))
+            choices.append((not handy, "e" in number, len(number.strip("-").replace(".", "")), f"{number} {unit}"))
     # The SI unit has factor one, so it always works.
-    return min(choices, key=lambda choice: choice[:2])[2] if choices else f"{value!r} {kind.si or 'dimensionless'}"
+    return min(choices, key=lambda choice: choice[:3])[3] if choices else f"{value!r} {kind.si or 'dimensionless'}"
 
 
 def split_quantity(text: object) -> tuple[float, str] | None:

@@ -85,6 +85,14 @@ def test_text_comes_out_as_it_went_in() -> None:
         assert tuple(units.format_quantity(units.parse_quantity(text, kind), kind) for text in texts) == texts
 
 
+def test_lengths_above_a_kilometre_have_no_power_of_ten() -> None:
+    assert [units.format_quantity(value, units.LENGTH) for value in (6e3, 5e5, -7e6)] == [
+        "6000 m",
+        "500000 m",
+        "-7000000 m",
+    ]
+
+
 def test_no_text_for_what_is_not_finite() -> None:
     for value in (math.nan, math.inf, -math.inf):
         with pytest.raises(ValueError, match="has no text"):

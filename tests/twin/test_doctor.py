@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from packaging.requirements import Requirement
 
+from optics.numerics.extension_table import PREFIX, Entry
 from optics.numerics.llvm import VARIABLE, LibraryMissing, ensure_llvm, find_llvm
 from twin import doctor
 from twin.framework import doctor_probe, lock_file
@@ -157,3 +158,13 @@ def test_packages_that_are_not_as_locked_are_told(missing, other, unknown, statu
     assert [(one.status, one.detail[:24]) for one in doctor._lock()] == [("failed", "cannot be read: a.txt:1:")]
     monkeypatch.setattr(lock_file, "FOLDER", Path("/nowhere"))
     assert doctor._lock() == []
+
+
+def test_extensions_are_listed_and_a_misspelt_group_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    """An entry of a group that no table has is never read; nothing else would say so."""
+    made = [Entry("toy", "1.0", f"{PREFIX}{group}", "half", "toy:Half") for group in ("estimators", "estimator", "xyz")]
+    monkeypatch.setattr("optics.numerics.extension_table.entries", lambda: tuple(made))
+    good, near, far = doctor._extensions()
+    assert (good.status, near.status, far.status) == ("ok", "note", "note")
+    assert near.detail.endswith(f"no such group of entry points; did you mean {PREFIX}estimators?")
+    assert "allowed: camera_parameters, centroids" in far.detail

@@ -259,6 +259,21 @@ def test_a_script_gets_a_commands_run_folder(name: str, file: Path | str, shot: 
         assert manifests[0].get(key) == manifests[1].get(key), key
 
 
+@pytest.mark.second
+def test_another_camera_of_a_test_is_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The camera that is named is the one that is measured, not that of the file."""
+    monkeypatch.setattr(
+        "twin.scripting.procedures.performed", lambda procedure, setup, *_: pytest.fail(setup.camera.name)
+    )
+    other = tmp_path / "other.yaml"
+    other.write_text((LIBRARY / "cameras/gf7.yaml").read_text("utf-8").replace("name: gf7", "name: other"), "utf-8")
+    for changes, name in (({}, "gf7"), ({"camera": str(other)}, "other")):
+        with pytest.raises(pytest.fail.Exception, match=f"^{name}$"):
+            twin.perform("lab focus", "focus", **changes)
+    with pytest.raises(twin.InputError, match="no such name"):
+        twin.perform("lab focus", "focus", camera="nowhere")
+
+
 def test_wrong_names_are_explained(pair: twin.InstrumentTwin) -> None:
     for call, words in (
         (lambda: twin.load("gf7_par"), "did you mean 'gf7_pair'"),

@@ -281,7 +281,7 @@ def test_an_allocation_is_the_cheapest_that_keeps_its_margin(target: float, real
 def told_warnings(**changes: Any) -> list[str]:
     """Return the warnings of a run of 40 good cameras with one compensator, but for what is changed."""
     own: dict[str, Any] = {
-        "lost": [], "unlit": "", "settled": 0.0, "paired": True, "level": 1.0, "moves": 0.5, "plan": None,
+        "lost": [], "unlit": "", "settled": 0.0, "paired": True, "level": 1.0, "moves": 0.5, "plan": None, "varied": 2,
     }  # fmt: skip
     own |= changes
     merit = SimpleNamespace(merit=SimpleNamespace(name="w"), levels=(1.0,) * 3, linear=(own["level"],) * 3)
@@ -289,7 +289,7 @@ def told_warnings(**changes: Any) -> list[str]:
     return tolerance_run._warnings(
         SimpleNamespace(
             entries={"tilt": (0,)},
-            numbers=(None,),
+            numbers=(None,) * own["varied"],
             ranges=np.array([1.0]),
             compensators=(SimpleNamespace(name="focus"),),
         ),
@@ -304,6 +304,10 @@ def told_warnings(**changes: Any) -> list[str]:
         None if own["plan"] is None else Yield.count(np.arange(40) < 36),
         AllocationSpec(target=0.9),
     )
+
+
+def test_one_parameter_has_no_mixed_terms_to_omit() -> None:
+    assert told_warnings(paired=False, varied=1, level=1.04, moves=0.99) == []
 
 
 @pytest.mark.parametrize("text", [None, *TEXTS["warnings"]])

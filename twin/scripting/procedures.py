@@ -102,7 +102,7 @@ def perform(
         Backend that traces the rays, ``llvm`` or ``cuda``.
     changes : keyword arguments
         Keys of the test's file with other values, for ``camera`` and ``uncertainty`` those of the run's config.yaml; a
-        mapping replaces single keys of a mapping.
+        mapping replaces single keys of a mapping. A key that refers to another file, such as ``camera``, is read anew.
 
     Raises
     ------
@@ -118,7 +118,10 @@ def perform(
         tree = _merged(tree, changes if test is None else {"test": changes})
         setup = validate(type(setup), YamlFile("", tree, {}))
         if test is not None:
-            setup = setup.model_copy(update={"test": setup.test.with_source(Source(test.source.file))})
+            changed = setup.test.with_source(Source(test.source.file))
+            setup = setup.model_copy(update={"test": changed})
+            if any(key in type(setup).model_fields for key in changes):  # another camera, turntable, instrument
+                setup = type(setup).model_construct(**{"test": changed, **type(setup).parts(changed)}).checked()
     setup, number, options = seeded(procedure, setup, seed)
     started, clock = time.time(), time.monotonic()
     run, warnings = performed(procedure, setup, load_backend(backend), number)

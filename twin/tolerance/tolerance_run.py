@@ -399,7 +399,7 @@ def _warnings(
         out.append(
             f"the adjustments of {unsettled} cameras have not converged: their merits may be better than reported"
         )
-    if not sensitivity.model.paired:
+    if not sensitivity.model.paired and len(bench.numbers) > 1:  # one has no mixed terms
         out.append(f"{len(bench.numbers)} parameters vary: the second order omits their mixed terms")
     for result in merits:
         level = result.levels[1]
