@@ -73,7 +73,6 @@ class ExtensionTable(UserDict[str, Value]):
     """
 
     def __init__(self, name: str, own: Mapping[str, Value], kind: Any = Callable) -> None:
-        assert name in GROUPS, name
         self.group = PREFIX + name
         self._own, self._kind = own, kind
 

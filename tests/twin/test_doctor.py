@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from packaging.requirements import Requirement
 
-from optics.numerics.extension_table import PREFIX, Entry
+from optics.numerics.extension_table import GROUPS, PREFIX, Entry
 from optics.numerics.llvm import VARIABLE, LibraryMissing, ensure_llvm, find_llvm
 from twin import doctor
 from twin.framework import doctor_probe, lock_file
@@ -165,6 +165,8 @@ def test_extensions_are_listed_and_a_misspelt_group_is_named(monkeypatch: pytest
     made = [Entry("toy", "1.0", f"{PREFIX}{group}", "half", "toy:Half") for group in ("estimators", "estimator", "xyz")]
     monkeypatch.setattr("optics.numerics.extension_table.entries", lambda: tuple(made))
     good, near, far = doctor._extensions()
+    page = Path(doctor.__file__).parents[1] / "docs/architecture.md"
+    assert all(f"| `{group}` |" in page.read_text("utf-8") for group in GROUPS)  # where to add
     assert (good.status, near.status, far.status) == ("ok", "note", "note")
     assert near.detail.endswith(f"no such group of entry points; did you mean {PREFIX}estimators?")
     assert "allowed: camera_parameters, centroids" in far.detail

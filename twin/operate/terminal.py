@@ -166,7 +166,7 @@ class Call:
 
     @property
     def without_plan(self) -> str:
-        """What to do where a command needs a plan of operation and the record has none."""
+        """Message for a record without a plan of operation, with the command that stores one."""
         return (
             f"the record has no plan of operation; name one, or store one: python -m twin.operate init RECORD "
             f"{self.history.name} --plan FILE"
