@@ -893,7 +893,7 @@ def find_jitter(
     Returns
     -------
     Lines
-        Oscillations, K of them: `frequency` (K,), `amplitude` and `phase` (K, A) with `frequency_sigma` and
+        Oscillations, K of them: `frequency` (K,), ``amplitude`` and `phase` (K, A) with `frequency_sigma` and
         `amplitude_sigma`, strongest first.
 
     Raises
