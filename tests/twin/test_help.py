@@ -13,7 +13,7 @@ from twin.validation import registry
 
 TAUGHT = (
     "twin.render twin.live twin.recover twin.lab twin.orbit twin.study twin.design twin.validate twin.compare"
-    " twin.doctor analysis.mtf scenes.schema"
+    " twin.doctor twin.show analysis.mtf scenes.schema"
 ).split()
 OPENED = ("job", "study")
 """Kinds of files that twin.live opens beside the commands that read them."""
