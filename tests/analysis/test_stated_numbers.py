@@ -86,7 +86,7 @@ def test_many_degrees_of_freedom_are_the_normal_statement() -> None:
     for k in range(3):
         assert tail.held[k] == pytest.approx((k + 1) * sigma, rel=2e-3)
     assert tail.beyond == pytest.approx(np.full(4, 0.0027), rel=0.02)
-    refuses(ValueError, "above 2 degrees", heavy_tails, ROWS, STATED, NOISE, GAIN, 2.0)
+    refuses(ValueError, "more than 2 degrees of freedom", heavy_tails, ROWS, STATED, NOISE, GAIN, 2.0)
 
 
 def test_a_body_that_moves_no_spot_is_found() -> None:
