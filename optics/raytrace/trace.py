@@ -19,7 +19,8 @@ coordinates with respect to every number of every system, however many there are
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+import gc
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from threading import local
@@ -607,8 +608,27 @@ def _recorded(plan: _TracePlan, form: Any) -> Any:
         def through(numbers: Any, rays: Any, shared: Any, run: Any = recorded) -> Any:
             return run(numbers, rays, shared)
 
-        function = recordings[plan] = through
+        function = recordings[plan] = _without_collection(through)
     return function
+
+
+def _without_collection(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Return a function that calls another one while Python does not collect cyclic garbage.
+
+    Garbage may hold arrays with NumPy's memory. Dr.Jit cannot record that such memory is freed: it throws an exception
+    in a destructor, which ends the process.
+    """
+
+    def call(*arguments: Any) -> Any:
+        collecting = gc.isenabled()
+        gc.disable()
+        try:
+            return function(*arguments)
+        finally:
+            if collecting:
+                gc.enable()
+
+    return call
 
 
 def require_rays(valid: np.ndarray, name: str) -> None:
