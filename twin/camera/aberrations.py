@@ -185,25 +185,24 @@ def point_images(optics: CameraOptics) -> PointImages:
     AimError, BeamMissedError, ValueError
         The light is lost, edges cut a pupil into too many pieces, or a wavefront is too irregular.
     """
-    *psfs, perfect = spectral_psfs(optics, IMAGE_FIELDS, np.array([optics.wavelength]), np.ones(1), perfect=True)
+    images = spectral_psfs(optics, IMAGE_FIELDS, np.array([optics.wavelength]), np.ones(1), perfect=True)
+    centres = [_centroid(psf) for psf in images]
     # circles about every centroid within all samples
-    radius = np.linspace(0.0, 0.98 * min(map(_room, psfs)), ENERGY_POINTS)
-    encircled, ensquared, pixel = [], [], []
-    half = 0.5 * optics.model.spec.line.pitch
-    for psf in psfs:
-        step = float(psf.position[1] - psf.position[0])
-        encircled.append(encircled_energy(psf.values, step, radius))
-        ensquared.append(ensquared_energy(psf.values, step, radius))
-        pixel.append(float(ensquared_energy(psf.values, step, half)[0]))
-    limit = encircled_energy(perfect.values, float(perfect.position[1] - perfect.position[0]), radius)
-    return PointImages(tuple(psfs), radius, np.array(encircled), np.array(ensquared), limit, np.array(pixel))
+    room = min(float(psf.position[-1]) - max(map(abs, centre)) for psf, centre in zip(images, centres, strict=True))
+    radius = np.linspace(0.0, 0.98 * room, ENERGY_POINTS)
+    step = [float(psf.position[1] - psf.position[0]) for psf in images]
+    encircled = [encircled_energy(psf.values, d, radius, at) for psf, d, at in zip(images, step, centres, strict=True)]
+    widths = [*radius, 0.5 * optics.model.spec.line.pitch]
+    squares = np.array(
+        [ensquared_energy(psf.values, d, widths, at) for psf, d, at in zip(images[:-1], step, centres, strict=False)]
+    )
+    return PointImages(images[:-1], radius, np.array(encircled[:-1]), squares[:, :-1], encircled[-1], squares[:, -1])
 
 
-def _room(psf: Psf) -> float:
-    """Return the radius of the largest circle about the centroid of a point image within its samples, metres."""
-    total = np.sum(psf.values)
-    centroid = [float(np.sum(psf.values.sum(axis=axis) * psf.position) / total) for axis in (0, 1)]
-    return float(psf.position[-1]) - max(map(abs, centroid))
+def _centroid(psf: Psf) -> tuple[float, float]:
+    """Return the centroid of a point image, along the line and along the track, from the middle of its grid, metres."""
+    along, across = (float(np.average(psf.position, weights=psf.values.sum(axis=axis))) for axis in (0, 1))
+    return along, across
 
 
 ENERGY: Record[PointImages] = Record(
