@@ -81,7 +81,7 @@ def main(
     """
     errors = Console(stderr=True)
     with cli.explained(errors):
-        from scenes.specs.file_kinds import file_kinds, kinds_of
+        from scenes.specs.file_kinds import content_of, file_kinds, kinds_of
         from scenes.yaml.errors import InputError, Issue
         from scenes.yaml.yaml_file import read_yaml
 
@@ -91,8 +91,7 @@ def main(
             allowed = ", ".join(kind.what for kind in kinds or file_kinds())
             raise InputError(Issue("it is not clear what kind of file this is", str(file), allowed=allowed))
         (kind,) = kinds
-        inner = next((data[key] for key in ("job", "study", "test") if isinstance(data.get(key), Mapping)), data)
-        rows = described(inner, kind)
+        rows = described(content_of(data), kind)
     reads = f"python -m {kind.command} {file}" if kind.command else ""
     with to_stdout(errors):
         if as_json:

@@ -38,6 +38,13 @@ test's file would be.
 """
 
 
+def content_of(data: Any) -> Any:
+    """Return the plain data that a file's kind describes: for a run's config.yaml those below its key, else all."""
+    if isinstance(data, Mapping):
+        return next((data[key] for key in (*_RESOLVED, "test") if isinstance(data.get(key), Mapping)), data)
+    return data
+
+
 def kind_of(data: Any) -> FileKind | None:
     """Return the only kind of file that these plain data can be; None if that is not clear.
 
