@@ -52,8 +52,8 @@ class SeidelSums:
         They are the path error at the rim of the pupil and the edge of the field, positive where the wavefront is
         ahead. W222 and W220 are those of a focus at the paraxial image: W220 is sagittal, W220 + W222 tangential.
         """
-        one, two, three, four, five = self.sums.T
-        return np.stack([one / 8.0, two / 2.0, three / 2.0, (three + four) / 4.0, five / 2.0], axis=-1)
+        s1, s2, s3, s4, s5 = self.sums.T
+        return np.stack([s1 / 8.0, s2 / 2.0, s3 / 2.0, (s3 + s4) / 4.0, s5 / 2.0], axis=-1)
 
 
 def seidel(camera: Camera, field: float, ends: tuple[float, float] | None = None) -> SeidelSums:

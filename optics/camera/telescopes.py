@@ -108,8 +108,9 @@ def first_design(
 
     Notes
     -----
-    The three-mirror anastigmats are used beside their axis, at ``field_bias``; for the off-axis one, where higher
-    orders count, conics and focus then minimise the traced wavefront error there.
+    The three-mirror anastigmats are used beside their axis, at the field angle ``bias`` of their type over the
+    F-number. For the off-axis one, where higher orders count, conics and focus then minimise the traced
+    wavefront error there.
     """
     if kind not in TELESCOPES:
         raise ValueError(f"there is no telescope {kind!r}; there are {', '.join(TELESCOPES)}")

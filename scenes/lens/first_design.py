@@ -97,10 +97,10 @@ def _mirrors(camera: Camera, half: float, bias: float, aperture: float) -> list[
     centred = camera.stop == 0 and len(camera.surfaces) > 1
     if centred:  # the secondary shadows the beam
         first = camera.surfaces[0]
-        reach = 0.5 * aperture * (1.0 - z[1] / (0.5 * first.radius)) + abs(z[1]) * np.tan(half + bias)
+        radius = 0.5 * aperture * (1.0 - z[1] / (0.5 * first.radius)) + abs(z[1]) * np.tan(half + bias)
         out.append(
             f"  shadow: {{z: {1e3 * (z[1] - 0.02 * aperture):.10g} mm, radius: flat, light: passes, "
-            f"edges: [{{blocks: circle, radius: {1e3 * MARGIN * reach:.5g} mm}}]}}   # of M2 and its mount"
+            f"edges: [{{blocks: circle, radius: {1e3 * MARGIN * radius:.5g} mm}}]}}   # of M2 and its mount"
         )
     for k, surface in enumerate(camera.surfaces):
         out.append(

@@ -117,7 +117,7 @@ class PlainPerturbationSpec(Spec):
         Problem
             Both rotate or scale the body about different pivots, or both have a table of nodes.
         """
-        pivots = list(dict.fromkeys(one.pivot for one in (self, other) if {"rotate", "scale"} & set(one.uses())))
+        pivots = list(dict.fromkeys(p.pivot for p in (self, other) if {"rotate", "scale"} & set(p.uses())))
         if len(pivots) > 1:
             text = "the body is rotated or scaled about another pivot already, and has only one"
             raise Problem(text, pivots[1], pivots[0], within=("pivot",))
@@ -140,27 +140,27 @@ class PlainPerturbationSpec(Spec):
         )
 
 
-def _sums(one: Spec, other: Spec) -> dict[str, Any]:
+def _sums(first: Spec, other: Spec) -> dict[str, Any]:
     """Return the sums of the values of two specifications by key, without texts."""
-    pairs = {key: (value, getattr(other, key)) for key, value in one if not isinstance(value, str)}
+    pairs = {key: (value, getattr(other, key)) for key, value in first if not isinstance(value, str)}
     return {key: _sum(key, *pair) for key, pair in pairs.items()}
 
 
-def _sum(key: str, one: Any, other: Any) -> Any:
+def _sum(key: str, first: Any, other: Any) -> Any:
     """Return the sum of the values of a key of two perturbations; None is nothing."""
-    if one is None or other is None:
-        return other if one is None else one
-    if isinstance(one, Spec):
+    if first is None or other is None:
+        return other if first is None else first
+    if isinstance(first, Spec):
         table = getattr(other, "table", None)
-        if table and getattr(one, "table", None):
+        if table and getattr(first, "table", None):
             text = "this body has a table of nodes already, and another cannot be added"
             raise Problem(text, table, "one table of each body", within=(key, "table"))
-        return one.model_copy(update=_sums(one, other))
-    if isinstance(one, Mapping):
-        return FrozenMap({**one, **{name: _sum(key, one.get(name), value) for name, value in other.items()}})
-    if isinstance(one, tuple):
-        return tuple(_sum(key, *pair) for pair in zip(one, other, strict=True))
-    return float(f"{one + other:.15g}")  # 20 um + 3 um are 23 um, without the rounding of floats
+        return first.model_copy(update=_sums(first, other))
+    if isinstance(first, Mapping):
+        return FrozenMap({**first, **{name: _sum(key, first.get(name), value) for name, value in other.items()}})
+    if isinstance(first, tuple):
+        return tuple(_sum(key, *pair) for pair in zip(first, other, strict=True))
+    return float(f"{first + other:.15g}")  # 20 um + 3 um are 23 um, without the rounding of floats
 
 
 def _in_words(value: Any) -> Any:
@@ -184,7 +184,7 @@ class NodeInfo:
     allows : frozenset[str]
         Names in ACTIONS of the changes that are allowed.
     cold : str
-        Reason why the body has no temperature of its own; empty if it has one or the reason is obvious.
+        Reason why the body has no temperature of its own; empty if it has first or the reason is obvious.
     """
 
     pivots: tuple[str, ...] = (DEFAULT_PIVOT,)
@@ -237,7 +237,7 @@ def with_full_paths(
     Raises
     ------
     InputError
-        A name fits several nodes, or two names fit one node.
+        A name fits several nodes, or two names fit first node.
     """
     issues: list[Issue] = []
     named: dict[str, str] = {}
@@ -245,7 +245,7 @@ def with_full_paths(
         try:
             path = find_node(name, nodes) if matching_nodes(name, nodes) else name
             if path in named.values():
-                raise Problem("this node is perturbed twice", shown(name), f"{path} once, under one name")
+                raise Problem("this node is perturbed twice", shown(name), f"{path} once, under first name")
             named[name] = path
         except Problem as problem:
             issues.append(issue(problem, name))

@@ -358,10 +358,10 @@ def in_cycles_per_m(frequency: Frequencies) -> np.ndarray:
         A text is not a spatial frequency, or a number is not finite.
     """
     texts = [
-        str(one).replace("cycles/", "1/").replace("lp/", "1/") if isinstance(one, str) else one
-        for one in np.atleast_1d(np.asarray(frequency, dtype=object))
+        str(value).replace("cycles/", "1/").replace("lp/", "1/") if isinstance(value, str) else value
+        for value in np.atleast_1d(np.asarray(frequency, dtype=object))
     ]
-    return np.array([in_si(one, SPATIAL_FREQUENCY, "frequency") for one in texts])
+    return np.array([in_si(text, SPATIAL_FREQUENCY, "frequency") for text in texts])
 
 
 def field_fractions(field: Field | FieldText, half: tuple[float, float]) -> Field:

@@ -291,8 +291,8 @@ def run_camera(
             state = job_state(job, ThermalModel(instrument))
         if refocus and refocused is None:
             plane = focal_plane_body(optics.path.root)
-            own = motions_of(job).get(plane) if setup.perturb else None
-            refocused = find_focus(optics.in_state(state), tilt, setup.mounted, own)
+            existing = motions_of(job).get(plane) if setup.perturb else None
+            refocused = find_focus(optics.in_state(state), tilt, setup.mounted, existing)
             state = compose(state, {plane: refocused.motion}, {plane: instrument.assembly.tree[plane]})
         if setup.instrument is not None:
             quality = image_quality(instrument, backend, [state], QUALITY_FIELDS).cameras[mounted]
@@ -359,7 +359,7 @@ def _nyquist(optics: CameraOptics) -> np.ndarray:
         return np.empty((0, 2))
 
 
-def find_focus(optics: CameraOptics, tilt: bool, mounted: str | None = None, own: Motion | None = None) -> Refocus:
+def find_focus(optics: CameraOptics, tilt: bool, mounted: str | None = None, existing: Motion | None = None) -> Refocus:
     """Find the focal plane with the smallest mean square wavefront error over ``FIELDS``.
 
     Parameters
@@ -370,7 +370,7 @@ def find_focus(optics: CameraOptics, tilt: bool, mounted: str | None = None, own
         Allow a tilt about the line as well.
     mounted : str or None
         Name of the camera in its instrument; None for a camera alone.
-    own : Motion or None
+    existing : Motion or None
         Motion that the state gives the focal plane itself; None for none.
 
     Raises
@@ -385,13 +385,13 @@ def find_focus(optics: CameraOptics, tilt: bool, mounted: str | None = None, own
         problem = f"refocusing is not possible: the light has no focus after {list(camera.mirrors)[-1]}"
         raise camera.error(problem, ("mirrors",), allowed="mirrors that make a real image")
     frame = model.focal_plane
-    turn = np.array([0.0, best.tilt - nominal.tilt, 0.0])  # Y of the focal plane is x of the prescription
-    normal = frame.rotation @ rotation_matrix(turn)[:, 2]
+    rotation = np.array([0.0, best.tilt - nominal.tilt, 0.0])  # Y of the focal plane is x of the prescription
+    normal = frame.rotation @ rotation_matrix(rotation)[:, 2]
     distance = (np.array([0.0, 0.0, best.z]) - frame.translation) @ normal / (frame.rotation[:, 2] @ normal)
-    motion = Motion(triple(turn), (0.0, 0.0, float(distance)))
+    motion = Motion(triple(rotation), (0.0, 0.0, float(distance)))
     body, total = focal_plane_body(optics.path.root), motion
-    if own is not None:
-        total = compose({body: own}, {body: motion}, {body: optics.assembly.tree[body]})[body]
+    if existing is not None:
+        total = compose({body: existing}, {body: motion}, {body: optics.assembly.tree[body]})[body]
     return Refocus(
         nominal,
         best,
@@ -400,7 +400,7 @@ def find_focus(optics: CameraOptics, tilt: bool, mounted: str | None = None, own
         tilt,
         motion,
         _motion_words(focal_plane_body(mounted or "").lstrip("/"), total),
-        own is not None,
+        existing is not None,
         bool(model.image_direction @ frame.rotation[:, 2] > 0.0),
     )
 

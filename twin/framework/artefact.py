@@ -52,7 +52,7 @@ def _power_text(power: re.Match[str]) -> str:
     return f"e{MINUS}" if power[1] == "-" else "e"
 
 
-def _typeset(text: str) -> str:
+def _with_minus(text: str) -> str:
     """Replace the hyphens of a formatted number by typographic minus signs."""
     return text.replace("-", MINUS)
 
@@ -77,7 +77,7 @@ def fixed(value: float, decimals: int, sign: bool = False) -> str:
     if not math.isfinite(value):
         return "\N{EM DASH}"
     rounded = round(value, decimals) + 0.0
-    return _typeset(f"{rounded:+.{decimals}f}" if sign and rounded else f"{rounded:.{decimals}f}")
+    return _with_minus(f"{rounded:+.{decimals}f}" if sign and rounded else f"{rounded:.{decimals}f}")
 
 
 def decimals_for(sigma: float, digits: int = 2, most: int = 7, default: int = 4) -> int:
@@ -133,9 +133,9 @@ def significant(value: float, digits: int = 3, floor: float = SAME, sign: bool =
     size = math.floor(math.log10(abs(value)))
     if size < -3 or size > 6:
         mantissa, _, exponent = f"{value:{'+' if sign else ''}.{max(digits - 2, 0)}e}".partition("e")
-        return _typeset(f"{mantissa}e{int(exponent)}")
+        return _with_minus(f"{mantissa}e{int(exponent)}")
     text = f"{value:{'+' if sign else ''}.{max(digits - 1 - size, 0)}f}"
-    return _typeset(text)
+    return _with_minus(text)
 
 
 def plain(value: float, digits: int = 5) -> str:
@@ -153,7 +153,7 @@ def plain(value: float, digits: int = 5) -> str:
     str
         Formatted number, with a typographic minus sign.
     """
-    return _typeset(f"{value:.{digits}g}")
+    return _with_minus(f"{value:.{digits}g}")
 
 
 def residual(value: float, sigma: float) -> float | None:
@@ -163,7 +163,7 @@ def residual(value: float, sigma: float) -> float | None:
 
 def tick_text(value: float) -> str:
     """Format a number at an axis tick as a whole number with a typographic sign."""
-    return _typeset(f"{value:+,.0f}").replace(",", "\N{NARROW NO-BREAK SPACE}") if value else "0"
+    return _with_minus(f"{value:+,.0f}").replace(",", "\N{NARROW NO-BREAK SPACE}") if value else "0"
 
 
 def residual_text(ratio: float | None) -> str:
@@ -172,7 +172,7 @@ def residual_text(ratio: float | None) -> str:
         return "\N{EM DASH}"
     if abs(ratio) < 10:
         return fixed(ratio, 1, sign=True)
-    return _typeset(f"{ratio:+,.0f}").replace(",", "\N{NARROW NO-BREAK SPACE}")
+    return _with_minus(f"{ratio:+,.0f}").replace(",", "\N{NARROW NO-BREAK SPACE}")
 
 
 _NAME = re.compile(r"[a-z0-9][a-z0-9_-]*")
