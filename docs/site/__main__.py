@@ -171,7 +171,7 @@ def run_sphinx(source: Path, made: Path, notebooks: str, tell: Callable[..., Non
     BuildError
         Sphinx warns, for instance of a broken link or of a page to which no other leads, or a page needs the network.
     """
-    environment = os.environ | {"JUPYTER_PLATFORM_DIRS": "1"}
+    environment = os.environ | {"JUPYTER_PLATFORM_DIRS": "1", "NO_COLOR": "1"}
     environment["PYTHONPATH"] = os.pathsep.join(filter(None, [str(ROOT), os.environ.get("PYTHONPATH")]))
     words = ["-b", "html", "-W", "--keep-going", "-c", HERE, "-D", f"nb_execution_mode={notebooks}"]
     command = [sys.executable, "-m", "sphinx", *words, "-d", source.with_name("state"), source, made]
