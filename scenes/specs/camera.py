@@ -5,9 +5,11 @@ Also the specifications of the optimisation of a camera and of the search for a 
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from math import isinf
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
+import numpy as np
 from pydantic import Field, model_validator
 
 from optics.geometry.sag_terms import SagTerm
@@ -16,7 +18,7 @@ from optics.numerics.number_tree import FrozenMap
 from optics.raytrace.reflectors import REFLECTORS
 from scenes.specs import instrument as instruments
 from scenes.specs.baffle import SurfaceEdgeSpec
-from scenes.specs.detector import PixelPitch
+from scenes.specs.detector import PITCH_RANGE, PixelPitch
 from scenes.specs.glass import LensGlass, Medium
 from scenes.specs.spectrum import Spectrum, SpectrumSpec
 from scenes.yaml.errors import Problem, unknown
@@ -465,8 +467,11 @@ class ImageSpec(Spec):
     tilt: Annotated[float, Quantity(ANGLE, largest="45 deg")] | None = None
 
 
+_MOST_PIXELS = 1_000_000
+
+
 class LineSpec(Spec):
-    """Line CCD, centred on the field bias.
+    """Line CCD or area detector, centred on the field bias.
 
     Attributes
     ----------
@@ -474,10 +479,27 @@ class LineSpec(Spec):
         Number of pixels along the line.
     pitch : float
         Pixel pitch, in metres.
+    rows : int
+        Number of lines: 1 for a line CCD, more for an area detector.
     """
 
-    pixels: Annotated[Whole, Field(ge=2, le=1_000_000)]
+    pixels: Annotated[Whole, Field(ge=2, le=_MOST_PIXELS)]
     pitch: PixelPitch
+    rows: Annotated[Whole, Field(ge=1, le=_MOST_PIXELS)] = 1
+
+
+def line_over_field(camera: Mapping[str, Any]) -> LineSpec:
+    """Return a line CCD over the field whose Nyquist frequency is half the cut-off, for a camera whose file has none.
+
+    Parameters
+    ----------
+    camera : mapping
+        ``focal_length``, ``entrance_pupil``, ``wavelength`` (metres) and ``field``.
+    """
+    focal, pupil, wavelength, field = (camera[key] for key in ("focal_length", "entrance_pupil", "wavelength", "field"))
+    pitch = float(np.clip(wavelength * focal / pupil, *PITCH_RANGE))
+    pixels = int(np.clip(round(2.0 * focal * np.tan(field.x) / pitch), 2, _MOST_PIXELS))
+    return LineSpec.model_construct(pixels=pixels, pitch=pitch, rows=1)
 
 
 class CameraSpec(TitledSpec):
@@ -506,7 +528,8 @@ class CameraSpec(TitledSpec):
     image : ImageSpec
         Position and tilt of the focal plane.
     line : LineSpec
-        Pixels of the line CCD.
+        Pixels of the line CCD, or of an area detector. By default a line over the field with a pitch of the
+        wavelength times the F-number: its Nyquist frequency is half the cut-off frequency of diffraction.
     bands : Mapping[str, BandSpec]
         Name of a spectral band -> its line CCD, for images of targets; none by default.
     spectrum : SpectrumSpec | None
@@ -527,7 +550,7 @@ class CameraSpec(TitledSpec):
     stop_diameter: PositiveLength | None = None
     mirrors: Annotated[Named[MirrorSpec], Field(min_length=1)]
     image: ImageSpec
-    line: LineSpec
+    line: LineSpec = Field(default_factory=line_over_field)
     bands: Named[BandSpec] = Field(default_factory=FrozenMap)
     spectrum: Spectrum | None = None
     medium: Medium | None = None

@@ -18,6 +18,8 @@ AreaSide = Annotated[Whole, Field(ge=LEAST_SIDE, le=8192)]
 """Number of rows or columns of an area CCD; the smallest number is that in which a spot can be measured."""
 PixelPitch = Annotated[float, Quantity(LENGTH, smallest="0.5 um", largest="1 mm")]
 """Pixel pitch, in metres; a value below the smallest pixels that are made would be a mistaken unit."""
+PITCH_RANGE = (0.5e-6, 1e-3)
+"""Smallest and largest `PixelPitch`, in metres."""
 LEAST_STEPS = 1.0
 """Smallest number of grey values between dark and full well."""
 

@@ -434,7 +434,8 @@ def validate(model: type[SpecType], yaml: YamlFile) -> SpecType:
     try:
         spec = model.model_validate(yaml.data)
     except ValidationError as error:
-        details = error.errors(include_url=False)
+        # a default that follows from other keys is not a fault beside those of these keys
+        details = [d for d in error.errors(include_url=False) if d["type"] != "default_factory_not_called"]
         # Pydantic does not count invalid items, so a list with some is also reported as too short.
         wrong = {detail["loc"][:-1] for detail in details} | {detail["loc"][:-2] for detail in details}
         faults = [detail for detail in details if detail["type"] != "too_short" or detail["loc"] not in wrong]

@@ -14,7 +14,9 @@ from typer.testing import CliRunner
 
 from optics.design.merit_function import Operands
 from optics.design.optimiser import ActiveConstraint, DesignError, _require_fulfilled, initial_merit
+from optics.geometry.aperture import Rectangle
 from scenes.models.camera_design import CameraDesignSetup, beams_of, file_with_plane, prescription_of
+from scenes.models.camera_model import IMAGE, CameraModel
 from scenes.models.camera_sharpness import FIELDS, FocalPlane, sharpness
 from scenes.models.monitor_layout import Beam
 from scenes.specs.camera import CameraSpec
@@ -32,6 +34,7 @@ from twin.camera.__main__ import app
 from twin.camera.camera_optics import CameraOptics
 from twin.camera.camera_run import aberration_name, find_focus, perturbed_text, refocus_text, run_camera, verdict
 from twin.camera.field_maps import distortion
+from twin.camera.first_order_data import obstacles
 from twin.design.__main__ import app as design_app
 from twin.design.design_run import HELD_BY, _held_text, run_design
 from twin.design.layout_bench import BeamFacts
@@ -42,6 +45,38 @@ from twin.framework.run_folder import RunFolderError
 @pytest.fixture(scope="module")
 def gf7_alone(backend, gf7) -> CameraOptics:
     return CameraOptics.alone(gf7, backend)
+
+
+def test_a_camera_without_a_line_is_sampled_at_half_the_cut_off(tmp_path: Path) -> None:
+    lines = (LIBRARY / "cameras/ritchey_chretien.yaml").read_text("utf-8").splitlines()
+    lines = [line for line in lines if not line.startswith("line:")]
+    bare = load_camera(written(tmp_path, lines))
+    assert bare.line.pitch == pytest.approx(6.5e-6)  # 650 nm at F/10
+    assert bare.line.pixels == round(2 * 5.0 * np.tan(np.radians(0.15)) / 6.5e-6)
+    assert "line" not in bare.model_fields_set
+    with pytest.raises(InputError, match="rows"):
+        load_camera(written(tmp_path, [*lines, "line: {pixels: 100, pitch: 7 um, rows: 0}"]))
+    with pytest.raises(InputError, match="wavelength") as missing:
+        load_camera(written(tmp_path, [line for line in lines if not line.startswith("wavelength:")]))
+    assert len(missing.value.issues) == 1  # what is missing, not what follows from it
+
+
+def written(folder: Path, lines: list[str]) -> Path:
+    """Write the lines of a camera file into a folder, and return its path."""
+    file = folder / "camera.yaml"
+    file.write_text("\n".join(lines), "utf-8")
+    return file
+
+
+def test_an_area_detector_obstructs_with_its_height(gf7: CameraModel) -> None:
+    high = gf7.spec.line.model_copy(update={"rows": 20_001})
+    area = obstacles(replace(gf7, spec=gf7.spec.model_copy(update={"line": high})))[IMAGE]
+    line = obstacles(gf7)[IMAGE]
+    assert isinstance(area, Rectangle)
+    assert isinstance(line, Rectangle)
+    assert area.half_x == line.half_x
+    assert area.half_y == pytest.approx(0.5 * 20_001 * gf7.spec.line.pitch + gf7.spec.edge_margin)
+    assert line.half_y < 0.5 * area.half_y
 
 
 def test_distortion_is_that_of_the_papers_formula(gf7_alone) -> None:

@@ -125,7 +125,8 @@ def first_order_table(run: CameraRun) -> Table:
         ("field of view", "{:.4g} × {:.4g} deg".format(*n["field_deg"])),
         ("image", "{:.2f} × {:.2f} mm".format(*n["image_mm"])),
         ("plate scale", f"{n['plate_scale_arcsec_per_mm']:.4f} arcsec/mm"),
-        ("pixel", f"{n['pitch_um']:.4g} µm, {n['pixel_arcsec']:.4f} arcsec"),
+        ("pixel" if "line" in run.camera.model_fields_set else "pixel (the camera file has no line: λF)",
+         f"{n['pitch_um']:.4g} µm, {n['pixel_arcsec']:.4f} arcsec"),
         ("Airy disk", f"{n['airy_radius_um']:.3f} µm radius, {n['airy_radius_um'] / n['pitch_um']:.2f} pixels"),
         ("sampling", f"λF / pixel {n['sampling_lambda_f_per_pixel']:.3f} (2 samples the cut-off); "
          f"Nyquist {n['nyquist_per_mm']:.2f}, cut-off {n['cutoff_per_mm']:.1f} cycles/mm"),

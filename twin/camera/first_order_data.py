@@ -98,13 +98,13 @@ def obstacles(model: CameraModel) -> dict[str, Aperture]:
             continue  # the plate of a stop lies outside its hole
         # the clear apertures of the other mirrors include the margin
         out[name] = _body(model, name, Circle(edge.bounds[1] + margin) if name == spec.stop else edge)
-    lines: list[tuple[LineSpec | BandSpec, float]] = [
-        (spec.line, 0.0),
-        *((band, band.offset) for band in spec.bands.values()),
+    lines: list[tuple[LineSpec | BandSpec, float, int]] = [
+        (spec.line, 0.0, spec.line.rows),
+        *((band, band.offset, 1) for band in spec.bands.values()),
     ]
-    half = 0.5 * max(line.pixels * line.pitch for line, _ in lines) + margin
-    low = min(offset - 0.5 * line.pitch for line, offset in lines) - margin
-    high = max(offset + 0.5 * line.pitch for line, offset in lines) + margin
+    half = 0.5 * max(line.pixels * line.pitch for line, *_ in lines) + margin
+    low = min(offset - 0.5 * rows * line.pitch for line, offset, rows in lines) - margin
+    high = max(offset + 0.5 * rows * line.pitch for line, offset, rows in lines) + margin
     centre = model.image_body.inverse().apply(model.focal_plane.translation)
     out[IMAGE] = Rectangle(half, 0.5 * (high - low), (float(centre[0]), float(centre[1] + 0.5 * (high + low))))
     return out
