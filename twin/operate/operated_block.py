@@ -193,10 +193,10 @@ def _prior_of_record(
         operation.filter_readings()
         for line in lines:
             length = plan.model.cameras[mounted[line].camera].focal_length
-            stated = setup.camera.lines[line].principal_distance
-            if abs(length / stated - 1.0) > _NEAR:
+            specified = setup.camera.lines[line].principal_distance
+            if abs(length / specified - 1.0) > _NEAR:
                 text = f"the record is of {history.name}, whose {line} camera has another principal distance"
-                found = f"{1e3 * length:.5g} mm, not {1e3 * stated:.5g} mm"
+                found = f"{1e3 * length:.5g} mm, not {1e3 * specified:.5g} mm"
                 raise Problem(text, found, "the record of the instrument that took the images", within=("record",))
         times = {name: micros(epoch) for name, epoch in epochs.items()}
         order = sorted(set(times.values()))

@@ -276,9 +276,9 @@ def _require_known_sensors(experiment: MonitorExperiment, what: Simulation) -> N
             _require_name(option, body, warm if what.sensors is None else what.sensors)
 
 
-def _write_truth(place: Path, text: str) -> None:
+def _write_truth(path: Path, text: str) -> None:
     """Write the truth. Raise InputErrorText if it cannot be written."""
     try:
-        write_safely(place, text.encode())
+        write_safely(path, text.encode())
     except OSError as error:
-        raise InputErrorText(f"--truth: {place} cannot be written: {error.strerror or error}") from None
+        raise InputErrorText(f"--truth: {path} cannot be written: {error.strerror or error}") from None

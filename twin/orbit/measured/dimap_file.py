@@ -182,8 +182,8 @@ class DimapPass:
         second[0], second[-1] = min(second[0], start - self.line_time), max(second[-1], start + span + self.line_time)
         day = np.floor(second / _DAY)
         clock = Readings(self.attitude.day + day.astype(np.int64), second - _DAY * day)
-        turns = self.attitude.at(second)
-        return AttitudeReadings(self.file, clock, turns, None, "ITRS", "UTC", "first", "body_to_frame")
+        quaternion = self.attitude.at(second)
+        return AttitudeReadings(self.file, clock, quaternion, None, "ITRS", "UTC", "first", "body_to_frame")
 
     def spanning_orbit(self) -> OrbitReadings:
         """Return the orbit's readings, extrapolated by one at each end where the image extends slightly beyond them.
@@ -202,13 +202,13 @@ class DimapPass:
                 problem = f"the image {'begins before' if end == 0 else 'ends after'} the ephemeris"
                 found, allowed = f"by {abs(step):.6g} s", f"{_NEAR:g} s at most"
                 raise InputError(Issue(problem, self.file, None, ("Ephemeris",), found, allowed))
-            other, place = (1, 0) if end == 0 else (-2, len(time))
+            other, index = (1, 0) if end == 0 else (-2, len(time))
             rate = (velocity[end] - velocity[other]) / (time[end] - time[other])
             # Velocities a few milliseconds apart are too noisy for an acceleration.
             rate = rate if abs(time[end] - time[other]) > 0.5 else -_GRAVITY * position[end] / _norm(position[end]) ** 3
-            position = np.insert(position, place, position[end] + velocity[end] * step + 0.5 * rate * step**2, axis=0)
-            velocity = np.insert(velocity, place, velocity[end] + rate * step, axis=0)
-            time = np.insert(time, place, at)
+            position = np.insert(position, index, position[end] + velocity[end] * step + 0.5 * rate * step**2, axis=0)
+            velocity = np.insert(velocity, index, velocity[end] + rate * step, axis=0)
+            time = np.insert(time, index, at)
         return OrbitReadings(self.file, self._clock(time), position, velocity, "ITRS", "UTC")
 
     def _spanning_samples(self, attitude: AttitudeReadings) -> AttitudeReadings:
@@ -220,9 +220,11 @@ class DimapPass:
         if not more:
             return attitude
         # This is the interpolation of the samples everywhere else.
-        turns = CubicSpline(time, continuous_quaternions(attitude.quaternion))(np.array(more))
+        more_quaternions = CubicSpline(time, continuous_quaternions(attitude.quaternion))(np.array(more))
         order = np.argsort(times := np.concatenate([time, more]))
-        quaternion = np.concatenate([attitude.quaternion, turns / np.linalg.norm(turns, axis=1, keepdims=True)])
+        quaternion = np.concatenate(
+            [attitude.quaternion, more_quaternions / np.linalg.norm(more_quaternions, axis=1, keepdims=True)]
+        )
         return replace(attitude, clock=self._clock(times[order]), quaternion=quaternion[order])
 
     def _ends_beyond(self, time: Array) -> list[tuple[float, int]]:
