@@ -6,8 +6,8 @@ The unknowns are the interior orientation of each camera and the attitude bias o
 weights and variance components are iterated around it. No solution is returned from a singular system: combinations of
 unknowns that the points leave undetermined are named, and must be fixed by a gauge or by priors.
 
-**Checks before an adjustment.** `check_places` tests that points lie where their image points look, and the noise of a
-single image point must be smaller than what is to be estimated. Either fault would otherwise appear as undetermined
+**Checks before an adjustment.** `check_positions` tests that points lie where their image points look, and the noise of
+a single image point must be smaller than what is to be estimated. Either fault would otherwise appear as undetermined
 combinations: robust weights reject points that are kilometres off, and then too few are left; noise that exceeds the
 changes at launch leaves everything undetermined.
 

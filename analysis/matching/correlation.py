@@ -366,9 +366,9 @@ def _strength(rows: NDArray[np.generic]) -> NDArray[np.float32]:
 
 
 def _apart(points: NDArray[np.intp], distance: int) -> NDArray[np.intp]:
-    """Return the points without those closer than `reach` pixels, along rows and columns, to an earlier one."""
+    """Return the points without those closer than `distance` pixels, along rows and columns, to an earlier one."""
     keep = np.zeros(len(points), bool)
-    # maxima are at least reach apart unless they are equal, so few share a cell of this size
+    # maxima are at least `distance` apart unless they are equal, so few share a cell of this size
     side = distance + 1
     cells: dict[tuple[int, int], list[int]] = {}
     for k, (row, column) in enumerate(points.tolist()):
@@ -416,7 +416,7 @@ class Peaks:
 
 
 def search(image: ArrayLike, templates: ArrayLike, predicted: ArrayLike, radius: int) -> Peaks:
-    """Return the best position of each template within reach of its predicted position.
+    """Return the best position of each template within the radius around its predicted position.
 
     Parameters
     ----------
@@ -432,13 +432,13 @@ def search(image: ArrayLike, templates: ArrayLike, predicted: ArrayLike, radius:
     Raises
     ------
     ValueError
-        A shape is wrong, or reach is not 1 to 200 px.
+        A shape is wrong, or radius is not 1 to 200 px.
     """
     plane = checked_image(image, "search")
     windows = checked_templates(templates, "search")
     expected = checked_positions(predicted, len(windows), "search")
     if not 1 <= radius <= LARGEST_RADIUS:
-        raise ValueError(f"search: the reach must be 1 to {LARGEST_RADIUS} px, found {radius}; improve the prediction")
+        raise ValueError(f"search: the radius must be 1 to {LARGEST_RADIUS} px, found {radius}; improve the prediction")
     count = len(windows)
     positions, value, ratio = np.full((count, 2), np.nan), np.full(count, np.nan), np.full(count, np.nan)
     reason = np.zeros(count, np.int8)

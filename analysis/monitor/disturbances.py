@@ -466,7 +466,7 @@ class Consistency:
 
     @property
     def p_value_sigma_noise(self) -> float:
-        """Standard deviation of the p-value ``chance`` due to the noise of the images, to first order."""
+        """Standard deviation of the p-value ``p_value`` due to the noise of the images, to first order."""
         return float(density(self.chi_square, self.degrees)) * self.sigma_noise
 
     @staticmethod

@@ -515,11 +515,11 @@ class GroundGeometry:
 
     @cached_property
     def matrices(self) -> Array:
-        """Matrices from changes of the two cameras to shifts on the ground at positions along the line, (places, 3, 8).
+        """Matrices from changes of the two cameras to shifts on the ground at P positions along the line, (P, 3, 8).
 
         Rows of a matrix are the shifts along the track, across it and up, in m; columns are the changes. The changes
         are d_alpha, d_beta, d_gamma (rad), d_f / f of the first camera, then of the second. The middle of the line is
-        the middle place.
+        the middle position.
         """
         half_swath = min(r * t for r, t in zip(self.ranges_m, self.half_field, strict=True))
         return np.stack([self._at(c) for c in np.linspace(-half_swath, half_swath, _GROUND_POINTS)])

@@ -501,7 +501,7 @@ class PixelResponse:
 
     Attributes
     ----------
-    kernel : (2 reach + 1, 2 reach + 1) ndarray
+    kernel : (2 half_width + 1, 2 half_width + 1) ndarray
         Filter kernel.
     """
 
@@ -555,9 +555,9 @@ class PixelResponse:
         )
 
     def apply(self, images: np.ndarray) -> np.ndarray:
-        """Return the filtered images, smaller by ``reach`` pixels on every side.
+        """Return the filtered images, smaller by ``half_width`` pixels on every side.
 
-        ``images`` (B, R, C) are B images of R rows and C columns; the result is (B, R - 2 reach, C - 2 reach).
+        ``images`` (B, R, C) are B images of R rows and C columns; the result is (B, R - 2 h, C - 2 h) for a half width h.
         """
         # imported late, since commands that only check files import this module
         import cv2

@@ -611,12 +611,12 @@ def monitor_beams(
     hits, valid = [traced.hit(k) for k in range(len(chains[0]))], traced.numpy()[3]
     out = []
     for i, (channel, chain) in enumerate(zip(channels, chains, strict=True)):
-        places = [position[i]]
+        points_of_beam = [position[i]]
         for hit, name in zip(hits, chain, strict=True):
-            places.append(placed.pose(assembly.elements[name].body).apply(hit[i]))
+            points_of_beam.append(placed.pose(assembly.elements[name].body).apply(hit[i]))
         media = media_along(assembly.sequence(f"{channel.key}/monitor"))
         inside = tuple(medium.solid for medium in media[:-1])
-        out.append(MonitorBeam(channel, _segments(places), inside, position[i], direction[i], valid[i]))
+        out.append(MonitorBeam(channel, _segments(points_of_beam), inside, position[i], direction[i], valid[i]))
     return out
 
 

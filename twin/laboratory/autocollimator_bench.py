@@ -791,12 +791,12 @@ class Reader:
             [{axis_body("X"): Motion(rotate=_triple(rotation))} for rotation in rotations]
         )
         photons, corner = windows.photons[0], windows.corner[0]
-        positions, _ = self.place(self.detector.expected_dn(photons, self.exposure), corner)
+        positions, _ = self.positions(self.detector.expected_dn(photons, self.exposure), corner)
         return autocollimator.ReadingMap.fit(
             positions, autocollimator.reading_of_normal(rotation_matrix(rotations) @ np.array([0.0, 0.0, -1.0]))
         )
 
-    def place(self, mean: np.ndarray, corner: np.ndarray) -> tuple[np.ndarray, SpotPositions]:
+    def positions(self, mean: np.ndarray, corner: np.ndarray) -> tuple[np.ndarray, SpotPositions]:
         """Measure the positions of the spots in B window images, in pixels of the whole CCD.
 
         Parameters
@@ -833,7 +833,7 @@ class Reader:
             mean = self.detector.expected_dn(windows.photons, self.exposure)
         else:
             mean = mean_frames(self.expose(windows, series.stream, seed))
-        positions, spots = self.place(mean.reshape(-1, *mean.shape[2:]), windows.corner.reshape(-1, 2))
+        positions, spots = self.positions(mean.reshape(-1, *mean.shape[2:]), windows.corner.reshape(-1, 2))
         shape = windows.corner.shape
         rotations = self.map(positions).reshape(shape)
         variance = np.einsum("bkk->bk", self.map.covariance(positions, spots.covariance)).reshape(shape)

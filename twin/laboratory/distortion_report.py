@@ -48,7 +48,7 @@ def distortion_report(run: DistortionRun) -> Report:
     return Report(
         title="Interior orientation and distortion",
         verdict=verdict,
-        lead=(*more, _typeset(run.compensated.fit.point.comparison)),
+        lead=(*more, _typeset(run.compensated.fit.point.sentence)),
         facts=_facts(run, data),
         summary=_summary(run, data),
         sections=tuple(sections),
@@ -365,7 +365,7 @@ def _estimates(run: DistortionRun, data: Mapping[str, Any]) -> Section:
     covariance: list[tuple[Cell, ...]] = [(n, *row) for n, row in zip(terms, data["covariance_mm2"], strict=True)]
     return Section(
         "Estimators and observability",
-        (*text, _typeset(run.compensated.fit.point.comparison)),
+        (*text, _typeset(run.compensated.fit.point.sentence)),
         (
             Table("distortion-estimates", title, caption, heads, rows, digits),
             Table("distortion-covariance", "Covariance of constant, f and p", note, ("", *terms), covariance),

@@ -652,7 +652,7 @@ DISTORTION: Record[DistortionRun] = Record(
     Quantity("principal_point_observable", lambda r: bool(r.compensated.fit.point.observable), "sigma within 10 um"),
     Quantity(
         "principal_point_statement",
-        lambda r: r.compensated.fit.point.comparison,
+        lambda r: r.compensated.fit.point.sentence,
         "statement about p and its observability",
     ),
     Quantity(

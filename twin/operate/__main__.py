@@ -50,7 +50,7 @@ from twin.operate.terminal import (
 
 if TYPE_CHECKING:
     from twin.operate.record.history import History
-    from twin.operate.record.taking import IngestResult
+    from twin.operate.record.ingest import IngestResult
 
 POLL = 10.0
 """Time between two checks of watched files for new readings, in seconds."""
@@ -184,8 +184,8 @@ def ingest(
         try:
             while True:
                 before = totals["new"]
-                for given in sources.poll(call.history):
-                    taken = call.history.ingest(given, late)
+                for content in sources.poll(call.history):
+                    taken = call.history.ingest(content, late)
                     totals.update(taken.counts)
                     first = first or (f"{taken.file}: {taken.refused[0][1]}" if taken.refused else "")
                     if listed:

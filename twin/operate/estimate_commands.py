@@ -183,10 +183,10 @@ def products(
         raise InputErrorText("no time: give --time UTC, or --scene FILE, which has one")
     operation = call.filtered_operation(call.resolve_plan(plan))
     with input_errors():
-        one = make_products(operation, call.history, time, source, load_backend())
-    files, numbers = product_files(one)
+        made = make_products(operation, call.history, time, source, load_backend())
+    files, numbers = product_files(made)
     call.write_new(out, files, "products")
-    call.print_result(numbers, lambda console: print_line(console, summary(one)))
+    call.print_result(numbers, lambda console: print_line(console, summary(made)))
 
 
 @on_record

@@ -103,7 +103,7 @@ def posterior(
         raise Problem("times out of order", utc_text(int(times[late[0] + 1])), "each time later than the one before")
     known = {quantity.name: quantity for quantity in operation.quantities}
     cameras = dict.fromkeys(camera for camera, _ in operation.model.spots)
-    chosen = [name for name, one in known.items() if one.group in cameras] if names is None else list(names)
+    chosen = [name for name, item in known.items() if item.group in cameras] if names is None else list(names)
     for name in chosen:
         if name not in known:
             raise Problem("no such quantity", name, f"one of: {', '.join(known)}")

@@ -247,7 +247,7 @@ class Simulation:
         Time of the first reading and origin of the time laws, in microseconds of TAI since 2000.
     seconds : float
         Length of the life, in seconds.
-    every : float
+    interval : float
         Interval between readings of the monitor, in seconds; temperatures are read at the same times.
     seed : int
         Seed of all random numbers.
@@ -272,7 +272,7 @@ class Simulation:
 
     start: int
     seconds: float
-    every: float
+    interval: float
     seed: int = 0
     frames: int = 10
     coefficient_error: float = 0.0
@@ -289,8 +289,8 @@ class Simulation:
 
         Array dimensions: T times.
         """
-        count = max(1, math.ceil(self.seconds / self.every - 1e-9))
-        return self.start + np.array([round(k * self.every * MICRO) for k in range(count)], np.int64)
+        count = max(1, math.ceil(self.seconds / self.interval - 1e-9))
+        return self.start + np.array([round(k * self.interval * MICRO) for k in range(count)], np.int64)
 
 
 @dataclass(frozen=True, eq=False)

@@ -236,9 +236,17 @@ def _series(run: RecoverRun) -> Section:
     smoothed = run.smoothed
     heads = ["time [s]", "camera", "change", "unit", "value", "σ", "σ of noise"]
     rows: list[list[Cell]] = [
-        [time, one.camera or "both", one.parameter.symbol, one.parameter.unit, one.value, one.sigma, one.noise]
+        [
+            time,
+            change.camera or "both",
+            change.parameter.symbol,
+            change.parameter.unit,
+            change.value,
+            change.sigma,
+            change.noise,
+        ]
         for time, reading in zip(run.times, run.readings, strict=True)
-        for one in reading.table.of(reading.judged)
+        for change in reading.table.of(reading.judged)
     ]
     judged = run.last.estimators[run.last.judged].title
     caption = f"Value: reading of the {judged} at each time alone, relative to the same frames before."

@@ -448,8 +448,8 @@ def _monitor_sections(run: ToleranceRun) -> tuple[Section, ...]:
     text = (
         f"Standard deviations of the monitor's readings under the disturbances {prior_name}, with the derivatives "
         "and the noise of each camera as it is built and adjusted; its area CCDs have been set to its spots. "
-        f"Derivatives are interpolated between those of the tolerances; in {EXACT} of the cameras they were also traced for "
-        "comparison.",
+        f"Derivatives are interpolated between those of the tolerances; in {EXACT} of the cameras they were also "
+        "traced for comparison.",
     )
     heads = ("merit", "reading", "estimator", "designed", "relative difference of traced derivatives")
     table = Table("monitor", "Accuracy of the monitor's readings", "", heads, rows, (None, None, None, None, 7))

@@ -34,6 +34,7 @@ from twin.operate.record.entries import (
     now,
     utc_text,
 )
+from twin.operate.record.ingest import Ingest, IngestResult
 from twin.operate.record.schema import (
     ACKNOWLEDGEMENT,
     ALARM,
@@ -50,7 +51,6 @@ from twin.operate.record.schema import (
     url_of,
     writing,
 )
-from twin.operate.record.taking import Ingest, IngestResult
 
 USED = ("monitor", "temperature")
 """Kinds of entries that the estimate uses as observations; events are used as times at which motions may step."""

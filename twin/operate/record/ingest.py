@@ -124,8 +124,10 @@ class Ingest:
         grows.
         """
         out = {
-            digest_of_data([entry] if entry else [content.file, content.meaning, one.line, one.reason]): (one, entry)
-            for one, entry in refused
+            digest_of_data(
+                [entry] if entry else [content.file, content.meaning, new_refusal.line, new_refusal.reason]
+            ): (new_refusal, entry)
+            for new_refusal, entry in refused
             if entry or not before  # the same file at any path
         }
         known = self._present(REFUSED.c.sha256, list(out))
