@@ -209,7 +209,7 @@ def _from_dimap(root: Element) -> RationalPolynomial:
     if version not in _GROUND_MODELS:
         form.wrong("not this format", shown(form.attributes.get("version")), "DIMAP of version 2 or 3")
     model = root.single("Rational_Function_Model", "Global_RFM")
-    values, validity = model.one(_GROUND_MODELS[version]), model.single("RFM_Validity")
+    values, validity = model.single(_GROUND_MODELS[version]), model.single("RFM_Validity")
     offset, scale = ([validity.number(f"{axis}_{what}") for axis in _AXES] for what in ("OFF", "SCALE"))
     offset[0] -= _FIRST_PIXEL[version]
     offset[1] -= _FIRST_PIXEL[version]

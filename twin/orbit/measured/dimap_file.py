@@ -415,7 +415,7 @@ def _attitude(attitudes: Element, file: str, day: int) -> AttitudeReadings | Att
     scale = polynomial.number("SCALE", least=1e-6, most=1e6)
     rows = []
     for k in range(4):
-        part = polynomial.one(f"Q{k}")
+        part = polynomial.single(f"Q{k}")
         degree = part.whole("DEGREE", least=0, most=_MOST_TERMS - 1)
         rows.append(np.zeros(_MOST_TERMS))
         rows[-1][: degree + 1] = part.single("COEFFICIENTS").floats(degree + 1)
