@@ -93,13 +93,13 @@ def shows(*chosen: str) -> Callable[[Kind], Kind]:
         raise ValueError(f"fields are written 'name' or 'name [unit]', found {chosen}")
 
     def shown(self: Any) -> str:
-        named = [(one["path"], one["unit"] or "") for one in parsed] or _default_fields(self)
+        named = [(entry["path"], entry["unit"] or "") for entry in parsed] or _default_fields(self)
         parts = []
         for path, unit in named:
             if text := summary(_value(self, path), unit):
                 parts.append(f"{_label(path, unit)} {text}")
         text = f"{type(self).__name__}: {'; '.join(parts)}" if parts else type(self).__name__
-        return f"<{_cut(text, MOST)}>"
+        return f"<{_shortened(text, MOST)}>"
 
     def take(kind: Kind) -> Kind:
         kind.__repr__ = shown  # type: ignore[assignment]
@@ -123,7 +123,7 @@ def summary(value: Any, unit: str = "") -> str:
     if isinstance(value, bool | np.bool_):
         return "yes" if value else "no"
     if isinstance(value, str):
-        return _cut(" ".join(value.split()), LONGEST)
+        return _shortened(" ".join(value.split()), LONGEST)
     if isinstance(value, int | np.integer):
         return _with(f"{value}", unit)
     if isinstance(value, float | np.floating):
@@ -138,7 +138,7 @@ def summary(value: Any, unit: str = "") -> str:
         return f"{size}{_range(np.asarray(value.values), unit)}"
     if isinstance(value, tuple | list) and not all(isinstance(element, int | float | np.number) for element in value):
         texts = [element if isinstance(element, str) else summary(element, unit) for element in value]
-        return _cut(", ".join(texts), LONGEST) if len(value) <= FEW else f"{len(value)} of them"
+        return _shortened(", ".join(texts), LONGEST) if len(value) <= FEW else f"{len(value)} of them"
     if isinstance(value, np.ndarray | tuple | list):
         return _array(np.asarray(value), unit)
     text = repr(value)
@@ -165,7 +165,7 @@ def _value(owner: Any, path: str) -> Any:
     return owner
 
 
-def _cut(text: str, most: int) -> str:
+def _shortened(text: str, most: int) -> str:
     return text if len(text) <= most else f"{text[: most - 3]}..."
 
 
@@ -178,7 +178,7 @@ def _number(value: float, unit: str) -> str:
 
 
 def _named(value: Mapping[Any, Any]) -> str:
-    return _cut(", ".join(str(name) for name in value), LONGEST)
+    return _shortened(", ".join(str(name) for name in value), LONGEST)
 
 
 def _array(values: np.ndarray, unit: str) -> str:

@@ -22,7 +22,7 @@ _NORMAL_SIZE = 1.4826
 """Ratio of a normal distribution's standard deviation to the median of the absolute deviations."""
 
 
-def chance_beyond(chi_square: Any, degrees: Any) -> Any:
+def p_value_of(chi_square: Any, degrees: Any) -> Any:
     """Return the probability that chi-square exceeds a value by chance (upper tail of its distribution).
 
     Parameters
@@ -35,17 +35,17 @@ def chance_beyond(chi_square: Any, degrees: Any) -> Any:
     return chdtrc(degrees, chi_square)
 
 
-def limit_of(chance: Any, degrees: Any) -> Any:
+def limit_of(probability: Any, degrees: Any) -> Any:
     """Return the chi-square that is exceeded with a given probability.
 
     Parameters
     ----------
-    chance : float or ndarray
+    probability : float or ndarray
         Probability, above 0 and at most 1, of any shape.
     degrees : float or ndarray
         Degrees of freedom, of the same shape or a number.
     """
-    return chdtri(degrees, chance)
+    return chdtri(degrees, probability)
 
 
 def density(chi_square: Any, degrees: Any) -> Any:

@@ -54,7 +54,7 @@ if TYPE_CHECKING:
 
 __all__ = ["Found", "InputError", "InstrumentTwin", "Shot", "TestResult", "load", "load_camera", "perform", "study"]
 
-_PLACES = {
+_MODULES = {
     "load": "twin.scripting.instrument_twin",
     "load_camera": "twin.scripting.instrument_twin",
     "InstrumentTwin": "twin.scripting.instrument_twin",
@@ -70,9 +70,9 @@ def __getattr__(name: str) -> Any:
     if name == "study":
         # a package that can be called, see there
         return importlib.import_module(f"{__name__}.study")
-    if name not in _PLACES:
+    if name not in _MODULES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(importlib.import_module(__name__.removesuffix("twin") + _PLACES[name]), name)
+    return getattr(importlib.import_module(__name__.removesuffix("twin") + _MODULES[name]), name)
 
 
 def __dir__() -> list[str]:

@@ -180,7 +180,9 @@ def _run(
 
 def _print_list(selections: Sequence[Selection], fast: bool, as_json: bool) -> None:
     """Print ids, statements and approximate times of the selected checks."""
-    groups = [(one.group, [c for c in one.group.checks if c.id in one.ids]) for one in selections]
+    groups = [
+        (selection.group, [c for c in selection.group.checks if c.id in selection.ids]) for selection in selections
+    ]
     if as_json:
         rows = [
             {

@@ -106,8 +106,8 @@ def _whole(state: FolderState, keep: Path | None, silent: bool) -> Repetition:
 
     if keep is not None:
         return repeat(state, keep, silent)
-    with scratch("twin-verify") as place:
-        return repeat(state, place / "again", silent)
+    with scratch("twin-verify") as folder:
+        return repeat(state, folder / "again", silent)
 
 
 if __name__ == "__main__":

@@ -6,8 +6,8 @@ The unknowns are the interior orientation of each camera and the attitude bias o
 weights and variance components are iterated around it. No solution is returned from a singular system: combinations of
 unknowns that the points leave undetermined are named, and must be fixed by a gauge or by priors.
 
-**Checks before an adjustment.** `check_places` tests that points lie where their image points look, and the noise of a
-single image point must be smaller than what is to be estimated. Either fault would otherwise appear as undetermined
+**Checks before an adjustment.** `check_positions` tests that points lie where their image points look, and the noise of
+a single image point must be smaller than what is to be estimated. Either fault would otherwise appear as undetermined
 combinations: robust weights reject points that are kilometres off, and then too few are left; noise that exceeds the
 changes at launch leaves everything undetermined.
 
@@ -150,16 +150,16 @@ class Steps:
 
     Attributes
     ----------
-    places : tuple of (str, float)
+    positions : tuple of (str, float)
         Line, and y of the position in metres, for each step.
     """
 
-    places: tuple[tuple[str, float], ...]
+    positions: tuple[tuple[str, float], ...]
 
     @property
     def size(self) -> int:
         """Number of omitted terms: a step in x and one in y for each position."""
-        return 2 * len(self.places)
+        return 2 * len(self.positions)
 
     def columns(self, field: calibration_parameters.CalibrationField, line: str, rays: Rays, by: Partials) -> Array:
         """Return the derivatives of n image points' misclosures (x, y) with respect to the steps, (n, 2, size).
@@ -167,7 +167,7 @@ class Steps:
         The misclosure of an image point that is displaced by 1 m is 1 m larger.
         """
         derivatives = np.zeros((len(rays.point), 2, self.size))
-        for k, (name, position) in enumerate(self.places):
+        for k, (name, position) in enumerate(self.positions):
             if name == line:
                 beyond = rays.image[:, 1] > position
                 derivatives[beyond, 0, 2 * k] = derivatives[beyond, 1, 2 * k + 1] = -1.0
@@ -332,7 +332,7 @@ def single_ray(
     return {group: float(np.sqrt(np.median(np.concatenate(rows)))) for group, rows in variances.items()}
 
 
-def check_places(
+def check_positions(
     fields: Sequence[calibration_parameters.CalibrationField],
     cameras: Mapping[str, LineModel],
     start: Mapping[str, float] | None = None,
@@ -596,7 +596,7 @@ def adjust(
         raise calibration_parameters.CalibrationError(
             f"calibration: {count} image points are too few for {len(parameters.names) - len(gauge.held)} unknowns"
         )
-    check_places(fields, cameras, gauge.start if isinstance(gauge.start, Mapping) else None)
+    check_positions(fields, cameras, gauge.start if isinstance(gauge.start, Mapping) else None)
     start_state = State(parameters.start, tuple(f.ground for f in fields), np.zeros(shared.size))
     state = _Iteration(start_state, Weights(np.ones(count), dict.fromkeys(groups, 1.0)), 0, rejected)
     try:
@@ -673,7 +673,7 @@ class _Problem:
     estimated: frozenset[str] | None = None
 
     @cached_property
-    def place(self) -> NDArray[np.intp]:
+    def point_row(self) -> NDArray[np.intp]:
         """Index, among the ground points of all fields, of the point that each of M image points shows."""
         first = np.concatenate([[0], np.cumsum([len(f.ground) for f in self.fields])])
         return np.concatenate([a + r.point for a, f in zip(first, self.fields, strict=False) for r in f.rays.values()])
@@ -692,9 +692,9 @@ class _Problem:
     def weighed(self, state: _Iteration, weight: tuple[Array, ...], factor: Mapping[str, float]) -> _Iteration:
         """Return the state with new weights, rejecting tie points with fewer than two rays permanently."""
         control = np.concatenate([f.control for f in self.fields])
-        rays = np.bincount(self.place[weight[0] > reweighting.SETTLED], minlength=len(control))
+        rays = np.bincount(self.point_row[weight[0] > reweighting.SETTLED], minlength=len(control))
         lost = state.lost | (~control & (rays < 2))
-        return replace(state, weights=Weights(np.where(lost[self.place], 0.0, weight[0]), factor), lost=lost)
+        return replace(state, weights=Weights(np.where(lost[self.point_row], 0.0, weight[0]), factor), lost=lost)
 
     def equations(self, state: _Iteration, omitted: OmittedTerms | None = None) -> Equations:
         """Return the equations linearised at a state, optionally with omitted terms as further unknowns."""

@@ -525,7 +525,7 @@ class _Rows:
         Derivatives with respect to the ground point.
     miss : (M, 2) ndarray
         Misclosures.
-    place : (M,) ndarray of int
+    point_row : (M,) ndarray of int
         Index of the ground point.
     spans : tuple
         Row and coordinate ranges of each field.
@@ -535,7 +535,7 @@ class _Rows:
     design_shared: sparse.csr_matrix
     point: Array
     miss: Array
-    place: NDArray[np.intp]
+    point_row: NDArray[np.intp]
     spans: tuple[tuple[tuple[int, int], ...], tuple[tuple[int, int], ...]]
 
 
@@ -551,10 +551,10 @@ def _reduce(
     exact = np.concatenate([f.control & ~np.any(f.covariance, axis=(1, 2)) for f in fields])
     control = np.concatenate([f.control for f in fields]) & ~exact
     total, count = len(exact), rows.design.shape[1]
-    point = np.where(exact[rows.place][:, None, None], 0.0, rows.point)
+    point = np.where(exact[rows.point_row][:, None, None], 0.0, rows.point)
     # one (2, 3) block for each image point
-    pattern = (point, rows.place, np.arange(len(rows.place) + 1))
-    design_point = sparse.bsr_matrix(pattern, shape=(2 * len(rows.place), 3 * total)).tocsr()
+    pattern = (point, rows.point_row, np.arange(len(rows.point_row) + 1))
+    design_point = sparse.bsr_matrix(pattern, shape=(2 * len(rows.point_row), 3 * total)).tocsr()
     row_weight = np.repeat(weights.image, 2) / weights.factor.get("image", 1.0)
     inverse = np.zeros((total, 3, 3))
     inverse[control] = np.linalg.inv(np.concatenate([f.covariance for f in fields])[control])
@@ -565,7 +565,7 @@ def _reduce(
     weighted = (sparse.diags(row_weight) @ full_design).tocsr()
     cross = (design_point.T @ weighted).tocsr()
     normal_blocks = (
-        _point_blocks(point, rows.place, weights.image / weights.factor.get("image", 1.0), total)
+        _point_blocks(point, rows.point_row, weights.image / weights.factor.get("image", 1.0), total)
         + control_precision.data
     )
     # rejected points have no ray with weight
@@ -663,10 +663,10 @@ def _inverse(matrix: Array) -> Array:
     return np.asarray(half + half.T)
 
 
-def _point_blocks(point: Array, place: NDArray[np.intp], weight: Array, count: int) -> Array:
+def _point_blocks(point: Array, point_row: NDArray[np.intp], weight: Array, count: int) -> Array:
     """Return the normal matrices of m ground points, (m, 3, 3), from the derivatives (M, 2, 3) of M image points."""
     blocks = np.zeros((count, 3, 3))
-    np.add.at(blocks, place, weight[:, None, None] * (np.swapaxes(point, 1, 2) @ point))
+    np.add.at(blocks, point_row, weight[:, None, None] * (np.swapaxes(point, 1, 2) @ point))
     return blocks
 
 

@@ -103,7 +103,7 @@ class StripAdjustment:
     degrees_of_freedom: int
     _shared: SharedNoise = field(repr=False)
     _values: Array = field(repr=False)
-    _turn: Array = field(repr=False)
+    _rotation: Array = field(repr=False)
 
     @property
     def p_value(self) -> float:
@@ -121,9 +121,9 @@ class StripAdjustment:
         if rays.time is None:
             raise CalibrationError("strip adjustment: these rays have no times")
         corrected_rays = self._shared.corrected_at(
-            _NAME, replace(rays, attitude=rays.attitude @ self._turn), self._values
+            _NAME, replace(rays, attitude=rays.attitude @ self._rotation), self._values
         )
-        return replace(corrected_rays, attitude=corrected_rays.attitude @ self._turn.T)
+        return replace(corrected_rays, attitude=corrected_rays.attitude @ self._rotation.T)
 
 
 def adjust_strip(
@@ -177,7 +177,7 @@ def adjust_strip(
         degrees_of_freedom=residuals.image.size - 3 * size,
         _shared=shared,
         _values=state.shared,
-        _turn=bias_matrix,
+        _rotation=bias_matrix,
     )
 
 

@@ -98,7 +98,7 @@ class RigidMotion:
         return np.asarray(Rotation.from_rotvec(self.rotation).as_matrix())
 
     @property
-    def line_turn(self) -> float:
+    def line_rotation(self) -> float:
         """Angle by which the motion rotates the line CCD (the Y' axis) about +Z', in radians.
 
         The rotated line is projected on the X'Y' plane.
@@ -298,7 +298,7 @@ def fit_focal_plane(
         raise ValueError("focal plane: position, defocus and sigma must be finite; exclude positions without a focus")
     if not np.all(spread > 0):
         raise ValueError("focal plane: every sigma must be positive")
-    _check_places(spots)
+    _check_positions(spots)
     design = _design(spots)
     freedom = len(height) - 3
 
@@ -336,7 +336,7 @@ def _design(position: Array) -> Array:
     return np.stack([np.ones(position.shape[:-1]), position[..., 0], position[..., 1]], axis=-1)
 
 
-def _check_places(position: Array) -> None:
+def _check_positions(position: Array) -> None:
     """Raise ObservabilityError, with the geometric reason, if the positions do not determine both slopes."""
     if len(position) < 3:
         raise ObservabilityError(
@@ -467,7 +467,7 @@ class ShimPlan:
         Thicknesses of the new shims, multiples of the step, in metres.
     slide : (H, 3) ndarray
         Displacement of each hole in the mounting surface that is set by hand, in metres.
-    turn : float
+    rotation : float
         Rotation about the normal that is set by hand, right-handed, in radians; the twist of the required rotation.
     achieved : RigidMotion
         Motion with the rounded shims and the required rotation and slide; with more than three holes, that of the plane
@@ -483,7 +483,7 @@ class ShimPlan:
     rounded_change: Array
     thickness: Array
     slide: Array
-    turn: float
+    rotation: float
     achieved: RigidMotion
     shims_only: RigidMotion
 
@@ -495,7 +495,7 @@ class ShimPlan:
     @property
     def level_coupling(self) -> float:
         """Rotation of the line about +Z' that remains if shims alone are used, in radians."""
-        return self.shims_only.line_turn - self.wanted.line_turn
+        return self.shims_only.line_rotation - self.wanted.line_rotation
 
     def focus_error(self, position: ArrayLike) -> Array:
         """Return the defocus that remains at positions (..., 2) because shims are rounded, in metres.
@@ -557,7 +557,7 @@ def shim_plan(correction: RigidMotion, mount: Mount, present: ArrayLike) -> Shim
         rounded_change=rounded,
         thickness=thickness,
         slide=slide,
-        turn=twist,
+        rotation=twist,
         achieved=achieved,
         shims_only=_seated(start, mount, change),
     )

@@ -35,7 +35,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from analysis.arrays import Array, MeasurementError
-from analysis.statistics import chance_beyond
+from analysis.statistics import p_value_of
 
 QUARTIC = 0.3
 """Coefficient q of the fitted curve p (1 - u + q u^2), u = a (z - z0)^2: peak value p at defocus z0, width parameter a.
@@ -99,8 +99,8 @@ class _Lobe:
         rows = np.arange(len(z))
         self.z, self.v, self.weight = z, v, weight
         self.centre = z[rows, start]
-        reach = np.max(np.where(mask, np.abs(z - self.centre[:, None]), 0.0), axis=1)
-        self.scale = np.where(reach > 0, reach, 1.0)
+        half_range = np.max(np.where(mask, np.abs(z - self.centre[:, None]), 0.0), axis=1)
+        self.scale = np.where(half_range > 0, half_range, 1.0)
         self.x = (z - self.centre[:, None]) / self.scale[:, None]
         measured = weight > 0
         self.ends = np.stack(
@@ -140,9 +140,9 @@ class _Lobe:
         B is the number of curves, Z that of focus positions.
         """
         distance = np.abs(self.x - self.x0[:, None]) * self.scale[:, None]
-        return (distance <= self.reach(fraction)[:, None]) & (self.weight > 0)
+        return (distance <= self.half_width(fraction)[:, None]) & (self.weight > 0)
 
-    def reach(self, fraction: float) -> Array:
+    def half_width(self, fraction: float) -> Array:
         """Return the distance from the vertex at which each of B fitted curves falls to a fraction of its peak."""
         u = (1.0 - np.sqrt(1.0 - 4 * QUARTIC * (1.0 - fraction))) / (2 * QUARTIC)
         return np.asarray(np.sqrt(u / self.a) * self.scale)
@@ -441,7 +441,7 @@ def focus_vertices(position: ArrayLike, value: ArrayLike, sigma: ArrayLike, *, s
     fault = _faults(model, mask, vertex, second_derivative, covariance)
     fault[invalid.any(axis=1)] = "not finite"
     if strict:
-        _raise(fault, shape, z, weight, vertex, model.reach(WIDEST_FRACTION))
+        _raise(fault, shape, z, weight, vertex, model.half_width(WIDEST_FRACTION))
     used = np.zeros(z.shape, dtype=bool)
     np.put_along_axis(used, order, mask, axis=1)
     used[fault != ""] = False
@@ -492,7 +492,7 @@ def outlying_points(position: ArrayLike, value: ArrayLike, sigma: ArrayLike, lim
         if remaining.size <= LEAST_POINTS + 1:
             break
         fitted = focus_vertices(z, v, s, strict=False)
-        if not fitted.fault and chance_beyond(fitted.chi_square, max(fitted.degrees_of_freedom, 1)) > _EXPLAINED:
+        if not fitted.fault and p_value_of(fitted.chi_square, max(fitted.degrees_of_freedom, 1)) > _EXPLAINED:
             break
         pairs = np.stack(np.triu_indices(remaining.size if remaining.size <= _MOST_PAIRED else 0, 1), axis=1)
         for groups in (remaining[:, None], remaining[pairs]):
@@ -545,7 +545,7 @@ def _faults(
     # them; or there is no curvature, and the values rise toward the end.
     misfit = model.chi_square(mask) > _MISFIT * np.maximum(mask.sum(axis=1) - 3, 1)
     vertex_sigma = np.sqrt(covariance[:, 1, 1]) / model.scale
-    trend, half = _trend(model, mask), model.reach(WIDEST_FRACTION) / model.scale
+    trend, half = _trend(model, mask), model.half_width(WIDEST_FRACTION) / model.scale
     for sign, name, room in ((-1, "peak below", model.x0 - model.ends[0]), (1, "peak above", model.ends[1] - model.x0)):
         rising = sign * trend > _SIGNIFICANT
         # A vertex within two sigma of the end is not significantly inside.
@@ -573,7 +573,7 @@ def _trend(model: _Lobe, mask: NDArray[np.bool_]) -> Array:
 
 
 def _raise(
-    fault: NDArray[np.str_], shape: tuple[int, ...], z: Array, weight: Array, vertex: Array, reach: Array
+    fault: NDArray[np.str_], shape: tuple[int, ...], z: Array, weight: Array, vertex: Array, half_width: Array
 ) -> None:
     """Raise FocusError for curves without a usable vertex; the message names the first few with their reasons."""
     bad = np.flatnonzero(fault != "")
@@ -591,7 +591,7 @@ def _raise(
             "least": LEAST_POINTS,
             "place": vertex[b],
             # LEAST_POINTS in the window for any phase of the steps; less a quarter, because too few points look wide.
-            "step": 0.75 * 2 * reach[b] / LEAST_POINTS,
+            "step": 0.75 * 2 * half_width[b] / LEAST_POINTS,
         }
         text = _REMEDY[faults[index]].format(**values)
         lines.append(f"curve {', '.join(map(str, index))}: {text}" if index else text)

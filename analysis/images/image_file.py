@@ -231,9 +231,9 @@ def _opened(path: Path) -> Iterator[Any]:
     with path.open("rb") as file, warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         with fits.open(file, mode="readonly", memmap=False, lazy_load_hdus=False) as units:
-            cut = next((str(w.message) for w in caught if "truncated" in str(w.message)), "")
-            if cut:
-                raise ImageError(f"{path} cannot be read as an image: it is cut off ({cut})")
+            truncated = next((str(w.message) for w in caught if "truncated" in str(w.message)), "")
+            if truncated:
+                raise ImageError(f"{path} cannot be read as an image: it is cut off ({truncated})")
             yield units
 
 
@@ -437,7 +437,7 @@ def tiff_header(path: Path, wanted: int | None, choose: str) -> ImageHeader:
         elif bits == 8 and _ICC_PROFILE in page.tags:
             coded = "its 8-bit pages have a colour profile"
         orientation = page.tags.valueof(_ORIENTATION, 1)
-        rows, columns, channels = (1 if place is None else shape[place] for place in _AXES[axes])
+        rows, columns, channels = (1 if axis is None else shape[axis] for axis in _AXES[axes])
         used = page.bitspersample if isinstance(page.bitspersample, int) else None
         return ImageHeader(
             kind="TIFF",

@@ -30,7 +30,7 @@ import numpy as np
 from scipy.optimize import lsq_linear
 
 from analysis.arrays import Array, UndeterminedError, shows
-from analysis.statistics import chance_beyond, limit_of
+from analysis.statistics import limit_of, p_value_of
 from optics.numerics.array_math import covariance_root
 
 Predict = Callable[[Array], Array]
@@ -228,7 +228,7 @@ class ConsistencyTest:
     @classmethod
     def of(cls, name: str, chi_square: float, degrees: int) -> ConsistencyTest:
         """Return the test of a chi-square, with its p-value; without degrees of freedom the p-value is 1."""
-        p_value = float(chance_beyond(chi_square, degrees)) if degrees else 1.0
+        p_value = float(p_value_of(chi_square, degrees)) if degrees else 1.0
         return cls(name, float(chi_square), degrees, p_value)
 
     def passes(self, looks: int = 1, false_alarm: float = FALSE_ALARM) -> bool:
@@ -396,13 +396,13 @@ def estimate_state(
         )
         if worst is None or worst[2].passes(count):
             break
-        _, name, agreement = worst
+        _, name, contradiction = worst
         contradicted = next(group for group in groups if group.name == name)
         blocks = len(set(contradicted.blocks))
         if len(out.get(name, ())) + 1 > _MOST_EXCLUDED * blocks:
             break
-        out.setdefault(name, []).append(agreement.name)
-        excluded.append((name, agreement.name, agreement))
+        out.setdefault(name, []).append(contradiction.name)
+        excluded.append((name, contradiction.name, contradiction))
     fields = {key: getattr(estimate, key) for key in estimate.__dataclass_fields__}
     return StateEstimate(**fields | {"excluded": tuple(excluded)})
 

@@ -360,28 +360,28 @@ def _strength(rows: NDArray[np.generic]) -> NDArray[np.float32]:
     gain = (1.0 - np.exp(-1.0 / _SMOOTHING**2)) / (8.0 * np.pi * _SMOOTHING**2)
     least[least < _LEAST * gain * noise] = 0.0
     if missing.any():
-        reach = 2 * _HALO + 1
-        least[cv2.dilate(missing.astype(np.uint8), np.ones((reach, reach), np.uint8)) > 0] = 0.0
+        size = 2 * _HALO + 1
+        least[cv2.dilate(missing.astype(np.uint8), np.ones((size, size), np.uint8)) > 0] = 0.0
     return least.astype(np.float32)
 
 
-def _apart(points: NDArray[np.intp], reach: int) -> NDArray[np.intp]:
-    """Return the points without those closer than `reach` pixels, along rows and columns, to an earlier one."""
+def _apart(points: NDArray[np.intp], distance: int) -> NDArray[np.intp]:
+    """Return the points without those closer than `distance` pixels, along rows and columns, to an earlier one."""
     keep = np.zeros(len(points), bool)
-    # maxima are at least reach apart unless they are equal, so few share a cell of this size
-    side = reach + 1
+    # maxima are at least `distance` apart unless they are equal, so few share a cell of this size
+    side = distance + 1
     cells: dict[tuple[int, int], list[int]] = {}
     for k, (row, column) in enumerate(points.tolist()):
         cell = (row // side, column // side)
         neighbours = (j for r in (-1, 0, 1) for c in (-1, 0, 1) for j in cells.get((cell[0] + r, cell[1] + c), ()))
-        if any(max(abs(row - points[j, 0]), abs(column - points[j, 1])) <= reach for j in neighbours):
+        if any(max(abs(row - points[j, 0]), abs(column - points[j, 1])) <= distance for j in neighbours):
             continue
         keep[k] = True
         cells.setdefault(cell, []).append(k)
     return points[keep]
 
 
-LARGEST_REACH = 200
+LARGEST_RADIUS = 200
 """Largest half width of a search window, in pixels."""
 _LOBE = 3
 """Half width of the main lobe of the correlation around its best peak, in pixels; peaks beyond it are separate
@@ -415,8 +415,8 @@ class Peaks:
     reason: NDArray[np.int8]
 
 
-def search(image: ArrayLike, templates: ArrayLike, predicted: ArrayLike, reach: int) -> Peaks:
-    """Return the best position of each template within reach of its predicted position.
+def search(image: ArrayLike, templates: ArrayLike, predicted: ArrayLike, radius: int) -> Peaks:
+    """Return the best position of each template within the radius around its predicted position.
 
     Parameters
     ----------
@@ -426,19 +426,19 @@ def search(image: ArrayLike, templates: ArrayLike, predicted: ArrayLike, reach: 
         Templates of k x k pixels, n of them, in the image's geometry; k odd.
     predicted : (n, 2) array_like
         Expected row and column of their middles; the search starts from the nearest pixel.
-    reach : int
+    radius : int
         Half width of the search window along rows and columns, in pixels.
 
     Raises
     ------
     ValueError
-        A shape is wrong, or reach is not 1 to 200 px.
+        A shape is wrong, or radius is not 1 to 200 px.
     """
     plane = checked_image(image, "search")
     windows = checked_templates(templates, "search")
     expected = checked_positions(predicted, len(windows), "search")
-    if not 1 <= reach <= LARGEST_REACH:
-        raise ValueError(f"search: the reach must be 1 to {LARGEST_REACH} px, found {reach}; improve the prediction")
+    if not 1 <= radius <= LARGEST_RADIUS:
+        raise ValueError(f"search: the radius must be 1 to {LARGEST_RADIUS} px, found {radius}; improve the prediction")
     count = len(windows)
     positions, value, ratio = np.full((count, 2), np.nan), np.full(count, np.nan), np.full(count, np.nan)
     reason = np.zeros(count, np.int8)
@@ -446,16 +446,18 @@ def search(image: ArrayLike, templates: ArrayLike, predicted: ArrayLike, reach: 
         if not (np.isfinite(windows[k]).all() and np.isfinite(expected[k]).all()):
             reason[k] = Reason.TEMPLATE
             continue
-        positions[k], value[k], ratio[k], reason[k] = _best(plane, windows[k], np.rint(expected[k]), int(reach))
+        positions[k], value[k], ratio[k], reason[k] = _best(plane, windows[k], np.rint(expected[k]), int(radius))
     return Peaks(positions, value, ratio, reason)
 
 
-def _best(image: NDArray[np.generic], template: Array, middle: Array, reach: int) -> tuple[Array, float, float, Reason]:
+def _best(
+    image: NDArray[np.generic], template: Array, middle: Array, radius: int
+) -> tuple[Array, float, float, Reason]:
     """Return position, coefficient and peak ratio of the best match of one template, and the verdict."""
     no_position = np.full(2, np.nan)
     half = template.shape[0] // 2
     last = np.array(image.shape) - 1 - half
-    low, high = np.maximum(middle - reach, half), np.minimum(middle + reach, last)
+    low, high = np.maximum(middle - radius, half), np.minimum(middle + radius, last)
     if np.any(low > high) or np.any(middle < half) or np.any(middle > last):
         return no_position, np.nan, np.nan, Reason.OUTSIDE
     (top, left), (bottom, right) = (low - half).astype(int), (high + half + 1).astype(int)

@@ -89,7 +89,7 @@ _HELD = 0.3
 """Fraction of the curvature of the sum of squares above which template noise, not texture, counts as determining a
 position.
 """
-_ONE_WAY = 0.1
+_SINGLE_DIRECTION = 0.1
 """Curvature of the sum of squares along the worst direction, relative to that along the best, below which the texture
 of a window counts as running along one direction. As it is sharp across, no low-pass can be chosen that would
 otherwise remove the noise's energy.
@@ -98,7 +98,7 @@ _EQUAL = 0.6
 """Smallest noise ratio for locking: template and image have the same noise, of which interpolation passes two thirds.
 """
 # Half width of the impulse response, and number of sub-pixel phases at which it is computed.
-_REACH, _PHASES = 30, 64
+_IMPULSE_RADIUS, _PHASES = 30, 64
 
 
 @dataclass(frozen=True, eq=False)
@@ -151,7 +151,7 @@ class TemplateNoise:
         curvature = curvature - energy[determined]
         curvature[least <= energy[determined, 0, 0]] = np.nan
         lock = np.linalg.inv(curvature) @ energy[determined] / (2.0 * np.pi)
-        unaffected = (energy[determined, 0, 0] < _HELD * least) | (least > _ONE_WAY * most)
+        unaffected = (energy[determined, 0, 0] < _HELD * least) | (least > _SINGLE_DIRECTION * most)
         out[determined] = np.where(unaffected[:, None, None], 0.0, lock)
         return out
 
@@ -216,7 +216,7 @@ def template_noise(
     variance = np.einsum("np,np->n", residual[used], residual[used]) / (pixels - unknowns)
     bias_force = variance[:, None] * _force(position, linear[used], smoothing[used], by_geometry)
     lean[used] = np.einsum("nij,nj->ni", inverse[used, :2], bias_force)
-    mean, wave = np.moveaxis(np.array([_noise_gain(float(one)) for one in smoothing[used]])[:, :, 0], 1, 0)
+    mean, wave = np.moveaxis(np.array([_noise_gain(float(radius)) for radius in smoothing[used]])[:, :, 0], 1, 0)
     curvature[used] = 2.0 * np.pi**2 * pixels * variance * mean * wave
     square_sum, energy = lowered[0][used], lowered[1][used]
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -288,13 +288,13 @@ def _force(position: Array, linear: Array, smoothing: Array, by_geometry: Array)
     slope = -2.0 * np.pi * wave.T[:, :, None, None] * np.sin(phase)
     factors = linear[:, 1:]
     matrix = _products(energy[:, :, 0], energy[:, :, 1])[:, : factors.shape[1], : factors.shape[1]]
-    of_place = np.zeros((len(linear), by_geometry.shape[2]))
+    of_position = np.zeros((len(linear), by_geometry.shape[2]))
     for axis, pair in enumerate(((slope[:, :, 0], energy[:, :, 1]), (energy[:, :, 0], slope[:, :, 1]))):
         change = _products(*pair)[:, : factors.shape[1], : factors.shape[1]]
         along = np.einsum("ni,nijp,nj->np", factors, change, factors)
-        of_place -= 0.5 * np.einsum("nip,np->ni", by_geometry[:, axis], along)
+        of_position -= 0.5 * np.einsum("nip,np->ni", by_geometry[:, axis], along)
     of_linear = -np.einsum("nijp,nj->ni", matrix, factors)
-    force = np.concatenate([of_place, np.zeros((len(linear), 1)), of_linear], axis=1)
+    force = np.concatenate([of_position, np.zeros((len(linear), 1)), of_linear], axis=1)
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.asarray(force / linear[:, 1, None] ** 2)
 
@@ -338,12 +338,12 @@ def _noise_gain(smoothing: float) -> Array:
     The columns are those of the value, of value times second derivative (px^-2) and of the second derivative (px^-4);
     the rows are the mean over the phase of a pixel and the amplitude of its cosine, which is largest on whole pixels.
     """
-    size = 2 * _REACH + 1
+    size = 2 * _IMPULSE_RADIUS + 1
     impulse = np.zeros((1, size, size))
-    impulse[0, _REACH] = 1.0
+    impulse[0, _IMPULSE_RADIUS] = 1.0
     stack = SplineStack(low_passed(impulse, smoothing))
     rows = np.arange(10, size - 11) + np.arange(_PHASES)[:, None] / _PHASES
-    value = stack(rows, np.full(rows.shape, float(_REACH)), np.zeros(_PHASES, np.intp), order=2)
+    value = stack(rows, np.full(rows.shape, float(_IMPULSE_RADIUS)), np.zeros(_PHASES, np.intp), order=2)
     energy = np.stack([(value[0] ** 2).sum(axis=1), (value[0] * value[3]).sum(axis=1), (value[3] ** 2).sum(axis=1)])
     series = np.fft.rfft(energy, axis=1) / _PHASES
     out = np.stack([series[:, 0].real, 2.0 * series[:, 1].real])
@@ -365,7 +365,7 @@ _RIDGE = 1e-11
 _SMOOTHINGS = (0.0, 0.35, 0.7, 1.1, 1.7, 2.6)
 """RMS radii of the Gaussians that may smooth a template, in pixels; those up to a ninth of the window's side are used.
 """
-_CHANCE = 4.0
+_ACCEPTED_INCREASE = 4.0
 """Increase of chi-square, with one degree of freedom, that chance exceeds in 5 % of cases; a low-pass that increases
 the residuals by less is accepted.
 """
@@ -441,23 +441,23 @@ class Fits:
 
         The first includes the interpolation error. Relief means displacements that vary within the window.
         """
-        noise, hidden, tau, _usual = self._parts(good)
+        noise, inflation, tau, _usual = self._parts(good)
         relief = tau[:, None, None] * self.relief.effect
         common = self.reason == Reason.ACCEPTED if good is None else good
-        lean = self.template.covariance(common) + self.scales.excess(hidden, common)
-        return noise * hidden[:, None, None] + lean + _INTERPOLATION**2 * np.eye(2), relief
+        lean = self.template.covariance(common) + self.scales.excess(inflation, common)
+        return noise * inflation[:, None, None] + lean + _INTERPOLATION**2 * np.eye(2), relief
 
     def steps(self, good: NDArray[np.bool_] | None = None) -> tuple[Array, Array]:
         """Return p-value and power of the test for a displacement step between halves of each of n windows, each (n,).
 
         NaN where there is no fit.
         """
-        noise, hidden, _tau, typical = self._parts(good)
+        noise, inflation, _tau, typical = self._parts(good)
         # points without a covariance, because of template noise, use the median factor
         coloured = self._coloured(noise)
         shared = float(np.nanmedian(coloured)) if np.isfinite(coloured).any() else 1.0
         coloured = np.where(np.isfinite(coloured), coloured, shared)
-        return self.halves.judged(self.spread.variance * coloured * hidden, typical)
+        return self.halves.judged(self.spread.variance * coloured * inflation, typical)
 
     def _parts(self, good: NDArray[np.bool_] | None) -> tuple[Array, Array, Array, float]:
         """Return covariance due to residual noise, factor for noise hidden by smoothing, and variances of relief.
@@ -466,14 +466,14 @@ class Fits:
         """
         common = self.reason == Reason.ACCEPTED if good is None else good
         noise = self.spread.covariance(common)
-        return noise, self._hidden(), *self.relief.square(self.spread.variance, self._coloured(noise), common)
+        return noise, self._noise_inflation(), *self.relief.square(self.spread.variance, self._coloured(noise), common)
 
     def _coloured(self, noise: Array) -> Array:
         """Return the factor by which correlation of residuals raises the variance of each of n positions."""
         with np.errstate(invalid="ignore", divide="ignore"):
             return np.asarray(np.trace(noise, axis1=1, axis2=2) / np.trace(self.spread.plain, axis1=1, axis2=2))
 
-    def _hidden(self) -> Array:
+    def _noise_inflation(self) -> Array:
         """Return the factor by which the noise at slopes of the grey values exceeds that in the residuals, (n,).
 
         It is NaN where unknown. A smoothed template hides part of its noise from the residuals.
@@ -530,9 +530,11 @@ def least_squares(
 def _fit(image: NDArray[np.generic], templates: Array, start: Array, options: MatchOptions) -> Fits:
     """Fit the positions of a group of points at once; the arguments are those of `least_squares`."""
     count, half = len(templates), templates.shape[1] // 2
-    reach = half - options.margin
-    row, column = (g.ravel().astype(np.float64) for g in np.mgrid[-reach : reach + 1, -reach : reach + 1])
-    grey, anchor, reason = _windows(image, templates, start, reach, options)
+    half_width = half - options.margin
+    row, column = (
+        g.ravel().astype(np.float64) for g in np.mgrid[-half_width : half_width + 1, -half_width : half_width + 1]
+    )
+    grey, anchor, reason = _windows(image, templates, start, half_width, options)
     shift = start - anchor
     affine = np.tile(np.eye(2), (count, 1, 1))
     linear = np.full((count, options.parameters - 6), np.nan)
@@ -570,7 +572,7 @@ def _fit(image: NDArray[np.generic], templates: Array, start: Array, options: Ma
             )
             size = np.abs(step[:, :2]).max(axis=1)
             affine_step = step[:, 2:6].reshape(-1, 2, 2)
-            converged = np.maximum(size, reach * np.abs(affine_step).max(axis=(1, 2))) < _REST
+            converged = np.maximum(size, half_width * np.abs(affine_step).max(axis=(1, 2))) < _REST
             moved = iteration > 0
             damping = np.minimum(1.0, _LONGEST_STEP / np.maximum(size, 1e-300))[:, None]
             if moved:
@@ -598,23 +600,33 @@ def _fit(image: NDArray[np.generic], templates: Array, start: Array, options: Ma
         lowered,
     )
     return _summary(
-        grey, anchor + shift, affine, linear, design, residual, smoothing, iterations, reason, reach, noise_of_template
+        grey,
+        anchor + shift,
+        affine,
+        linear,
+        design,
+        residual,
+        smoothing,
+        iterations,
+        reason,
+        half_width,
+        noise_of_template,
     )
 
 
 def _windows(
-    image: NDArray[np.generic], templates: Array, start: Array, reach: int, options: MatchOptions
+    image: NDArray[np.generic], templates: Array, start: Array, half_width: int, options: MatchOptions
 ) -> tuple[Array, Array, NDArray[np.int8]]:
     """Return the p grey values of n windows (n, p), their middles (n, 2), and why a window is unusable."""
     reason = np.zeros(len(templates), np.int8)
     anchor = np.rint(start)
-    fits = np.all((anchor >= reach) & (anchor <= np.array(image.shape) - 1 - reach), axis=1)
+    fits = np.all((anchor >= half_width) & (anchor <= np.array(image.shape) - 1 - half_width), axis=1)
     reason[~fits] = Reason.OUTSIDE
     reason[~(np.isfinite(templates).all(axis=(1, 2)) & np.isfinite(start).all(axis=1))] = Reason.TEMPLATE
-    offset = np.arange(-reach, reach + 1)
+    offset = np.arange(-half_width, half_width + 1)
     usable = np.flatnonzero(reason == 0)
     rows, columns = (anchor[usable, k, None].astype(np.intp) + offset for k in range(2))
-    grey = np.zeros((len(templates), (2 * reach + 1) ** 2))
+    grey = np.zeros((len(templates), (2 * half_width + 1) ** 2))
     grey[usable] = image[rows[:, :, None], columns[:, None, :]].reshape(usable.size, grey.shape[1])
     finite = np.isfinite(grey).all(axis=1)
     reason[~finite] = Reason.IMAGE
@@ -661,7 +673,7 @@ def _best_smoothing(
         square[k] = np.einsum("np,np->n", residual, residual)
         energy[k] = noise_energy(step[:, 7:], smoothing)
     # take the strongest: too little smoothing is overconfident, too much loses little accuracy
-    acceptable = square <= square.min(axis=0) * (1.0 + _CHANCE / grey.shape[1])
+    acceptable = square <= square.min(axis=0) * (1.0 + _ACCEPTED_INCREASE / grey.shape[1])
     best[selected] = radius_count - 1 - np.argmax(acceptable[::-1], axis=0)
     chosen = best[selected], np.arange(selected.size)
     for decrease, values in zip(lowered, (square, energy), strict=True):
@@ -725,7 +737,7 @@ def _summary(
     smoothing: Array,
     iterations: Index,
     reason: NDArray[np.int8],
-    reach: int,
+    half_width: int,
     template_noise_effect: TemplateNoise,
 ) -> Fits:
     """Return the converged fits with their statistics and the checks of their windows."""
@@ -736,7 +748,7 @@ def _summary(
     redundancy = grey.shape[1] - design.shape[1]
     with np.errstate(invalid="ignore", divide="ignore"):
         correlation = np.sqrt(np.maximum(1.0 - square / total, 0.0)) * np.sign(linear[:, 1])
-        side = 2 * reach + 1
+        side = 2 * half_width + 1
         plane = grey.reshape(-1, side, side)
         checker = plane[:, 1:, 1:] - plane[:, 1:, :-1] - plane[:, :-1, 1:] + plane[:, :-1, :-1]
         contrast = np.sqrt(total / grey.shape[1]) / (

@@ -195,7 +195,7 @@ def _block_ratio(plane: NDArray[np.generic]) -> float:
 
 
 def _without_steps(
-    reason: NDArray[np.int8], silent: NDArray[np.bool_], chance: Array, power: Array, options: MatchOptions
+    reason: NDArray[np.int8], silent: NDArray[np.bool_], p_value: Array, power: Array, options: MatchOptions
 ) -> NDArray[np.int8]:
     """Return the verdicts after the test for displacement steps within windows.
 
@@ -204,9 +204,9 @@ def _without_steps(
     """
     tested = reason == Reason.ACCEPTED
     # NaN compares false
-    step = tested & ~(chance >= FALSE_ALARM)
+    step = tested & ~(p_value >= FALSE_ALARM)
     counted = tested | silent
-    share = float(np.sum(step | (silent & (chance < FALSE_ALARM)))) / max(int(counted.sum()), 1)
+    share = float(np.sum(step | (silent & (p_value < FALSE_ALARM)))) / max(int(counted.sum()), 1)
     weak = tested & ~step & ~(risk(share, power) <= options.largest_risk)
     return np.where(step, Reason.RELIEF, np.where(weak, Reason.UNTESTED, reason)).astype(np.int8)
 
@@ -363,21 +363,21 @@ def consensus(
     >>> round(agreed.scatter, 2)
     0.09
     """
-    place = checked_positions(predicted, None, "consensus")
-    to = checked_positions(matched, len(place), "consensus")
+    start = checked_positions(predicted, None, "consensus")
+    to = checked_positions(matched, len(start), "consensus")
     if not (0 <= degree <= 3 and 0 < false_alarm < 0.5 and largest_scatter > 0):
         raise ValueError(
             f"consensus: need a degree of 0 to 3, a false alarm rate below 0.5 and a positive largest scatter; found "
             f"{degree}, {false_alarm}, {largest_scatter}"
         )
-    spread = np.zeros((len(place), 2, 2)) if covariance is None else np.asarray(covariance, np.float64)
+    spread = np.zeros((len(start), 2, 2)) if covariance is None else np.asarray(covariance, np.float64)
     heights = None if height is None else np.asarray(height, np.float64)
-    if spread.shape != (len(place), 2, 2) or (heights is not None and heights.shape != (len(place),)):
+    if spread.shape != (len(start), 2, 2) or (heights is not None and heights.shape != (len(start),)):
         raise ValueError(
-            f"consensus: {len(place)} points need covariances ({len(place)}, 2, 2) and heights ({len(place)},), found "
+            f"consensus: {len(start)} points need covariances ({len(start)}, 2, 2) and heights ({len(start)},), found "
             f"{spread.shape} and {None if heights is None else heights.shape}"
         )
-    usable = np.isfinite(place).all(axis=1) & np.isfinite(to).all(axis=1) & np.isfinite(spread).all(axis=(1, 2))
+    usable = np.isfinite(start).all(axis=1) & np.isfinite(to).all(axis=1) & np.isfinite(spread).all(axis=(1, 2))
     usable &= True if heights is None else np.isfinite(heights)
     terms = (degree + 1) * (degree + 2) // 2 + (heights is not None)
     if usable.sum() < max(2 * terms, 5):
@@ -386,12 +386,12 @@ def consensus(
             "match more points or lower the degree"
         )
     used_heights = heights[usable] if heights is not None else None
-    empty = _unfitted_field(place[usable], used_heights, degree, terms)
-    design, displacement, noise = _terms(place[usable], used_heights, empty), (to - place)[usable], spread[usable]
+    empty = _unfitted_field(start[usable], used_heights, degree, terms)
+    design, displacement, noise = _terms(start[usable], used_heights, empty), (to - start)[usable], spread[usable]
     limit = math.sqrt(-2.0 * math.log(false_alarm))
     coefficients = _best_candidate(design, displacement, np.random.default_rng(0))
     inside, coefficients, scatter, distance = _converged(design, displacement, noise, coefficients, limit)
-    accepted, apart = np.zeros(len(place), bool), np.full(len(place), np.nan)
+    accepted, apart = np.zeros(len(start), bool), np.full(len(start), np.nan)
     accepted[usable], apart[usable] = inside, distance
     share = (
         f"{int(inside.sum())} of {int(usable.sum())} matches agree within {limit:.1f} sigma (scatter {scatter:.3g} px)"

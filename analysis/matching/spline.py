@@ -93,8 +93,8 @@ def _fill(sample: Array, image: NDArray[np.generic], row: Array, column: Array, 
         crop = ndimage.gaussian_filter(crop, smoothing, mode="mirror", truncate=5.0)
     value = ndimage.map_coordinates(crop, positions, order=_DEGREE, mode="mirror")
     if missing.any():
-        reach = _SUPPORT + int(np.ceil(3.0 * smoothing))
-        near = ndimage.binary_dilation(missing, np.ones((2 * reach + 1, 2 * reach + 1)))
+        radius = _SUPPORT + int(np.ceil(3.0 * smoothing))
+        near = ndimage.binary_dilation(missing, np.ones((2 * radius + 1, 2 * radius + 1)))
         value[near[tuple(np.rint(positions).astype(np.intp))]] = np.nan
     sample[inside] = value
 
@@ -106,10 +106,10 @@ def low_passed(templates: Array, smoothing: float) -> Array:
     """
     if not smoothing:
         return templates
-    reach = int(np.ceil(4.0 * smoothing))
-    wide = np.pad(templates, ((0, 0), (reach, reach), (reach, reach)), mode="reflect", reflect_type="odd")
+    margin = int(np.ceil(4.0 * smoothing))
+    wide = np.pad(templates, ((0, 0), (margin, margin), (margin, margin)), mode="reflect", reflect_type="odd")
     wide = ndimage.gaussian_filter(wide, (0.0, smoothing, smoothing), truncate=4.0)
-    return np.asarray(wide[:, reach:-reach, reach:-reach])
+    return np.asarray(wide[:, margin:-margin, margin:-margin])
 
 
 class SplineStack:

@@ -98,8 +98,8 @@ class WindowHalves:
             square = ((d * x**2 - 2.0 * b * x * y + a * y**2) / (a * d - b**2)).max(axis=1)
             worst = (0.5 * (a + d) + np.hypot(0.5 * (a - d), b)).max(axis=1)
         # chi-square of two; the largest of the splits
-        chance = np.minimum(SPLITS * np.exp(-0.5 * square), 1.0)
-        return chance, np.asarray(ncx2.sf(_CRITICAL, 2, STEP**2 / worst))
+        p_value = np.minimum(SPLITS * np.exp(-0.5 * square), 1.0)
+        return p_value, np.asarray(ncx2.sf(_CRITICAL, 2, STEP**2 / worst))
 
 
 def risk(share: float, power: Array) -> Array:
@@ -277,12 +277,12 @@ def residual_correlation(
     return ResidualCorrelation(variance, white, influence, correlation, *size)
 
 
-_Cut = tuple[EllipsisType, slice, slice]
+_Window = tuple[EllipsisType, slice, slice]
 
 
-def _overlap(side: int, row: int, column: int) -> tuple[_Cut, _Cut]:
+def _overlap(side: int, row: int, column: int) -> tuple[_Window, _Window]:
     """Return slices of the pixels of a window that have a neighbour at a lag, and of these neighbours."""
-    here: _Cut = (..., slice(0, side - row), slice(max(-column, 0), side - max(column, 0)))
+    here: _Window = (..., slice(0, side - row), slice(max(-column, 0), side - max(column, 0)))
     return here, (..., slice(row, side), slice(max(column, 0), side - max(-column, 0)))
 
 
@@ -355,8 +355,8 @@ class WindowScales:
         weight /= weight.sum()
         noise = np.einsum("n,nij->ij", weight, covariance[common])
         value, vector = np.linalg.eigh(np.einsum("n,ni,nj->ij", weight, clipped, clipped) - noise)
-        chance = np.sqrt(2.0 * np.sum(weight**2)) * np.einsum("ik,ij,jk->k", vector, noise, vector)
-        shared = (vector * np.where(value > _SIGNIFICANT * chance, value, 0.0)) @ vector.T
+        noise_level = np.sqrt(2.0 * np.sum(weight**2)) * np.einsum("ik,ij,jk->k", vector, noise, vector)
+        shared = (vector * np.where(value > _SIGNIFICANT * noise_level, value, 0.0)) @ vector.T
         out += shared
         discordant = np.zeros(len(out), bool)
         discordant[determined] = _square(self.apart[determined], covariance[determined] + shared) > _DISCORDANT
@@ -421,7 +421,7 @@ _LENGTH = 1.0
 """Correlation length of the relief over the window's side: a shorter one would act as noise on the affine change, a
 longer one follows it.
 """
-_OWN = 4.0
+_SIGNIFICANT_SIGMAS = 4.0
 """Relief variance tau^2 of a point, in units of its standard deviation without relief, above which the point uses its
 own value and not the common one; chance exceeds it with a probability of about 1e-3.
 """
@@ -480,7 +480,7 @@ class WindowRelief:
             error = variance * coloured * np.sqrt(2.0 * self.second) / rise
         determined = np.isfinite(estimate) & (rise > 0) & (error > 0)
         significant = np.zeros(len(estimate), bool)
-        significant[determined] = estimate[determined] > _OWN * error[determined]
+        significant[determined] = estimate[determined] > _SIGNIFICANT_SIGMAS * error[determined]
         common = determined & good
         weight = 1.0 / error[common] ** 2
         # limit outliers instead of excluding them, which would make the common relief too small

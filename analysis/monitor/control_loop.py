@@ -57,8 +57,8 @@ def open_loop(gain: float, delay: int, frequency: ArrayLike) -> NDArray[np.compl
     frequency : array_like
         Frequency, of any shape, cycles per reading, above 0 up to 0.5.
     """
-    turn = np.exp(-2j * np.pi * np.asarray(frequency, np.float64))
-    return np.asarray(gain * turn ** (delay + 1) / (1.0 - turn))
+    delay_factor = np.exp(-2j * np.pi * np.asarray(frequency, np.float64))
+    return np.asarray(gain * delay_factor ** (delay + 1) / (1.0 - delay_factor))
 
 
 def rejection(gain: float, delay: int, frequency: ArrayLike) -> Array:
@@ -76,8 +76,10 @@ def rejection(gain: float, delay: int, frequency: ArrayLike) -> Array:
     frequency : array_like
         Frequency, of any shape, cycles per reading, above 0 up to 0.5.
     """
-    turn = np.exp(-2j * np.pi * np.asarray(frequency, np.float64))
-    return np.asarray(np.abs(1.0 - gain * turn**delay / (1.0 - turn + gain * turn ** (delay + 1))))
+    delay_factor = np.exp(-2j * np.pi * np.asarray(frequency, np.float64))
+    return np.asarray(
+        np.abs(1.0 - gain * delay_factor**delay / (1.0 - delay_factor + gain * delay_factor ** (delay + 1)))
+    )
 
 
 @dataclass(frozen=True)
@@ -155,13 +157,13 @@ def spectral_radius(
     first: dict[int, int] = {}
     for k in acting:
         first.setdefault(named[k], k)
-    rows, place = list(first.values()), {name: at for at, name in enumerate(first)}
+    rows, row = list(first.values()), {name: at for at, name in enumerate(first)}
     n, longest = len(rows), max(int(delays[k]) for k in acting)
     # states are sums of what was left, of each quantity over what its first mechanism does, the newest first
     step = np.zeros((n * (longest + 1),) * 2)
     step[:n, :n] = np.eye(n)
     for k in acting:
-        at = place[named[k]]
+        at = row[named[k]]
         step[:n, n * int(delays[k]) + at] -= g[k] * coupling_matrix[rows, k] / coupling_matrix[rows[at], k]
     step[n:, : n * longest] = np.eye(n * longest)
     return float(np.abs(np.linalg.eigvals(step)).max())
@@ -249,15 +251,17 @@ def limit_cycle(gain: float, delay: int, dead_band: float = 0.0) -> LimitCycle:
         command = np.concatenate([command[:1] - change, command[:-1]])
         if k >= _SETTLING:
             seen.append(np.round(command[delay]))
-    places = np.array(seen)
-    steps = np.ptp(places, axis=0)
-    periods = [_period(column) for column in places.T[steps > 0.0]]
-    return LimitCycle(int(steps.max()), float(np.abs(offset + places).max()), float(max(periods)) if periods else 0.0)
+    positions = np.array(seen)
+    steps = np.ptp(positions, axis=0)
+    periods = [_period(column) for column in positions.T[steps > 0.0]]
+    return LimitCycle(
+        int(steps.max()), float(np.abs(offset + positions).max()), float(max(periods)) if periods else 0.0
+    )
 
 
-def _period(places: Array) -> float:
+def _period(positions: Array) -> float:
     """Return the number of readings after which the positions of a mechanism repeat; NaN if they do not."""
-    for length in range(1, len(places) // 2):
-        if np.array_equal(places[length:], places[:-length]):
+    for length in range(1, len(positions) // 2):
+        if np.array_equal(positions[length:], positions[:-length]):
             return float(length)
     return math.nan

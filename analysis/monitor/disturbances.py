@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from analysis.arrays import Array, shows
-from analysis.statistics import chance_beyond, density, limit_of
+from analysis.statistics import density, limit_of, p_value_of
 from optics.numerics.arguments import check_fields, checked
 from optics.numerics.array_math import covariance_root
 
@@ -89,12 +89,12 @@ class TimeLaw:
             if value is not None and not value > 0.0:
                 raise ValueError(f"time law: {name} must be positive, found {value}")
 
-    def covariance(self, one: ArrayLike, two: ArrayLike) -> Array:
+    def covariance(self, time: ArrayLike, other_time: ArrayLike) -> Array:
         """Return the covariance between the disturbance's values at two times, in units of the prior variance.
 
         The arguments are times in seconds, of shapes that broadcast; the result has their common shape.
         """
-        first, second = np.asarray(one, np.float64), np.asarray(two, np.float64)
+        first, second = np.asarray(time, np.float64), np.asarray(other_time, np.float64)
         away = np.abs(first - second)
         if self.jump:
             return np.zeros_like(away)
@@ -113,11 +113,11 @@ class TimeLaw:
 
     def step_probability(self, time: ArrayLike) -> Array:
         """Return the probability that the step of an event has occurred by a time in seconds (any shape)."""
-        at, chance = np.array(self.event).T
+        at, probability = np.array(self.event).T
         when = np.asarray(time, np.float64)
         if len(at) == 1:
-            return np.asarray((when >= at[0]) * chance[0])
-        return np.asarray(np.interp(when, at, chance))
+            return np.asarray((when >= at[0]) * probability[0])
+        return np.asarray(np.interp(when, at, probability))
 
     def two_time_moments(self, then: float, now: float) -> tuple[float, float, float]:
         """Return the variance at an earlier time, the covariance with a later time, and the variance at the later time.
@@ -460,13 +460,13 @@ class Consistency:
         return self.chi_square <= self.limit
 
     @property
-    def chance(self) -> float:
+    def p_value(self) -> float:
         """Probability of a chi-square at least this large if the prior is right (p-value)."""
-        return float(chance_beyond(self.chi_square, self.degrees))
+        return float(p_value_of(self.chi_square, self.degrees))
 
     @property
-    def chance_sigma_noise(self) -> float:
-        """Standard deviation of the p-value ``chance`` due to the noise of the images, to first order."""
+    def p_value_sigma_noise(self) -> float:
+        """Standard deviation of the p-value ``p_value`` due to the noise of the images, to first order."""
         return float(density(self.chi_square, self.degrees)) * self.sigma_noise
 
     @staticmethod
@@ -482,10 +482,10 @@ class Consistency:
         degrees : int
             Number of spot coordinates.
         """
-        return float(chance_beyond(limit_of(FALSE_ALARM, degrees) / times**2, degrees))
+        return float(p_value_of(limit_of(FALSE_ALARM, degrees) / times**2, degrees))
 
 
-def chi_squares(shifts: Array, noise: Array, stated: Disturbances) -> Array:
+def chi_squares(shifts: Array, noise: Array, prior: Disturbances) -> Array:
     """Return the chi-square of each of T measurements against the prior, (T,), without a search for causes.
 
     Dimensions: D spot coordinates (row and column of every spot).
@@ -496,16 +496,16 @@ def chi_squares(shifts: Array, noise: Array, stated: Disturbances) -> Array:
         Measured shifts, px.
     noise : (T, D, D) ndarray
         Covariance of the spot shifts due to noise, px^2.
-    stated : Disturbances
+    prior : Disturbances
         Prior of the disturbances (motions of bodies), with their effects on spots and parameters.
     """
-    return np.array([consistency(s, r, stated, {}, 0.0).chi_square for s, r in zip(shifts, noise, strict=True)])
+    return np.array([consistency(s, r, prior, {}, 0.0).chi_square for s, r in zip(shifts, noise, strict=True)])
 
 
 def consistency(
     shift: Array,
     noise: Array,
-    stated: Disturbances,
+    prior: Disturbances,
     others: Mapping[str, Array] | None = None,
     false_alarm: float = FALSE_ALARM,
 ) -> Consistency:
@@ -519,7 +519,7 @@ def consistency(
         Measured shifts, px.
     noise : (D, D) ndarray
         Covariance of the spot shifts due to noise, px^2.
-    stated : Disturbances
+    prior : Disturbances
         Prior of the disturbances (motions of bodies), with their effects on spots and parameters.
     others : mapping of str to (D, k) ndarray, or None
         Further bodies that the prior does not contain, with the spot shifts of their motions, px, that are tested as
@@ -528,7 +528,7 @@ def consistency(
         Probability that shifts in accordance with the prior are called a contradiction; for one of T measurements that
         are tested together, a T-th of the common probability.
     """
-    spread = stated.spot_covariance + noise
+    spread = prior.spot_covariance + noise
     root = np.linalg.cholesky(spread)
     white = np.linalg.solve(root, shift)
     square, count = float(white @ white), len(shift)
@@ -537,7 +537,7 @@ def consistency(
     moved = 2.0 * float(np.sqrt(slope @ noise @ slope))
     if square <= limit:
         return Consistency(square, count, limit, (), false_alarm, moved)
-    candidates = {body: stated.spots[:, [b == body for b in stated.bodies]] for body in dict.fromkeys(stated.bodies)}
+    candidates = {body: prior.spots[:, [b == body for b in prior.bodies]] for body in dict.fromkeys(prior.bodies)}
     candidates |= {body: np.asarray(table) for body, table in (others or {}).items() if body not in candidates}
     suspects = []
     for body, table in candidates.items():

@@ -86,13 +86,13 @@ class Estimator(ABC):
         Name shown in tables and reports: the name in files with blanks instead of underscores.
     note : str
         Description shown in reports.
-    stated : bool
+    needs_prior : bool
         True if it needs a prior of the disturbances (motions of bodies); without one it is not in the results.
     """
 
     title: str
     note: str
-    stated: bool = False
+    needs_prior: bool = False
 
     def applies(self, cameras: Mapping[str, CameraCalibration], disturbances: Disturbances | None) -> bool:
         """Return True if the estimator can be used with these cameras and this prior.
@@ -104,7 +104,7 @@ class Estimator(ABC):
         disturbances : Disturbances or None
             Prior of the disturbances; None if there is none.
         """
-        return disturbances is not None or not self.stated
+        return disturbances is not None or not self.needs_prior
 
     @abstractmethod
     def gain(self, shifts: Shifts) -> Array:
@@ -265,17 +265,17 @@ class Posterior(Estimator):
 
     title: str = "posterior"
     note: str = "best linear unbiased prediction from all spots under the stated disturbances"
-    stated: bool = True
+    needs_prior: bool = True
 
     def gain(self, shifts: Shifts) -> Array:
         """Return the gain of the best linear prediction, (S, 4 K, 2 C) rad and m per px.
 
         Dimensions: S states, K cameras, C spots. ValueError is raised without a prior.
         """
-        stated = shifts.disturbances
-        if stated is None:
+        prior = shifts.disturbances
+        if prior is None:
             raise ValueError("posterior: needs stated disturbances")
-        return stated.best_gain(shifts.covariance)
+        return prior.best_gain(shifts.covariance)
 
 
 _ESTIMATORS: dict[str, Estimator] = {

@@ -299,13 +299,13 @@ class JumpingBody:
 
 
 def jumping_bodies(
-    stated: Disturbances, may: Sequence[Candidate], otherwise: float | None = None
+    prior: Disturbances, may: Sequence[Candidate], otherwise: float | None = None
 ) -> tuple[JumpingBody, ...]:
     """Return the bodies of which all jumping motions have a known rate.
 
     Parameters
     ----------
-    stated : Disturbances
+    prior : Disturbances
         Prior of the disturbances (motions of bodies), with their effects on spots and parameters.
     may : sequence of Candidate
         Motions, alone or of one body together, that may jump.
@@ -315,7 +315,7 @@ def jumping_bodies(
     out = []
     for body in dict.fromkeys(c.body for c in may):
         c = max((c for c in may if c.body == body), key=lambda c: len(c.motions))
-        rates = [otherwise if (rate := stated.laws[k].every_s) is None else rate for k in c.motions]
+        rates = [otherwise if (rate := prior.laws[k].every_s) is None else rate for k in c.motions]
         intervals = [rate for rate in rates if rate is not None]
         if len(intervals) == len(rates):
             out.append(JumpingBody(c.motions, c.spots, c.root, min(intervals)))
@@ -344,7 +344,7 @@ class Hint:
     covariance: Array
 
     @classmethod
-    def of(cls, looked: tuple[Array, Array], own: tuple[Array, Array], outputs: Array, expected: Array) -> Hint:
+    def of(cls, looked: tuple[Array, Array], evidence: tuple[Array, Array], outputs: Array, expected: Array) -> Hint:
         """Compute the hypotheses from the scores and information of steps.
 
         Dimensions: L gaps between readings, in each of which a step may have occurred, q values that readings can
@@ -354,7 +354,7 @@ class Hint:
         ----------
         looked : tuple of ndarray
             Score (L, q) and information (L, q, q) of steps from which the weights of the hypotheses are computed.
-        own : tuple of ndarray
+        evidence : tuple of ndarray
             Score and information of steps from which the amounts of the jump are computed.
         outputs : (q, r) ndarray
             Effect on the outputs of the r independent amounts of unit prior variance that make up the jump.
@@ -363,8 +363,8 @@ class Hint:
         """
         logs, means, squares = [], [], []
         for times in _SCALES:
-            amounts = Amounts.of(*own, outputs, times)
-            judged = amounts if looked is own else Amounts.of(*looked, outputs, times)
+            amounts = Amounts.of(*evidence, outputs, times)
+            judged = amounts if looked is evidence else Amounts.of(*looked, outputs, times)
             logs.append(judged.log_weight)
             means.append(amounts.mean)
             squares.append(amounts.covariance + amounts.mean[:, :, None] * amounts.mean[:, None, :])
@@ -377,7 +377,7 @@ class Hint:
         return cls(weight, mean, square - mean[:, :, None] * mean[:, None, :])
 
 
-def _chances(hints: Sequence[Hint], window: int | None = None) -> list[Array]:
+def _jump_probabilities(hints: Sequence[Hint], window: int | None = None) -> list[Array]:
     """Return for each body the probability of a jump before each reading, (L,), with at most one jump in a window.
 
     The window extends over the given number of readings on either side, or over all.
@@ -411,13 +411,13 @@ def mixture(mean: Array, covariance: Array, hints: Sequence[Hint], moved: Sequen
     moved : sequence of (L, n, r) ndarrays
         For each body, derivatives of the present states with respect to the amounts of a jump before each reading.
     """
-    probabilities = _chances(hints)
+    probabilities = _jump_probabilities(hints)
     away = [np.einsum("knr,kr->kn", m, hint.mean) for m, hint in zip(moved, hints, strict=True)]
     shift = np.asarray(sum(p @ a for p, a in zip(probabilities, away, strict=True)))
     out = covariance - np.outer(shift, shift)
-    for chance, each, m, hint in zip(probabilities, away, moved, hints, strict=True):
-        inner = np.matmul(chance[:, None, None] * m, hint.covariance)
-        out = out + (chance[:, None] * each).T @ each + np.tensordot(inner, m, axes=([0, 2], [0, 2]))
+    for probability, each, m, hint in zip(probabilities, away, moved, hints, strict=True):
+        inner = np.matmul(probability[:, None, None] * m, hint.covariance)
+        out = out + (probability[:, None] * each).T @ each + np.tensordot(inner, m, axes=([0, 2], [0, 2]))
     return mean + shift, 0.5 * (out + out.T)
 
 
@@ -451,9 +451,9 @@ def undetected_variance(
         evidence = b, j
         hints.append(Hint.of(evidence, evidence, np.eye(len(body.motions)), gap / body.every_s))
     out = []
-    for body, hint, chance in zip(bodies, hints, _chances(hints, window // 2), strict=True):
+    for body, hint, probability in zip(bodies, hints, _jump_probabilities(hints, window // 2), strict=True):
         square = (hint.mean @ body.root.T) ** 2 + np.einsum("ij,kjl,il->ki", body.root, hint.covariance, body.root)
-        over = np.divide(chance * body.every_s, gap, out=np.zeros_like(gap), where=gap > 0.0)
+        over = np.divide(probability * body.every_s, gap, out=np.zeros_like(gap), where=gap > 0.0)
         out.append(_AGAIN * over[:, None] * square)
     return out
 
@@ -493,7 +493,7 @@ def may_be_bad(bad: BadReading | None, log_odds: float, recent: Sequence[bool]) 
     return bad is not None and bad.log_ratio > _UNSURE and log_odds > _SURE and sum(recent) < _MOST
 
 
-def chance_good(log_odds: float) -> float:
+def probability_good(log_odds: float) -> float:
     """Return the probability with which a reading that was set aside still counts as good until it is decided.
 
     Parameters

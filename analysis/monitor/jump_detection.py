@@ -128,11 +128,11 @@ class Jump:
         Sizes of the jump in these units, and their standard deviations.
     after, until : float
         Times of the measurements between which it is most likely, s.
-    chances : tuple of (float, float)
+    time_distribution : tuple of (float, float)
         Pairs (time, probability that it has occurred by then), s, linear between.
     log_ratio : float
         Logarithm of the ratio of the likelihoods with it and without it.
-    chance : float
+    false_alarm : float
         Upper bound of the probability of as large a ratio anywhere in a series without a jump.
     rivals : mapping of str to float
         Best log ratio of other bodies at the same time, best first.
@@ -160,9 +160,9 @@ class Jump:
     sigmas: tuple[float, ...]
     after: float
     until: float
-    chances: tuple[tuple[float, float], ...]
+    time_distribution: tuple[tuple[float, float], ...]
     log_ratio: float
-    chance: float
+    false_alarm: float
     rivals: Mapping[str, float]
     times: float
     parts: tuple[tuple[tuple[int, ...], float], ...] = ()
@@ -174,7 +174,7 @@ class Jump:
     @cached_property
     def law(self) -> TimeLaw:
         """Time law of the jump once it is detected: a step with a known distribution of its time."""
-        return TimeLaw(event=self.chances)
+        return TimeLaw(event=self.time_distribution)
 
     def to_dict(self) -> dict[str, Any]:
         """Return the jump as plain data for the JSON files of results."""
@@ -185,7 +185,7 @@ class Jump:
             "until_s": self.until,
             "sizes": [{"name": n, "unit": u, "size": z, "sigma": s} for n, u, z, s in amounts],
             "log_ratio": self.log_ratio,
-            "false_alarm": self.chance,
+            "false_alarm": self.false_alarm,
             "rivals": [{"body": body, "log_ratio": ratio} for body, ratio in self.rivals.items()],
         }
 
@@ -200,7 +200,7 @@ class Step:
     ----------
     parts : tuple of (tuple of int, float)
         Motions and variance relative to the prior of each independent part of the step.
-    chances : tuple of (float, float)
+    time_distribution : tuple of (float, float)
         Pairs (time, probability that it has occurred by then), s, in the order of time, linear between; one pair (time,
         1) for a known time.
     moment : (D + P, D + P) ndarray or None
@@ -209,7 +209,7 @@ class Step:
     """
 
     parts: tuple[tuple[tuple[int, ...], float], ...]
-    chances: tuple[tuple[float, float], ...]
+    time_distribution: tuple[tuple[float, float], ...]
     moment: Array | None = None
 
     @classmethod
@@ -227,14 +227,14 @@ class Step:
             spread, spots = np.array(jump.spread), slice(jump.width)
             seen = spread[:, spots] @ np.linalg.pinv(spread[spots, spots], hermitian=True) @ spread[spots]
             moment = _TWO_VALUED * np.outer(change, change) + spread + _AGAIN * seen
-        return cls(jump.parts or ((jump.motions, jump.times**2),), jump.chances, moment)
+        return cls(jump.parts or ((jump.motions, jump.times**2),), jump.time_distribution, moment)
 
     def step_probability(self, time: float) -> float:
         """Return the probability that the step has occurred by a time in seconds."""
-        at, chance = np.array(self.chances).T
+        at, probability = np.array(self.time_distribution).T
         if len(at) == 1:
-            return float((time >= at[0]) * chance[0])
-        return float(np.interp(time, at, chance))
+            return float((time >= at[0]) * probability[0])
+        return float(np.interp(time, at, probability))
 
 
 @dataclass(frozen=True, eq=False)
@@ -281,24 +281,24 @@ class Amounts:
         return cls(mean, covariance, 0.5 * (np.sum(mean * score, axis=1) - size))
 
 
-def candidates(stated: Disturbances) -> tuple[Candidate, ...]:
+def candidates(prior: Disturbances) -> tuple[Candidate, ...]:
     """Return the sets of motions that are tested for jumps: each that may jump alone, and those of a body together.
 
     Parameters
     ----------
-    stated : Disturbances
+    prior : Disturbances
         Prior of the disturbances; motions that move no spot are excluded.
     """
-    jumping = [k for k, law in enumerate(stated.laws) if law.jump and np.any(stated.spots[:, k])]
+    jumping = [k for k, law in enumerate(prior.laws) if law.jump and np.any(prior.spots[:, k])]
     bodies: dict[str, list[int]] = {}
     for k in jumping:
-        bodies.setdefault(stated.bodies[k], []).append(k)
+        bodies.setdefault(prior.bodies[k], []).append(k)
     groups = [(k,) for k in jumping] + [tuple(members) for members in bodies.values() if len(members) > 1]
     out = []
     for members in groups:
-        values, vectors = np.linalg.eigh(stated.correlation[np.ix_(members, members)])
+        values, vectors = np.linalg.eigh(prior.correlation[np.ix_(members, members)])
         root = vectors * np.sqrt(np.clip(values, 0.0, None))
-        out.append(Candidate(stated.bodies[members[0]], members, stated.spots[:, members] @ root, root))
+        out.append(Candidate(prior.bodies[members[0]], members, prior.spots[:, members] @ root, root))
     return tuple(out)
 
 
@@ -334,19 +334,19 @@ def steps(root: Array, white: Array, when: Array, inside: slice, reference: floa
     return Steps(after[at], when[at], responses @ white, responses @ responses.transpose(0, 2, 1))
 
 
-def most_likely_jump(found: Sequence[Steps], may: Sequence[Candidate], stated: Disturbances) -> Jump | None:
+def most_likely_jump(intervals: Sequence[Steps], may: Sequence[Candidate], prior: Disturbances) -> Jump | None:
     """Return the jump that is least likely to be due to chance, without its sizes; None if nothing can be tested.
 
     Parameters
     ----------
-    found : sequence of Steps
+    intervals : sequence of Steps
         Steps at all times that are tested, one object for each section of the series.
     may : sequence of Candidate
         Candidates for jumps.
-    stated : Disturbances
+    prior : Disturbances
         Prior that contains these motions.
     """
-    parts = [candidate for candidate in found if len(candidate.until)]
+    parts = [candidate for candidate in intervals if len(candidate.until)]
     if not parts or not may:
         return None
     score, information = (np.concatenate([getattr(p, name) for p in parts]) for name in ("score", "information"))
@@ -357,7 +357,7 @@ def most_likely_jump(found: Sequence[Steps], may: Sequence[Candidate], stated: D
         along = np.einsum("kij,ki->kj", vectors, score @ candidate.spots)
         seen = values > UNOBSERVABLE * values.max()
         squares[c] = np.sum(np.where(seen, along**2 / np.where(seen, values, 1.0), 0.0), axis=1)
-        logs[c] = _log_chance(squares[c], np.sum(seen, axis=1))
+        logs[c] = _log_p_value(squares[c], np.sum(seen, axis=1))
     which, k = np.unravel_index(int(np.argmin(logs)), logs.shape)
     best = may[int(which)]
     members = list(best.motions)
@@ -368,29 +368,29 @@ def most_likely_jump(found: Sequence[Steps], may: Sequence[Candidate], stated: D
     return Jump(
         body=best.body,
         motions=best.motions,
-        labels=tuple(stated.labels[m] for m in members),
-        units=tuple(stated.units[m] for m in members),
+        labels=tuple(prior.labels[m] for m in members),
+        units=tuple(prior.units[m] for m in members),
         sizes=(np.nan,) * len(members),
         sigmas=(np.nan,) * len(members),
         after=float(after[k]),
         until=float(until[k]),
-        chances=_chances(after, until, 0.5 * squares[which]),
+        time_distribution=_time_distribution(after, until, 0.5 * squares[which]),
         log_ratio=0.5 * float(squares[which, k]),
-        chance=float(np.exp(min(0.0, logs[which, k] + np.log(logs.size)))),
+        false_alarm=float(np.exp(min(0.0, logs[which, k] + np.log(logs.size)))),
         rivals=dict(sorted(rivals.items(), key=lambda item: -item[1])),
         times=jump_scale(best.spots.T @ information[k] @ best.spots, score[k] @ best.spots),
     )
 
 
-def _log_chance(square: Array, degrees: NDArray[np.int_]) -> Array:
+def _log_p_value(square: Array, degrees: NDArray[np.int_]) -> Array:
     """Return the natural logarithm of the probability of a larger chi-square, also where it underflows in float64."""
     half, shape = 0.5 * square, 0.5 * np.maximum(degrees, 1)
-    chance = gammaincc(shape, half)
+    p_value = gammaincc(shape, half)
     far = (shape - 1.0) * np.log(np.maximum(half, 1.0)) - half - gammaln(shape)
-    return np.asarray(np.where(chance > 1e-280, np.log(np.maximum(chance, 1e-280)), far))
+    return np.asarray(np.where(p_value > 1e-280, np.log(np.maximum(p_value, 1e-280)), far))
 
 
-def _chances(after: Array, until: Array, log_ratio: Array) -> tuple[tuple[float, float], ...]:
+def _time_distribution(after: Array, until: Array, log_ratio: Array) -> tuple[tuple[float, float], ...]:
     """Return the distribution of the time of a step from its log likelihood ratio in each interval.
 
     It consists of pairs (time in seconds, probability that the step has occurred by then); all times have equal prior
@@ -444,19 +444,19 @@ def jump_scale(information: Array, score: Array) -> float:
     return float(np.sqrt(max(1.0, variance, size @ size)))
 
 
-def with_jumps(stated: Disturbances, found: Sequence[Jump]) -> Disturbances:
+def with_jumps(prior: Disturbances, jumps: Sequence[Jump]) -> Disturbances:
     """Return the prior with a step of the same motions, of known distribution in time, added for each detected jump.
 
     Parameters
     ----------
-    stated : Disturbances
+    prior : Disturbances
         Prior of the disturbances (motions of bodies), with their effects on spots and parameters.
-    found : sequence of Jump
+    jumps : sequence of Jump
         Jumps of their motions.
     """
-    for jump in found:
-        stated = stated.with_copies(jump.motions, jump.times, jump.law)
-    return stated
+    for jump in jumps:
+        prior = prior.with_copies(jump.motions, jump.times, jump.law)
+    return prior
 
 
 def subthreshold_share(limit: float, seen: Array) -> Array:
@@ -475,7 +475,7 @@ def subthreshold_share(limit: float, seen: Array) -> Array:
 
 
 def with_subthreshold_jumps(
-    model: Disturbances, found: Sequence[Steps], stated: Disturbances, looks: int, last: float
+    model: Disturbances, intervals: Sequence[Steps], prior: Disturbances, looks: int, last: float
 ) -> Disturbances:
     """Return the prior with a random walk for jumps too small to be detected, for motions with a known jump rate.
 
@@ -485,9 +485,9 @@ def with_subthreshold_jumps(
     ----------
     model : Disturbances
         Prior with the detected jumps.
-    found : sequence of Steps
+    intervals : sequence of Steps
         Steps at all times, with those jumps known.
-    stated : Disturbances
+    prior : Disturbances
         Original prior, whose motions are the first of ``model``.
     looks : int
         Number of tests of the search.
@@ -495,15 +495,15 @@ def with_subthreshold_jumps(
         Time of the last measurement, s, after which no jump is detected.
     """
     after, until, information = (
-        np.concatenate([getattr(part, name) for part in found]) for name in ("after", "until", "information")
+        np.concatenate([getattr(part, name) for part in intervals]) for name in ("after", "until", "information")
     )
     if not looks or not len(until):
         return model
-    limit = float(np.sqrt(limit_of(stated.jump_false_alarm / looks, 1)))
-    for k, law in enumerate(stated.laws):
+    limit = float(np.sqrt(limit_of(prior.jump_false_alarm / looks, 1)))
+    for k, law in enumerate(prior.laws):
         if law.every_s is None:
             continue
-        column = stated.spots[:, k]
+        column = prior.spots[:, k]
         detectability = np.sqrt(np.maximum(column @ information @ column, 0.0))
         left = subthreshold_share(limit, detectability)
         variance = np.cumsum(left * (until - after)) / law.every_s
@@ -515,7 +515,7 @@ def with_subthreshold_jumps(
 
 
 def with_sizes(
-    jump: Jump, stated: Disturbances, root: Array, white: Array, when: Array, reference: float | None
+    jump: Jump, disturbances: Disturbances, root: Array, white: Array, when: Array, reference: float | None
 ) -> Jump:
     """Return the jump with its sizes, estimated from all measurements with all other jumps known.
 
@@ -525,7 +525,7 @@ def with_sizes(
     ----------
     jump : Jump
         Jump of some motions.
-    stated : Disturbances
+    disturbances : Disturbances
         Prior that contains these motions.
     root : (n D, n D) ndarray
         Lower triangular Cholesky factor L of the covariance of all shifts, with all detected jumps as events.
@@ -537,13 +537,15 @@ def with_sizes(
         Time from which changes are counted, s; None for the calibration.
     """
     members = list(jump.motions)
-    prior = jump.times**2 * stated.correlation[np.ix_(members, members)]
+    prior = jump.times**2 * disturbances.correlation[np.ix_(members, members)]
     occurred_before = 0.0 if reference is None else float(jump.law.step_probability(reference))
     occurred = jump.law.step_probability(when) - occurred_before
-    weights = solve_triangular(root, np.kron(occurred[:, None], stated.spots[:, members] @ prior), lower=True)
-    sizes = stated.sigmas[members] * (weights.T @ white)
+    weights = solve_triangular(root, np.kron(occurred[:, None], disturbances.spots[:, members] @ prior), lower=True)
+    sizes = disturbances.sigmas[members] * (weights.T @ white)
     left = np.maximum(np.diag(prior) - np.sum(weights**2, axis=0), 0.0)
-    return replace(jump, sizes=tuple(sizes.tolist()), sigmas=tuple((stated.sigmas[members] * np.sqrt(left)).tolist()))
+    return replace(
+        jump, sizes=tuple(sizes.tolist()), sigmas=tuple((disturbances.sigmas[members] * np.sqrt(left)).tolist())
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -552,7 +554,7 @@ class Bodies:
 
     Attributes
     ----------
-    own : tuple of Candidate
+    candidates : tuple of Candidate
         For each body, all of its motions that may jump.
     times : tuple of float
         Ratio of the standard deviations assumed for each body's jump to the prior ones.
@@ -564,7 +566,7 @@ class Bodies:
         Estimated amounts of the jump, by the filter of the estimate.
     """
 
-    own: tuple[Candidate, ...]
+    candidates: tuple[Candidate, ...]
     times: tuple[float, ...]
     weight: Array
     judged: tuple[Amounts, ...]
@@ -601,10 +603,10 @@ class Bodies:
         state : tuple of ndarray
             Score and information that give the amounts for the estimate.
         """
-        place, out = int(np.argmin(np.abs(until - jump.until))), []
+        interval, out = int(np.argmin(np.abs(until - jump.until))), []
         for body in dict.fromkeys(c.body for c in may):
             c = max((c for c in may if c.body == body), key=lambda c: len(c.motions))
-            evidence = c.spots.T @ looking[1][place] @ c.spots, looking[0][place] @ c.spots
+            evidence = c.spots.T @ looking[1][interval] @ c.spots, looking[0][interval] @ c.spots
             times = jump.times if body == jump.body else jump_scale(*evidence)
             out.append((c, times, Amounts.of(*looking, c.spots, times), Amounts.of(*state, c.spots, times)))
         logs = np.array([judged.log_weight for _, _, judged, _ in out])
@@ -622,13 +624,13 @@ class Bodies:
 
         Dimensions: r motions of the body that may jump.
         """
-        return [candidate.spots for candidate in self.own]
+        return [candidate.spots for candidate in self.candidates]
 
     @property
     def parts(self) -> tuple[tuple[tuple[int, ...], float], ...]:
         """For each body, the indices of its motions and their relative variance times the body's probability."""
-        chance = self.weight.sum(axis=1)
-        rows = zip(self.own, chance.tolist(), self.times, strict=True)
+        probability = self.weight.sum(axis=1)
+        rows = zip(self.candidates, probability.tolist(), self.times, strict=True)
         return tuple((candidate.motions, share * times**2) for candidate, share, times in rows)
 
     def known(

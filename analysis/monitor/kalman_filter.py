@@ -68,11 +68,11 @@ from analysis.monitor.filter_state import (
     Track,
     Whitened,
     bad_reading,
-    chance_good,
     jump_evidence,
     jumping_bodies,
     may_be_bad,
     mixture,
+    probability_good,
     undetected_variance,
 )
 from analysis.monitor.jump_detection import (
@@ -132,14 +132,14 @@ class SeriesFilter:
 
     Attributes
     ----------
-    stated : Disturbances
+    prior : Disturbances
         Prior of the motions with their laws in time.
     reference_noise : (D, D) ndarray or None
         Noise of the spots that shifts are counted from, px^2; None if there is none.
     heat : HeatInputs or None
         Temperatures that sensors read; None if there is none.
     life_s : float
-        Time over which ``stated.jump_false_alarm`` counts, all tests together, s: each test gets its share by the ratio
+        Time over which ``prior.jump_false_alarm`` counts, all tests together, s: each test gets its share by the ratio
         of the time between its two readings to the life, whatever the cadence of the readings.
     window : int
         Number of readings within which a jump is searched for.
@@ -159,7 +159,7 @@ class SeriesFilter:
         Candidates for jumps, single motions and those of a body together.
     """
 
-    stated: Disturbances
+    prior: Disturbances
     reference_noise: Array | None = None
     heat: HeatInputs | None = None
     life_s: float = 10.0 * 365.25 * 86_400.0
@@ -178,7 +178,7 @@ class SeriesFilter:
     @cached_property
     def space(self) -> StateSpace:
         """State space (states, their transitions and their effects) of the disturbances."""
-        return StateSpace(self.stated, self.reference_noise, self.heat, self.stepping)
+        return StateSpace(self.prior, self.reference_noise, self.heat, self.stepping)
 
     @cached_property
     def _step_levels(self) -> list[Array]:
@@ -196,14 +196,16 @@ class SeriesFilter:
             for motions, variance in step.parts:
                 members = list(motions)
                 level = self.space.level_of(members)
-                together += variance * level @ self.stated.correlation[np.ix_(members, members)] @ level.T
+                together += variance * level @ self.prior.correlation[np.ix_(members, members)] @ level.T
             out.append(_symmetric(together))
         return out
 
     @cached_property
     def _step_ends(self) -> Array:
         """First and last possible time of each of the S known steps, (S, 2) s."""
-        return np.array([(step.chances[0][0], step.chances[-1][0]) for step in self.steps]).reshape(-1, 2)
+        return np.array([(step.time_distribution[0][0], step.time_distribution[-1][0]) for step in self.steps]).reshape(
+            -1, 2
+        )
 
     def _with_steps(self, covariance: Array, then: float, now: float) -> Array:
         """Return a covariance of the states with the variance of all known steps between two times added."""
@@ -221,8 +223,8 @@ class SeriesFilter:
     def _stacked(self) -> Disturbances:
         """Prior whose spots are replaced by all outputs that readings may contain: spots, sensors and parameters."""
         if not self.parameters_read:
-            return self.stated
-        return replace(self.stated, spots=np.concatenate([self.stated.spots, self.stated.parameters]))
+            return self.prior
+        return replace(self.prior, spots=np.concatenate([self.prior.spots, self.prior.parameters]))
 
     @cached_property
     def walking(self) -> NDArray[np.int_]:
@@ -232,7 +234,7 @@ class SeriesFilter:
 
         Dimensions: m motions that jump at a known rate.
         """
-        indices = [k for k, law in enumerate(self.stated.laws) if law.every_s is not None and self.include_undetected]
+        indices = [k for k, law in enumerate(self.prior.laws) if law.every_s is not None and self.include_undetected]
         return np.array(indices, int)
 
     @cached_property
@@ -244,7 +246,7 @@ class SeriesFilter:
 
         Dimensions: r states that steps change, m motions that jump at a known rate.
         """
-        rates = np.array([1.0 / float(self.stated.laws[k].every_s or 1.0) for k in self.walking])
+        rates = np.array([1.0 / float(self.prior.laws[k].every_s or 1.0) for k in self.walking])
         return self.space.level_of(self.walking.tolist())[self.space.level] * np.sqrt(rates)
 
     def looks(self, between: ArrayLike) -> Array:
@@ -261,7 +263,7 @@ class SeriesFilter:
     def _limit(self, current: FilterState) -> float:
         """Return the smallest log likelihood ratio at which a jump can be detected, whatever its number of motions."""
         between = current.until - current.after
-        return float(limit_of(self.stated.jump_false_alarm / self.looks(between.max()), 1))
+        return float(limit_of(self.prior.jump_false_alarm / self.looks(between.max()), 1))
 
     def start(self, time: float) -> FilterState:
         """Return the state of the filter before any reading, as the prior gives it.
@@ -556,7 +558,7 @@ class SeriesFilter:
         information, between = current.jump_track.information[0], current.until[0] - current.after[0]
         column = self._stacked.spots[:, self.walking]
         seen = np.sqrt(np.maximum(np.einsum("qm,qr,rm->m", column, information, column), 0.0))
-        limit = math.sqrt(float(limit_of(self.stated.jump_false_alarm / self.looks(between), 1)))
+        limit = math.sqrt(float(limit_of(self.prior.jump_false_alarm / self.looks(between), 1)))
         return subthreshold_share(limit, seen)
 
     def _detected(self, current: FilterState) -> Jump | None:
@@ -575,20 +577,20 @@ class SeriesFilter:
         if best is None:
             return None
         # `most_likely_jump` counts its own tests of these readings
-        alone = best.chance / (len(self.candidates) * len(current.until))
-        chance = min(1.0, alone * float(self.looks(best.until - best.after)))
-        if chance > self.stated.jump_false_alarm:
+        alone = best.false_alarm / (len(self.candidates) * len(current.until))
+        false_alarm = min(1.0, alone * float(self.looks(best.until - best.after)))
+        if false_alarm > self.prior.jump_false_alarm:
             return None
-        place, seen = int(np.argmin(np.abs(current.until - best.until))), self.space.width
-        rest = max(float(most[place]) - 2.0 * best.log_ratio, 0.0), max(seen - len(best.motions), 1)
-        return replace(best, chance=chance, rest=rest)
+        interval, seen = int(np.argmin(np.abs(current.until - best.until))), self.space.width
+        rest = max(float(most[interval]) - 2.0 * best.log_ratio, 0.0), max(seen - len(best.motions), 1)
+        return replace(best, false_alarm=false_alarm, rest=rest)
 
     def _with_jump(self, current: FilterState, jump: Jump) -> tuple[FilterState, Jump]:
         """Return the filter's state after it has included a detected jump, and the jump with its estimated sizes."""
         jump_track, info = ((track.score, track.information) for track in (current.jump_track, current.state))
         gap = current.until - current.after
         bodies = Bodies.of(self.candidates, jump, current.until, gap, jump_track, info)
-        levels = [self.space.level_of(c.motions) @ c.root for c in bodies.own]
+        levels = [self.space.level_of(c.motions) @ c.root for c in bodies.candidates]
         state, search = current.state, current.search
         mean, covariance = bodies.known(state.mean, state.covariance, state.response, levels, bodies.amounts)
         state = replace(state.alone(), mean=mean, covariance=covariance)
@@ -599,16 +601,16 @@ class SeriesFilter:
         alone, weight = (next(c for c in self.candidates if c.motions == jump.motions), bodies.weight.sum(axis=0))
         named = Amounts.of(*info, alone.spots, jump.times)
         size, size_spread = mixture_moments(
-            [named], [self.stated.sigmas[list(alone.motions), None] * alone.root], weight[None]
+            [named], [self.prior.sigmas[list(alone.motions), None] * alone.root], weight[None]
         )
-        effects = [self.space.outputs_of(c.motions) @ c.root for c in bodies.own]
+        effects = [self.space.outputs_of(c.motions) @ c.root for c in bodies.candidates]
         change, spread = mixture_moments(bodies.amounts, effects, bodies.weight)
         empty = np.zeros(0)
         sized = replace(
             jump,
             sizes=tuple(size.tolist()),
             sigmas=tuple(np.sqrt(np.diag(size_spread)).tolist()),
-            chances=knots(current.after, current.until, weight),
+            time_distribution=knots(current.after, current.until, weight),
             parts=bodies.parts,
             change=tuple(change.tolist()),
             spread=tuple(tuple(row) for row in spread.tolist()),
@@ -619,12 +621,12 @@ class SeriesFilter:
     @cached_property
     def _jumping(self) -> tuple[JumpingBody, ...]:
         """All bodies that may jump; one without a known rate is assumed to jump once in the life of the filter."""
-        return jumping_bodies(self.stated, self.candidates, self.life_s)
+        return jumping_bodies(self.prior, self.candidates, self.life_s)
 
     @cached_property
     def jumping_bodies(self) -> tuple[JumpingBody, ...]:
         """Bodies whose jumps have a known rate (mean time between two jumps)."""
-        return jumping_bodies(self.stated, self.candidates) if self.include_undetected else ()
+        return jumping_bodies(self.prior, self.candidates) if self.include_undetected else ()
 
     def mixture(self, current: FilterState) -> FilterState:
         """Return the filter's state including jumps not yet detected, each weighted by its probability.
@@ -637,7 +639,7 @@ class SeriesFilter:
             State so far.
         """
         if current.pending is not None:
-            share = chance_good(current.pending.log_odds)
+            share = probability_good(current.pending.log_odds)
             bad, good = (self.mixture(body) for body in (replace(current, pending=None), current.pending.ingested))
             apart = good.mean - bad.mean
             covariance = (1.0 - share) * bad.covariance + share * good.covariance
@@ -716,7 +718,7 @@ class SeriesFilter:
         """
         more = [(motions, variance * s.step_probability(time)) for s in self.steps for motions, variance in s.parts]
         for motion in self.walking.tolist():
-            interval = float(self.stated.laws[motion].every_s or math.inf)
+            interval = float(self.prior.laws[motion].every_s or math.inf)
             more.append(((motion,), max(time - since, 0.0) / interval))
         rows, left = self.space.motion_gain(time, more)
         if not acting:
@@ -767,9 +769,9 @@ def with_indicated_jumps(
     known_of = np.empty((*scores.shape, scores.shape[1]))
 
     def note(number: int, carried: Array, known: Array) -> None:
-        place = number % _PIECE
-        scores[place], known_of[place] = carried[at], known[at, at]
-        if place == 0:  # readings come from the last to the first
+        row = number % _PIECE
+        scores[row], known_of[row] = carried[at], known[at, at]
+        if row == 0:  # readings come from the last to the first
             there = slice(number, min(number + _PIECE, len(observed)))
             count = there.stop - number
             for level, part, more in zip(levels, score, information, strict=True):
@@ -782,12 +784,12 @@ def with_indicated_jumps(
     )
     first = how.before_s if math.isnan(start.last) else 0.0
     gap = np.diff([reading.time for reading in observed], prepend=observed[0].time - first)
-    place = {k: i for i, k in enumerate(how.walking.tolist())}
+    row = {k: i for i, k in enumerate(how.walking.tolist())}
     out = np.array(left)
     for body, more in zip(
         how.jumping_bodies, undetected_variance(score, information, gap, how.jumping_bodies, how.window), strict=True
     ):
-        out[:, [place[k] for k in body.motions]] += more
+        out[:, [row[k] for k in body.motions]] += more
     return how.with_random_walk(start, out[0] - left[0], first), list(out)
 
 
@@ -1004,7 +1006,7 @@ def detection_power(how: SeriesFilter, interval: float, noise: Array) -> tuple[D
     if not may:
         return ()
     looks = float(how.looks(interval))
-    tests = [[_test(c.spots, j, how.stated.jump_false_alarm / looks) for c in may] for j in informations]
+    tests = [[_test(c.spots, j, how.prior.jump_false_alarm / looks) for c in may] for j in informations]
     out: list[DetectionPower] = []
     for body in dict.fromkeys(c.body for c in may):
         whole = max((c for c in may if c.body == body), key=lambda c: len(c.motions))
@@ -1031,7 +1033,7 @@ def _step_informations(how: SeriesFilter, interval: float, noise: Array) -> Arra
     return np.array(out)
 
 
-def _test(spots: Array, information: Array, chance: float) -> tuple[Array, float]:
+def _test(spots: Array, information: Array, probability: float) -> tuple[Array, float]:
     """Return the test for jumps of one candidate: the matrix that whitens its score, and the limit of the chi-square.
 
     A candidate is a set of motions of one body that may jump. Its score is the sum of the prediction errors after the
@@ -1043,7 +1045,7 @@ def _test(spots: Array, information: Array, chance: float) -> tuple[Array, float
         Derivatives of the q components of the readings with respect to the m motions of the candidate.
     information : (q, q) ndarray
         Information (inverse covariance) of the readings on a step of these components.
-    chance : float
+    probability : float
         False-alarm probability of the test.
 
     Returns
@@ -1054,7 +1056,7 @@ def _test(spots: Array, information: Array, chance: float) -> tuple[Array, float
     """
     values, vectors = np.linalg.eigh(spots.T @ information @ spots)
     seen = values > UNOBSERVABLE * values.max()
-    return (vectors[:, seen] / np.sqrt(values[seen])).T @ spots.T, float(limit_of(chance, int(np.sum(seen))))
+    return (vectors[:, seen] / np.sqrt(values[seen])).T @ spots.T, float(limit_of(probability, int(np.sum(seen))))
 
 
 def _detection_rates(
@@ -1075,13 +1077,13 @@ def _detection_rates(
     return np.array(out)
 
 
-def _smallest_size(found: Array, share: float) -> float:
+def _smallest_size(power: Array, share: float) -> float:
     """Return the smallest jump size from which on a given fraction of jumps is detected; NaN if no size reaches it."""
-    less = np.flatnonzero(found < share)
+    less = np.flatnonzero(power < share)
     first = less[-1] + 1 if len(less) else 0
     if first == len(_SIZES):
         return float("nan")
     if first == 0:
         return float(_SIZES[0])
-    part = (share - found[first - 1]) / (found[first] - found[first - 1])
+    part = (share - power[first - 1]) / (power[first] - power[first - 1])
     return float(_SIZES[first - 1] * (_SIZES[first] / _SIZES[first - 1]) ** part)

@@ -94,8 +94,8 @@ def quantities(cameras: Mapping[str, CameraCalibration], ground: GroundGeometry 
         sign = parameters.ANGLE.per_si if first > second else -parameters.ANGLE.per_si
         out.append(Quantity(ANGLE_GROUP, parameters.ANGLE, sign * (unit[0] - unit[count])))
     if ground is not None:
-        one_f, two_f = (camera.geometry.principal_distance_m for camera in cameras.values())
-        rows = ground.rows((one_f, two_f))
+        first_f, second_f = (camera.geometry.principal_distance_m for camera in cameras.values())
+        rows = ground.rows((first_f, second_f))
         middle = rows[len(rows) // 2]
         out += [Quantity(GROUND_GROUP, axis, row) for axis, row in zip(parameters.GROUND, middle, strict=True)]
     return tuple(out)
@@ -110,13 +110,13 @@ to the largest effect of any motion.
 
 
 def unchanged_quantities(
-    stated: Disturbances, cameras: Mapping[str, CameraCalibration], ground: GroundGeometry | None = None
+    disturbances: Disturbances, cameras: Mapping[str, CameraCalibration], ground: GroundGeometry | None = None
 ) -> frozenset[tuple[str, str]]:
     """Return group and key of the quantities that no motion of the prior changes, so that they have no posterior.
 
     Parameters
     ----------
-    stated : Disturbances
+    disturbances : Disturbances
         Prior of the disturbances (motions of bodies), with their effects on spots and parameters.
     cameras : mapping of str to CameraCalibration
         Calibration of each camera.
@@ -124,12 +124,12 @@ def unchanged_quantities(
         Ground geometry of a pair whose altitude is known.
     """
     unit = np.concatenate([(1.0, 1.0, 1.0, item.geometry.principal_distance_m) for item in cameras.values()])
-    size = np.max(np.abs(stated.parameters) / unit[:, None], axis=0, initial=0.0)
+    size = np.max(np.abs(disturbances.parameters) / unit[:, None], axis=0, initial=0.0)
     least = np.maximum(_UNMOVED * size, _NEGLIGIBLE * np.max(size, initial=0.0))
     return frozenset(
         (item.group, item.key)
         for item in quantities(cameras, ground)
-        if np.all(np.abs(item.row @ stated.parameters) <= float(np.abs(item.row) @ unit) * least)
+        if np.all(np.abs(item.row @ disturbances.parameters) <= float(np.abs(item.row) @ unit) * least)
     )
 
 
@@ -188,7 +188,7 @@ class Split:
         return {name: shares[:, groups == name].sum(axis=1) for name in dict.fromkeys(names)}
 
 
-def split(rows: Array, stated: Disturbances, noise: Array, gain: Array) -> Split:
+def split(rows: Array, disturbances: Disturbances, noise: Array, gain: Array) -> Split:
     """Compute the contributions of the motions to the variances of quantities, before and after a measurement.
 
     Dimensions: Q quantities, K cameras, D spot coordinates (row and column of every spot).
@@ -197,20 +197,20 @@ def split(rows: Array, stated: Disturbances, noise: Array, gain: Array) -> Split
     ----------
     rows : (Q, 4 K) ndarray
         Coefficients of each quantity on the parameters of all cameras (rad and m).
-    stated : Disturbances
+    disturbances : Disturbances
         Prior of the disturbances (motions of bodies), with their effects on spots and parameters.
     noise : (D, D) ndarray
         Covariance of the spot shifts due to noise, px^2.
     gain : (4 K, D) ndarray
         Gain of an estimator, rad and m per px.
     """
-    prior, reading = rows @ stated.parameters, rows @ gain
-    error = reading @ stated.spots - prior
+    prior, reading = rows @ disturbances.parameters, rows @ gain
+    error = reading @ disturbances.spots - prior
     by_noise = np.einsum("qd,de,qe->q", reading, noise, reading)
-    return Split(prior * (prior @ stated.correlation), error * (error @ stated.correlation), by_noise)
+    return Split(prior * (prior @ disturbances.correlation), error * (error @ disturbances.correlation), by_noise)
 
 
-def posterior_sigma(rows: Array, stated: Disturbances, noise: Array) -> Array:
+def posterior_sigma(rows: Array, disturbances: Disturbances, noise: Array) -> Array:
     """Return the standard deviations of quantities after the best linear unbiased prediction, (Q,), in their units.
 
     Dimensions: Q quantities, K cameras, D spot coordinates (row and column of every spot).
@@ -219,12 +219,12 @@ def posterior_sigma(rows: Array, stated: Disturbances, noise: Array) -> Array:
     ----------
     rows : (Q, 4 K) ndarray
         Coefficients of each quantity on the parameters of all cameras (rad and m).
-    stated : Disturbances
+    disturbances : Disturbances
         Prior of the disturbances, with any number of spots.
     noise : (D, D) ndarray
         Covariance of their shifts, px^2.
     """
-    return split(rows, stated, noise, stated.best_gain(noise)).sigma
+    return split(rows, disturbances, noise, disturbances.best_gain(noise)).sigma
 
 
 @dataclass(frozen=True, eq=False)
@@ -251,7 +251,7 @@ class LeastObservable:
     noise: Array
 
 
-def least_seen(row: Array, stated: Disturbances, noise: Array) -> LeastObservable:
+def least_seen(row: Array, disturbances: Disturbances, noise: Array) -> LeastObservable:
     """Return the combination of motions that the spots reveal least and that still changes a quantity.
 
     With the posterior covariance Q of the motions and the effect b = row B of each motion on the quantity, the
@@ -264,22 +264,22 @@ def least_seen(row: Array, stated: Disturbances, noise: Array) -> LeastObservabl
     ----------
     row : (4 K,) ndarray
         Coefficients of the quantity on the parameters of all cameras (rad and m).
-    stated : Disturbances
+    disturbances : Disturbances
         Prior of the disturbances (motions of bodies), with their effects on spots and parameters.
     noise : (D, D) ndarray
         Covariance of the spot shifts due to noise, px^2.
     """
-    b = row @ stated.parameters
-    spread = stated.spot_covariance + noise
-    across = stated.spots @ stated.correlation  # (D, M)
-    direction = stated.correlation @ b - across.T @ np.linalg.lstsq(spread, across @ b, rcond=1e-13)[0]
+    b = row @ disturbances.parameters
+    spread = disturbances.spot_covariance + noise
+    across = disturbances.spots @ disturbances.correlation  # (D, M)
+    direction = disturbances.correlation @ b - across.T @ np.linalg.lstsq(spread, across @ b, rcond=1e-13)[0]
     change = float(np.sqrt(max(float(b @ direction), 0.0)))
     if change > 0.0:
         direction = direction / change
-    return LeastObservable(direction, change, stated.spots @ direction, np.sqrt(np.diagonal(noise)))
+    return LeastObservable(direction, change, disturbances.spots @ direction, np.sqrt(np.diagonal(noise)))
 
 
-def sigma_if_known(rows: Array, stated: Disturbances, noise: Array, groups: Sequence[Sequence[str]]) -> Array:
+def sigma_if_known(rows: Array, disturbances: Disturbances, noise: Array, groups: Sequence[Sequence[str]]) -> Array:
     """Return the posterior standard deviations of quantities if some motions were known exactly, (G, Q).
 
     Dimensions: Q quantities, K cameras, D spot coordinates (row and column of every spot).
@@ -288,15 +288,15 @@ def sigma_if_known(rows: Array, stated: Disturbances, noise: Array, groups: Sequ
     ----------
     rows : (Q, 4 K) ndarray
         Coefficients of each quantity on the parameters of all cameras (rad and m).
-    stated : Disturbances
+    disturbances : Disturbances
         Prior of the disturbances (motions of bodies), with their effects on spots and parameters.
     noise : (D, D) ndarray
         Covariance of the spot shifts due to noise, px^2.
     groups : sequence of sequences of str
         For each of G cases, the labels of the known motions; motions correlated with them are then known better, too.
     """
-    prior, c, labels = rows @ stated.parameters, stated.correlation, np.array(stated.labels)
-    both = np.concatenate([stated.spots, prior])
+    prior, c, labels = rows @ disturbances.parameters, disturbances.correlation, np.array(disturbances.labels)
+    both = np.concatenate([disturbances.spots, prior])
     spread, count = both @ c @ both.T, len(noise)
     spread[:count, :count] += noise
     out = np.empty((len(groups), len(rows)))
@@ -310,48 +310,48 @@ def sigma_if_known(rows: Array, stated: Disturbances, noise: Array, groups: Sequ
     return out
 
 
-def with_further_spots(stated: Disturbances, spots: Array, own: Sequence[bool]) -> Disturbances:
+def with_further_spots(disturbances: Disturbances, spots: Array, individual: Sequence[bool]) -> Disturbances:
     """Return the prior for a monitor with further spots that are measured at the same time as the existing ones.
 
     Dimensions: D spot coordinates (row and column of every spot), M motions.
 
     Parameters
     ----------
-    stated : Disturbances
+    disturbances : Disturbances
         Prior of the disturbances (motions of bodies), with their effects on spots and parameters.
     spots : (D', M) ndarray
         Shifts of D' further spot coordinates for one standard deviation of the motions, px.
-    own : (M,) sequence of bool
+    individual : (M,) sequence of bool
         True for a motion of a body of which the further spots have their own copy (such as the prisms of their
         channels); the copy moves as much as the original but independently.
     """
-    apart = np.array(own, bool)
+    apart = np.array(individual, bool)
     copies = np.flatnonzero(apart)
-    count, more = len(stated.labels), len(copies)
-    moved = np.zeros((len(stated.spots) + len(spots), count + more))
-    moved[: len(stated.spots), :count] = stated.spots
-    moved[len(stated.spots) :, :count] = np.where(apart, 0.0, spots)
-    moved[len(stated.spots) :, count:] = spots[:, copies]
+    count, more = len(disturbances.labels), len(copies)
+    moved = np.zeros((len(disturbances.spots) + len(spots), count + more))
+    moved[: len(disturbances.spots), :count] = disturbances.spots
+    moved[len(disturbances.spots) :, :count] = np.where(apart, 0.0, spots)
+    moved[len(disturbances.spots) :, count:] = spots[:, copies]
     correlation = np.zeros((count + more, count + more))
-    correlation[:count, :count] = stated.correlation
-    correlation[count:, count:] = stated.correlation[np.ix_(copies, copies)]
+    correlation[:count, :count] = disturbances.correlation
+    correlation[count:, count:] = disturbances.correlation[np.ix_(copies, copies)]
 
     def with_copies(values: tuple[str, ...]) -> tuple[str, ...]:
         return (*values, *(values[k] for k in copies))
 
-    laws: tuple[TimeLaw, ...] = (*stated.laws, *(stated.laws[k] for k in copies))
+    laws: tuple[TimeLaw, ...] = (*disturbances.laws, *(disturbances.laws[k] for k in copies))
     return Disturbances(
-        name=stated.name,
-        labels=with_copies(stated.labels),
-        bodies=with_copies(stated.bodies),
-        causes=with_copies(stated.causes),
-        sigmas=np.concatenate([stated.sigmas, stated.sigmas[copies]]),
-        units=with_copies(stated.units),
+        name=disturbances.name,
+        labels=with_copies(disturbances.labels),
+        bodies=with_copies(disturbances.bodies),
+        causes=with_copies(disturbances.causes),
+        sigmas=np.concatenate([disturbances.sigmas, disturbances.sigmas[copies]]),
+        units=with_copies(disturbances.units),
         spots=moved,
-        parameters=np.concatenate([stated.parameters, np.zeros((len(stated.parameters), more))], axis=1),
+        parameters=np.concatenate([disturbances.parameters, np.zeros((len(disturbances.parameters), more))], axis=1),
         correlation=correlation,
         laws=laws,
-        jump_false_alarm=stated.jump_false_alarm,
+        jump_false_alarm=disturbances.jump_false_alarm,
     )
 
 
@@ -381,7 +381,7 @@ def field_covariance(
     return np.asarray(np.diag(np.concatenate(sigma) ** 2))
 
 
-def calibrated_sigma(rows: Array, stated: Disturbances, noise: Array, field: Array, gap_s: float) -> Array:
+def calibrated_sigma(rows: Array, disturbances: Disturbances, noise: Array, field: Array, gap_s: float) -> Array:
     """Return the standard deviations of quantities some time after a calibration on a test field, (Q,).
 
     The test field on the ground gave the parameters, and the monitor measured then as well as now: unchanged motions
@@ -393,7 +393,7 @@ def calibrated_sigma(rows: Array, stated: Disturbances, noise: Array, field: Arr
     ----------
     rows : (Q, 4 K) ndarray
         Coefficients of each quantity on the parameters of all cameras (rad and m).
-    stated : Disturbances
+    disturbances : Disturbances
         Prior of the disturbances with its laws in time; correlated motions have the same law.
     noise : (D, D) ndarray
         Covariance of the shifts of each of the two measurements, px^2.
@@ -402,9 +402,13 @@ def calibrated_sigma(rows: Array, stated: Disturbances, noise: Array, field: Arr
     gap_s : float
         Time since the calibration, s.
     """
-    before, across, after = np.array([law.two_time_moments(0.0, gap_s) for law in stated.laws]).reshape(-1, 3).T
-    now, then, old_now = stated.correlation * after, stated.correlation * across, stated.correlation * before
-    a, b = stated.spots, stated.parameters
+    before, across, after = np.array([law.two_time_moments(0.0, gap_s) for law in disturbances.laws]).reshape(-1, 3).T
+    now, then, old_now = (
+        disturbances.correlation * after,
+        disturbances.correlation * across,
+        disturbances.correlation * before,
+    )
+    a, b = disturbances.spots, disturbances.parameters
     measured = np.concatenate([a, a, b])
     parts = len(a), 2 * len(a)
     old = np.arange(len(measured)) >= parts[0]
@@ -489,29 +493,31 @@ class HeavyTail:
     beyond: Array
 
 
-def prior_numbers(stated: Disturbances) -> dict[str, list[int]]:
+def prior_numbers(disturbances: Disturbances) -> dict[str, list[int]]:
     """Return, for each standard deviation specified in the prior, the indices of the motions that have it.
 
     The keys of the result name the cause and the kind of motion.
 
     Parameters
     ----------
-    stated : Disturbances
+    disturbances : Disturbances
         Prior of the disturbances (motions of bodies), with their effects on spots and parameters.
     """
     sizes: dict[tuple[str, str], set[float]] = {}
-    whats = [label.removeprefix(f"{body} ") for label, body in zip(stated.labels, stated.bodies, strict=True)]
-    for cause, what, sigma in zip(stated.causes, whats, stated.sigmas.tolist(), strict=True):
+    whats = [
+        label.removeprefix(f"{body} ") for label, body in zip(disturbances.labels, disturbances.bodies, strict=True)
+    ]
+    for cause, what, sigma in zip(disturbances.causes, whats, disturbances.sigmas.tolist(), strict=True):
         sizes.setdefault((cause, what.split()[0]), set()).add(sigma)
     out: dict[str, list[int]] = {}
-    for k, (cause, what) in enumerate(zip(stated.causes, whats, strict=True)):
+    for k, (cause, what) in enumerate(zip(disturbances.causes, whats, strict=True)):
         kind = what.split()[0]
         alike = kind != "figure" and len(sizes[cause, kind]) == 1
         out.setdefault(f"{cause} {kind if alike else what}", []).append(k)
     return out
 
 
-def elasticities(rows: Array, stated: Disturbances, noise: Array, gain: Array) -> tuple[Elasticity, ...]:
+def elasticities(rows: Array, disturbances: Disturbances, noise: Array, gain: Array) -> tuple[Elasticity, ...]:
     """Return the relative sensitivity of sigma to each standard deviation of the prior, d ln sigma / d ln s.
 
     Sigma is that of a quantity's error, s the standard deviation that a cause gives to a motion of one or several
@@ -523,7 +529,7 @@ def elasticities(rows: Array, stated: Disturbances, noise: Array, gain: Array) -
     ----------
     rows : (Q, 4 K) ndarray
         Coefficients of each quantity on the parameters of all cameras (rad and m).
-    stated : Disturbances
+    disturbances : Disturbances
         Prior of the disturbances (motions of bodies), with their effects on spots and parameters.
     noise : (D, D) ndarray
         Covariance of the spot shifts due to noise, px^2.
@@ -531,31 +537,31 @@ def elasticities(rows: Array, stated: Disturbances, noise: Array, gain: Array) -
         Gain of the estimator, rad and m per px.
     """
     reading = rows @ gain
-    error = reading @ stated.spots - rows @ stated.parameters
-    shares = error * (error @ stated.correlation)
+    error = reading @ disturbances.spots - rows @ disturbances.parameters
+    shares = error * (error @ disturbances.correlation)
     total = shares.sum(axis=1) + np.einsum("qd,de,qe->q", reading, noise, reading)
     safe = np.where(total > 0.0, total, np.inf)
     out = []
-    for number, indices in prior_numbers(stated).items():
-        factors = np.ones(len(stated.labels))
+    for number, indices in prior_numbers(disturbances).items():
+        factors = np.ones(len(disturbances.labels))
         factors[indices] = 2.0
         wider = error * factors
-        doubled = total - shares.sum(axis=1) + np.sum(wider * (wider @ stated.correlation), axis=1)
+        doubled = total - shares.sum(axis=1) + np.sum(wider * (wider @ disturbances.correlation), axis=1)
         out.append(
             Elasticity(
                 number=number,
-                size=float(stated.sigmas[indices[0]]),
-                unit=stated.units[indices[0]],
-                bodies=tuple(dict.fromkeys(stated.bodies[k] for k in indices)),
+                size=float(disturbances.sigmas[indices[0]]),
+                unit=disturbances.units[indices[0]],
+                bodies=tuple(dict.fromkeys(disturbances.bodies[k] for k in indices)),
                 elasticity=shares[:, indices].sum(axis=1) / safe,
                 doubled=np.sqrt(np.maximum(doubled, 0.0)),
-                doubled_in_prior=posterior_sigma(rows, stated.scaled(factors), noise),
+                doubled_in_prior=posterior_sigma(rows, disturbances.scaled(factors), noise),
             )
         )
     return tuple(sorted(out, key=lambda elasticity: -float(elasticity.elasticity[0])))
 
 
-def unobserved_bodies(rows: Array, stated: Disturbances, noise: Array, gain: Array) -> dict[str, Array]:
+def unobserved_bodies(rows: Array, disturbances: Disturbances, noise: Array, gain: Array) -> dict[str, Array]:
     """Return the fraction of each quantity's variance due to motions that hardly move the spots, (Q,), by body.
 
     Only bodies for which a share exceeds `SHARE` are returned.
@@ -566,23 +572,25 @@ def unobserved_bodies(rows: Array, stated: Disturbances, noise: Array, gain: Arr
     ----------
     rows : (Q, 4 K) ndarray
         Coefficients of each quantity on the parameters of all cameras (rad and m).
-    stated : Disturbances
+    disturbances : Disturbances
         Prior of the disturbances (motions of bodies), with their effects on spots and parameters.
     noise : (D, D) ndarray
         Covariance of the spot shifts due to noise, px^2.
     gain : (4 K, D) ndarray
         Gain of the estimator, rad and m per px.
     """
-    still = np.all(np.abs(stated.spots) < UNOBSERVED * np.sqrt(np.diag(noise))[:, None], axis=0)
-    contributions = split(rows, stated, noise, gain)
+    still = np.all(np.abs(disturbances.spots) < UNOBSERVED * np.sqrt(np.diag(noise))[:, None], axis=0)
+    contributions = split(rows, disturbances, noise, gain)
     shares = contributions.after / np.where(contributions.sigma > 0.0, contributions.sigma**2, np.inf)[:, None]
     by_body: dict[str, Array] = {}
     for k in np.flatnonzero(still).tolist():
-        by_body[stated.bodies[k]] = by_body.get(stated.bodies[k], np.zeros(len(rows))) + shares[:, k]
+        by_body[disturbances.bodies[k]] = by_body.get(disturbances.bodies[k], np.zeros(len(rows))) + shares[:, k]
     return {body: body_shares for body, body_shares in by_body.items() if np.max(body_shares) > SHARE}
 
 
-def heavy_tails(rows: Array, stated: Disturbances, noise: Array, gain: Array, degrees: float = DEGREES) -> HeavyTail:
+def heavy_tails(
+    rows: Array, disturbances: Disturbances, noise: Array, gain: Array, degrees: float = DEGREES
+) -> HeavyTail:
     """Compute the errors of an estimator if the motions have Student's and not a normal distribution.
 
     All motions that share a standard deviation specified in the prior are multiplied by one random scale.
@@ -593,7 +601,7 @@ def heavy_tails(rows: Array, stated: Disturbances, noise: Array, gain: Array, de
     ----------
     rows : (Q, 4 K) ndarray
         Coefficients of each quantity on the parameters of all cameras (rad and m).
-    stated : Disturbances
+    disturbances : Disturbances
         Prior of the disturbances; its standard deviations are the scales.
     noise : (D, D) ndarray
         Covariance of the spot shifts due to noise, px^2.
@@ -605,11 +613,11 @@ def heavy_tails(rows: Array, stated: Disturbances, noise: Array, gain: Array, de
     if degrees <= 2.0:
         raise ValueError(f"heavy tails: Student's t distribution needs more than 2 degrees of freedom, found {degrees}")
     reading = rows @ gain
-    error = reading @ stated.spots - rows @ stated.parameters
-    groups = list(prior_numbers(stated).values())
+    error = reading @ disturbances.spots - rows @ disturbances.parameters
+    groups = list(prior_numbers(disturbances).values())
     parts = np.stack([_of(error, diagonal) for diagonal in groups], axis=1)
     # (Q, G, G) contribution of the numbers g and h together to the variance
-    pairs = np.einsum("qgm,mn,qhn->qgh", parts, stated.correlation, parts)
+    pairs = np.einsum("qgm,mn,qhn->qgh", parts, disturbances.correlation, parts)
     by_noise = np.einsum("qd,de,qe->q", reading, noise, reading)
     scales = np.random.default_rng(1).gamma(0.5 * degrees, 2.0 / degrees, (_DRAWS, len(groups))) ** -0.5
     variance = np.stack([np.einsum("ng,gh,nh->n", scales, pair, scales) for pair in pairs], axis=1) + by_noise

@@ -250,14 +250,14 @@ def _statements(reports: list[MotionReport], family: list[str], rank: int, coord
         f"{seen} spot coordinates observe {rank} independent combination{'s' if rank != 1 else ''} of {len(reports)} "
         f"motions; the model fits {len(family)}: {', '.join(family)}."
     ]
-    reach = {report.name: float(np.max(np.abs(report.signature_px))) for report in reports}
+    largest_shift = {report.name: float(np.max(np.abs(report.signature_px))) for report in reports}
     for report in reports:
         name = report.name
         if name in family:
             if abs(report.cosine) > 0.99 and report.nearest is not None:
                 lines.append(f"{name}: looks almost like {report.nearest} (cosine {report.cosine:+.6f}).")
             continue
-        if reach[name] <= _INVISIBLE_PX:
+        if largest_shift[name] <= _INVISIBLE_PX:
             true = _show(report.true)
             lines.append(
                 f"{name}: moves no spot and is invisible; its true change is {true}."
@@ -270,11 +270,13 @@ def _statements(reports: list[MotionReport], family: list[str], rank: int, coord
         else:
             text = f"is explained to {100 * report.explained:.3g}% by the family and leaves a residual"
         amounts = [(float(a), other) for a, other in zip(report.imitation, family, strict=True)]
-        shown = [(a, other) for a, other in amounts if abs(a) * reach[other] > _NEGLIGIBLE * reach[name]]
-        mix = _sum(sorted(shown, key=lambda item: -abs(item[0]) * reach[item[1]])) or "nothing"
+        shown = [
+            (a, other) for a, other in amounts if abs(a) * largest_shift[other] > _NEGLIGIBLE * largest_shift[name]
+        ]
+        mix = _sum(sorted(shown, key=lambda item: -abs(item[0]) * largest_shift[item[1]])) or "nothing"
         smallest = _NEGLIGIBLE * float(np.max(np.abs(np.concatenate([_table(report.reported), _table(report.true)]))))
         lines.append(
-            f"{name}: {text}; one unit moves a spot by {reach[name]:.3g} px and reads as {mix}: the model gives"
+            f"{name}: {text}; one unit moves a spot by {largest_shift[name]:.3g} px and reads as {mix}: the model gives"
             f" {_show(report.reported, smallest) or 'no change'}; the true change is "
             f"{_show(report.true, smallest) or 'none'}."
         )
@@ -373,16 +375,16 @@ class UnobservableMode:
     spots: float
 
 
-def _unobservable(stated: Disturbances) -> Array:
+def _unobservable(disturbances: Disturbances) -> Array:
     """Return the covariance of the motions that remains if the spot shifts due to each time law were known, (M, M).
 
     Dimensions: M motions.
     """
-    out = np.zeros_like(stated.correlation)
-    for law in dict.fromkeys(stated.laws):
-        indices = np.flatnonzero([other == law for other in stated.laws])
+    out = np.zeros_like(disturbances.correlation)
+    for law in dict.fromkeys(disturbances.laws):
+        indices = np.flatnonzero([other == law for other in disturbances.laws])
         block = np.ix_(indices, indices)
-        prior, spots = stated.correlation[block], stated.spots[:, indices]
+        prior, spots = disturbances.correlation[block], disturbances.spots[:, indices]
         scale = np.abs(spots).max(axis=1)
         seen = spots[scale > 0.0] / scale[scale > 0.0, None]
         across = prior @ seen.T
@@ -391,58 +393,59 @@ def _unobservable(stated: Disturbances) -> Array:
     return out
 
 
-def error_floor(stated: Disturbances, rows: Array) -> Array:
+def error_floor(disturbances: Disturbances, rows: Array) -> Array:
     """Return the lower bound of the error covariance of quantities for every estimate from the spots, (Q, Q).
 
     Dimensions: Q quantities, P parameters.
 
     Parameters
     ----------
-    stated : Disturbances
+    disturbances : Disturbances
         Prior of the disturbances (motions of bodies), with their effects on spots and parameters.
     rows : (Q, P) ndarray
         Coefficients of the quantities on the parameters.
     """
-    effect = rows @ stated.parameters
-    return np.asarray(effect @ _unobservable(stated) @ effect.T)
+    effect = rows @ disturbances.parameters
+    return np.asarray(effect @ _unobservable(disturbances) @ effect.T)
 
 
 _LEAST_MODE = 1e-3
 """Ratio of a mode's sigma to that of the first mode below which the mode is not reported."""
 
 
-def unobservable_modes(stated: Disturbances, rows: Array, scale: Array) -> tuple[UnobservableMode, ...]:
+def unobservable_modes(disturbances: Disturbances, rows: Array, scale: Array) -> tuple[UnobservableMode, ...]:
     """Return the changes of quantities that no measurement of the spots reveals, the largest first.
 
     Dimensions: Q quantities, P parameters.
 
     Parameters
     ----------
-    stated : Disturbances
+    disturbances : Disturbances
         Prior of the disturbances (motions of bodies), with their effects on spots and parameters.
     rows : (Q, P) ndarray
         Coefficients of the quantities on the parameters.
     scale : (Q,) ndarray
         Scale of each quantity, in which they are compared.
     """
-    effect = rows @ stated.parameters
-    hidden = _unobservable(stated)
-    values, vectors = np.linalg.eigh((effect / scale[:, None]) @ hidden @ (effect / scale[:, None]).T)
+    effect = rows @ disturbances.parameters
+    unobservable = _unobservable(disturbances)
+    values, vectors = np.linalg.eigh((effect / scale[:, None]) @ unobservable @ (effect / scale[:, None]).T)
     out = []
     for k in np.argsort(-values):
         sigma = float(np.sqrt(max(values[k], 0.0)))
         if sigma <= _LEAST_MODE * np.sqrt(max(values.max(), 0.0)):
             break
         row = vectors[:, k] / scale @ effect
-        motions = hidden @ row / sigma
+        motions = unobservable @ row / sigma
         shares = row * motions / sigma
         bodies = {
-            body: float(shares[[one == body for one in stated.bodies]].sum()) for body in dict.fromkeys(stated.bodies)
+            body: float(shares[[other == body for other in disturbances.bodies]].sum())
+            for body in dict.fromkeys(disturbances.bodies)
         }
         # the sign of an eigenvector is arbitrary: its largest quantity is made positive
         doing = effect @ motions
         sign = float(np.sign(doing[np.argmax(np.abs(doing / scale))]))
-        largest = float(np.abs(stated.spots @ motions).max(initial=0.0))
+        largest = float(np.abs(disturbances.spots @ motions).max(initial=0.0))
         ordered = dict(sorted(bodies.items(), key=lambda item: -item[1]))
         out.append(UnobservableMode(sign * doing, sigma, sign * motions, ordered, largest))
     return tuple(out)

@@ -423,9 +423,9 @@ def _line_of_sight(d_alpha: Array, d_beta: Array, look: float) -> tuple[Array, A
 
     It is +Z rotated by the rotation vector (d_beta, d_alpha, 0), then by the look angle.
     """
-    turn = np.hypot(d_alpha, d_beta)
-    ratio = np.sinc(turn / np.pi)
-    x, y, z = ratio * d_alpha, -ratio * d_beta, np.cos(turn)
+    angle = np.hypot(d_alpha, d_beta)
+    ratio = np.sinc(angle / np.pi)
+    x, y, z = ratio * d_alpha, -ratio * d_beta, np.cos(angle)
     c, s = math.cos(look), math.sin(look)
     return c * x + s * z, y, c * z - s * x
 
@@ -435,7 +435,7 @@ EARTH_RADIUS_M = 6_371_000.0
 
 The Earth's flattening and rotation change the results here by less than 1 %.
 """
-_PLACES = 9
+_GROUND_POINTS = 9
 """Number of positions along the line CCD over which rms values of ground errors are taken."""
 
 
@@ -515,14 +515,14 @@ class GroundGeometry:
 
     @cached_property
     def matrices(self) -> Array:
-        """Matrices from changes of the two cameras to shifts on the ground at positions along the line, (places, 3, 8).
+        """Matrices from changes of the two cameras to shifts on the ground at P positions along the line, (P, 3, 8).
 
         Rows of a matrix are the shifts along the track, across it and up, in m; columns are the changes. The changes
         are d_alpha, d_beta, d_gamma (rad), d_f / f of the first camera, then of the second. The middle of the line is
-        the middle place.
+        the middle position.
         """
-        reach = min(r * t for r, t in zip(self.ranges_m, self.half_field, strict=True))
-        return np.stack([self._at(c) for c in np.linspace(-reach, reach, _PLACES)])
+        half_swath = min(r * t for r, t in zip(self.ranges_m, self.half_field, strict=True))
+        return np.stack([self._at(c) for c in np.linspace(-half_swath, half_swath, _GROUND_POINTS)])
 
     def _at(self, across: float) -> Array:
         """Return the matrix (3, 8) from changes of both cameras to shifts on the ground at one place.
@@ -559,7 +559,7 @@ class GroundGeometry:
             out[..., 4 * k + 3] /= f
         return out
 
-    def found(self, true: Array, assumed: Array) -> Array:
+    def fitted_to_ground(self, true: Array, assumed: Array) -> Array:
         """Return the exact error along, across and up, (..., 3) m, of points that are located along assumed rays.
 
         Parameters
@@ -574,8 +574,8 @@ class GroundGeometry:
         for k, (incidence, look, far) in enumerate(
             zip(self.incidences_rad, self.looks_rad, self.ranges_m, strict=True)
         ):
-            turn = incidence - look
-            c, s = math.cos(turn), math.sin(turn)
+            rotation = incidence - look
+            c, s = math.cos(rotation), math.sin(rotation)
             level = np.array([[c, 0.0, s], [0.0, 1.0, 0.0], [-s, 0.0, c]])
             real, ray = (np.asarray(v, np.float64)[..., k, :] @ level.T for v in (true, assumed))
             down = np.linalg.norm(ray, axis=-1, keepdims=True)
@@ -606,7 +606,7 @@ class GroundGeometry:
             Principal distances of the two cameras, m.
         """
         rows = self.rows(principal_distances_m)
-        middle = rows[_PLACES // 2]
+        middle = rows[_GROUND_POINTS // 2]
         left = np.einsum("pai,sij,paj->spa", rows, total, rows)
         return GroundError(
             error_m=values @ middle.T,

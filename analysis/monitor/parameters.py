@@ -214,7 +214,7 @@ ESTIMATED = (
     ),
 )  # fmt: skip
 """Parameters that the estimators determine, in the order of a camera's vector: d_alpha, d_beta, d_gamma, d_f."""
-CAMERA_PARAMETERS = ExtensionTable("camera_parameters", {one.key: one for one in ESTIMATED}, Parameter)
+CAMERA_PARAMETERS = ExtensionTable("camera_parameters", {item.key: item for item in ESTIMATED}, Parameter)
 """Quantities that the monitor reads of every camera, by their key in files.
 
 The first four are the parameters that estimators determine; a further one is a linear combination of them, and its name

@@ -169,12 +169,12 @@ class SpotEvidence:
             return None
         first = self.before.at(slice(0, 1) if len(self.before.whole) == 1 else slice(state, state + 1))
         last = self.after.at(slice(state, state + 1))
-        off = [~one.fits[0] for one in (first, last)]
+        off = [~fit.fits[0] for fit in (first, last)]
         spots = tuple(np.flatnonzero(off[0] | off[1]).tolist())
-        worst = max((float(one.widening[0, k]), k) for one in (first, last) for k in spots)
-        own = last if off[1][worst[1]] else first
-        whole, core, noise = (float(v[0, worst[1]]) for v in (own.whole, own.core, own.noise))
-        if all(_noisy(one, k) for one, beyond in ((first, off[0]), (last, off[1])) for k in spots if beyond[k]):
+        worst = max((float(fit.widening[0, k]), k) for fit in (first, last) for k in spots)
+        fit_state = last if off[1][worst[1]] else first
+        whole, core, noise = (float(v[0, worst[1]]) for v in (fit_state.whole, fit_state.core, fit_state.noise))
+        if all(_noisy(fit, k) for fit, beyond in ((first, off[0]), (last, off[1])) for k in spots if beyond[k]):
             cause = NOISE
             why = (
                 f"the noise of the frames is {np.sqrt(noise):.3g} times that of the data sheet, both beside the spots "
@@ -194,7 +194,7 @@ class SpotEvidence:
                 "reflection or stray light, and a position on a changed spot is not that on the calibrated one"
             )
         named = ", ".join(names[k] if names else str(k) for k in spots)
-        limit = float(own.core_limit[0, worst[1]]), float(own.whole_limit[0, worst[1]])
+        limit = float(fit_state.core_limit[0, worst[1]]), float(fit_state.whole_limit[0, worst[1]])
         size = (
             f"reduced chi-square {_number(core)} of the core (limit {limit[0]:.2f}) and {_number(whole)} of the image "
             f"(limit {limit[1]:.2f}, false-alarm rate {FALSE_ALARM:g} a fit)"
@@ -209,9 +209,9 @@ class SpotEvidence:
         return SpotWarning(cause, spots, worst[0], text)
 
 
-def _noisy(one: FitStates, k: int) -> bool:
+def _noisy(fit: FitStates, k: int) -> bool:
     """Return True if the noise of the frames explains the misfit of spot k, which is then about equal everywhere."""
-    noise, whole, core = (float(v[0, k]) for v in (one.noise, one.whole, one.core))
+    noise, whole, core = (float(v[0, k]) for v in (fit.noise, fit.whole, fit.core))
     return noise > LOUD and whole < LOUD * noise and core < ALIKE * noise
 
 
@@ -420,8 +420,8 @@ class _Steps:
         with np.errstate(divide="ignore", invalid="ignore"):
             return np.where(moved == 0.0, 0.0, moved / self.sigma[states])
 
-    def step(self, x: Array, found: Retraced, states: slice | NDArray[np.intp]) -> Array:
-        rest = self.shift[states] - found.spots + x @ self.model.spots.T
+    def step(self, x: Array, retraced: Retraced, states: slice | NDArray[np.intp]) -> Array:
+        rest = self.shift[states] - retraced.spots + x @ self.model.spots.T
         return np.asarray(np.einsum("spd,sd->sp", self.gain[states], rest))
 
     def judged(self, values: Array, traced: Retraced) -> tuple[Array, Curvature]:
@@ -801,7 +801,7 @@ def estimates(
         For each estimator, the motions that are traced again to test whether its reading is linear.
     """
     shifts = Shifts(start, end, covariance, cameras, disturbances)
-    found: dict[str, tuple[Array, Array, Array | None]] = {}
+    by_title: dict[str, tuple[Array, Array, Array | None]] = {}
     curvature: dict[str, Curvature] = {}
     readings: dict[str, LinearReading] = {}
     for title, estimator in applicable(cameras, disturbances).items():
@@ -810,16 +810,16 @@ def estimates(
         total = None if disturbances is None else noise + disturbances.misfit(gain)
         if motions is not None and title in motions:
             readings[title] = LinearReading(values, noise if total is None else total, motions[title])
-        found[title] = values, noise, total
+        by_title[title] = values, noise, total
     if readings:
         rows = np.stack([quantity.row for quantity in quantities(cameras, ground)])
-        for title, (values, own) in read_again(readings, shifts.vector, shifts.covariance, rows).items():
-            found[title], curvature[title] = (values, *found[title][1:]), own
-    return replace(estimates_of(found, cameras, ground), curvature=curvature)
+        for title, (values, by_curvature) in read_again(readings, shifts.vector, shifts.covariance, rows).items():
+            by_title[title], curvature[title] = (values, *by_title[title][1:]), by_curvature
+    return replace(estimates_of(by_title, cameras, ground), curvature=curvature)
 
 
 def estimates_of(
-    found: Mapping[str, tuple[Array, Array, Array | None]],
+    by_title: Mapping[str, tuple[Array, Array, Array | None]],
     cameras: Mapping[str, CameraCalibration],
     ground: GroundGeometry | None = None,
 ) -> Estimates:
@@ -829,7 +829,7 @@ def estimates_of(
 
     Parameters
     ----------
-    found : mapping of str to tuple of ndarrays
+    by_title : mapping of str to tuple of ndarrays
         For each estimator, changes (S, 4 K) and their covariances (S, 4 K, 4 K) due to noise and of the total error;
         None instead of the total one without a prior.
     cameras : mapping of str to CameraCalibration
@@ -840,17 +840,17 @@ def estimates_of(
     parameters: dict[str, dict[str, CameraParameters]] = {name: {} for name in cameras}
     angle: dict[str, IntersectionAngleChange] = {}
     errors: dict[str, GroundError] = {}
-    own = [slice(PARAMETERS_PER_CAMERA * k, PARAMETERS_PER_CAMERA * (k + 1)) for k in range(len(cameras))]
-    for title, (values, noise, total) in found.items():
-        for name, part in zip(cameras, own, strict=True):
+    slices = [slice(PARAMETERS_PER_CAMERA * k, PARAMETERS_PER_CAMERA * (k + 1)) for k in range(len(cameras))]
+    for title, (values, noise, total) in by_title.items():
+        for name, part in zip(cameras, slices, strict=True):
             whole = None if total is None else total[..., part, part]
             parameters[name][title] = CameraParameters.from_vector(values[..., part], noise[..., part, part], whole)
         if len(cameras) == 2:
-            one, two = _pair(cameras)
-            first, second = (own[list(cameras).index(name)] for name in (one, two))
+            first_camera, second_camera = _pair(cameras)
+            first, second = (slices[list(cameras).index(name)] for name in (first_camera, second_camera))
             across = noise[..., first, second], None if total is None else total[..., first, second]
-            looks = cameras[one].look_rad, cameras[two].look_rad
-            both = parameters[one][title], parameters[two][title]
+            looks = cameras[first_camera].look_rad, cameras[second_camera].look_rad
+            both = parameters[first_camera][title], parameters[second_camera][title]
             angle[title] = exact(*both, *looks, *across)
             if ground is not None:
                 distances = [camera.geometry.principal_distance_m for camera in cameras.values()]

@@ -341,7 +341,7 @@ class _Search:
 
     Parameters
     ----------
-    stated : Disturbances
+    prior : Disturbances
         Prior of the motions with their laws in time.
     when : (M,) ndarray
         Times of the measurements, s, ascending.
@@ -357,15 +357,15 @@ class _Search:
 
     def __init__(
         self,
-        stated: Disturbances,
+        prior: Disturbances,
         when: Array,
         shifts: Array,
         noise: ShiftNoise,
         order: Numbers,
         reference: float | None,
     ) -> None:
-        self.stated, self.when, self.shifts, self.noise, self.order = stated, when, shifts, noise, order
-        self.reference, self.may = reference, candidates(stated)
+        self.prior, self.when, self.shifts, self.noise, self.order = prior, when, shifts, noise, order
+        self.reference, self.may = reference, candidates(prior)
 
     def jumps(self) -> tuple[tuple[Jump, ...], Disturbances]:
         """Return all detected jumps with their sizes, in the order of time, and the prior with these jumps."""
@@ -378,11 +378,11 @@ class _Search:
                 detected = others if again is None else [*detected[:k], again, *detected[k + 1 :]]
             detected = self._further(detected)
         detected.sort(key=lambda jump: jump.until)
-        model = with_jumps(self.stated, detected)
-        if any(law.every_s is not None for law in self.stated.laws):
+        model = with_jumps(self.prior, detected)
+        if any(law.every_s is not None for law in self.prior.laws):
             all_steps = self._steps(model)
             looks = len(self.may) * sum(len(jump.until) for jump in all_steps)
-            model = with_subthreshold_jumps(model, all_steps, self.stated, looks, float(self.when[-1]))
+            model = with_subthreshold_jumps(model, all_steps, self.prior, looks, float(self.when[-1]))
         return tuple(self._sized(jump, model) for jump in detected), model
 
     def _further(self, detected: list[Jump]) -> list[Jump]:
@@ -392,8 +392,8 @@ class _Search:
 
     def _look(self, known: list[Jump]) -> Jump | None:
         """Return the most likely jump that is not known yet if it is significant; None otherwise."""
-        jump = most_likely_jump(self._steps(with_jumps(self.stated, known)), self.may, self.stated)
-        return jump if jump is not None and jump.chance <= self.stated.jump_false_alarm else None
+        jump = most_likely_jump(self._steps(with_jumps(self.prior, known)), self.may, self.prior)
+        return jump if jump is not None and jump.false_alarm <= self.prior.jump_false_alarm else None
 
     def _steps(self, model: Disturbances) -> list[Steps]:
         return [steps(part.root, part.white, part.when, piece, self.reference) for part, piece in self._factors(model)]
@@ -401,7 +401,7 @@ class _Search:
     def _sized(self, jump: Jump, model: Disturbances) -> Jump:
         for part, piece in self._factors(model):
             if jump.until in part.when[piece]:
-                return with_sizes(jump, self.stated, part.root, part.white, part.when, self.reference)
+                return with_sizes(jump, self.prior, part.root, part.white, part.when, self.reference)
         raise AssertionError(f"a jump at {jump.until} s is at no measurement")
 
     def _factors(self, model: Disturbances) -> Iterator[tuple[_Factor, slice]]:
@@ -427,28 +427,28 @@ def _pieces(count: int, window: int) -> Iterator[tuple[slice, slice]]:
 class _Process:
     """Covariances over time of spot shifts and camera parameters under the prior's time laws."""
 
-    def __init__(self, stated: Disturbances, reference: float | None) -> None:
+    def __init__(self, prior: Disturbances, reference: float | None) -> None:
         self.reference = reference
         self.parts: list[tuple[TimeLaw, Array, Array, Array]] = []
-        laws = list(dict.fromkeys(stated.laws))
+        laws = list(dict.fromkeys(prior.laws))
         for law in laws:
-            own = np.array([one == law for one in stated.laws])
-            if np.any(stated.correlation[np.ix_(own, ~own)]):
+            follows_law = np.array([other == law for other in prior.laws])
+            if np.any(prior.correlation[np.ix_(follows_law, ~follows_law)]):
                 raise ValueError("smoother: motions with different laws in time cannot be correlated")
-            spots, parameters = stated.spots[:, own], stated.parameters[:, own]
-            correlation = stated.correlation[np.ix_(own, own)]
+            spots, parameters = prior.spots[:, follows_law], prior.parameters[:, follows_law]
+            correlation = prior.correlation[np.ix_(follows_law, follows_law)]
             across = parameters @ correlation
             self.parts.append((law, spots @ correlation @ spots.T, across @ spots.T, across @ parameters.T))
 
-    def _covariance(self, law: TimeLaw, one: Array, two: Array) -> Array:
+    def _covariance(self, law: TimeLaw, first_times: Array, second_times: Array) -> Array:
         """Return the covariance of motions with a time law between two sets of times, (n, m).
 
         Dimensions: n times of the first set, m times of the second set.
         """
-        out = law.covariance(one[:, None], two)
+        out = law.covariance(first_times[:, None], second_times)
         if self.reference is None:
             return out
-        since, until = (law.covariance(times, self.reference) for times in (one, two))
+        since, until = (law.covariance(times, self.reference) for times in (first_times, second_times))
         return np.asarray(out - since[:, None] - until + law.covariance(self.reference, self.reference))
 
     def shifts(self, times: Array) -> Array:

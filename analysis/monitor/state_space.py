@@ -139,7 +139,7 @@ class StateSpace:
 
     Attributes
     ----------
-    stated : Disturbances
+    prior : Disturbances
         Prior with D spot coordinates and P parameters.
     reference_noise : (D, D) ndarray or None
         Noise of the reference's spots, the same error in every shift, px^2; None if there is none.
@@ -154,7 +154,7 @@ class StateSpace:
         Motions of different laws are correlated.
     """
 
-    stated: Disturbances
+    prior: Disturbances
     reference_noise: Array | None = None
     heat: HeatInputs | None = None
     stepping: tuple[int, ...] = ()
@@ -164,17 +164,17 @@ class StateSpace:
         object.__setattr__(self, "_blocks", tuple(self._made()))
 
     def _made(self) -> list[_Block]:
-        stated = self.stated
-        outputs = self.outputs_of(range(len(stated.labels)))
+        prior = self.prior
+        outputs = self.outputs_of(range(len(prior.labels)))
         scale = np.abs(outputs).max(axis=1, initial=0.0)
         scale = np.where(scale > 0.0, scale, 1.0)[:, None]
-        raw = np.zeros(len(stated.labels), bool)
+        raw = np.zeros(len(prior.labels), bool)
         if self.heat is not None:
             raw[self.heat.motions] = True
-        laws = list(dict.fromkeys(stated.laws))
-        members = {law: np.array([other == law for other in stated.laws]) for law in laws}
+        laws = list(dict.fromkeys(prior.laws))
+        members = {law: np.array([other == law for other in prior.laws]) for law in laws}
         for law in laws:
-            if np.any(stated.correlation[np.ix_(members[law], ~members[law])]):
+            if np.any(prior.correlation[np.ix_(members[law], ~members[law])]):
                 raise ValueError("state space: motions with different laws in time cannot be correlated")
         out: list[_Block] = []
 
@@ -190,7 +190,7 @@ class StateSpace:
             at = slice(start, start + columns.shape[1] * (1 if law.period_s is None else 2))
             out.append(_Block(kind, law, at, columns, covariance, tuple(motions.tolist()), steps))
 
-        level = np.array([_is_level(law) for law in stated.laws], bool) & ~raw
+        level = np.array([_is_level(law) for law in prior.laws], bool) & ~raw
         if np.any(level) or self.stepping:
             spanning = level.copy()
             spanning[list(self.stepping)] = True
@@ -199,14 +199,14 @@ class StateSpace:
             for law in filter(_is_level, laws):
                 mine = members[law] & ~raw
                 at = basis.T @ (outputs[:, mine] / scale)
-                effect = at @ stated.correlation[np.ix_(mine, mine)] @ at.T
+                effect = at @ prior.correlation[np.ix_(mine, mine)] @ at.T
                 steps.append((law, 0.5 * (effect + effect.T)))
             none = np.zeros((basis.shape[1],) * 2)
             add("level", TimeLaw(), scale * basis, none, np.flatnonzero(level), tuple(steps))
         for law in laws:
             mine = members[law] & ~raw
             if not _is_level(law) and np.any(mine):
-                values, vectors = np.linalg.eigh(stated.correlation[np.ix_(mine, mine)])
+                values, vectors = np.linalg.eigh(prior.correlation[np.ix_(mine, mine)])
                 moved = outputs[:, mine] @ (vectors * np.sqrt(np.clip(values, 0.0, None)))
                 basis, sizes = _spanned(moved / scale)
                 add("law", law, scale * (basis * sizes), np.eye(basis.shape[1]), np.flatnonzero(mine))
@@ -214,7 +214,7 @@ class StateSpace:
             for law in laws:
                 mine = members[law] & raw
                 if np.any(mine):
-                    correlation = stated.correlation[np.ix_(mine, mine)]
+                    correlation = prior.correlation[np.ix_(mine, mine)]
                     add("heat", law, outputs[:, mine], correlation, np.flatnonzero(mine))
             factors = len(self.heat.names)
             spread = self.heat.sigma**2 * np.eye(factors)
@@ -233,7 +233,7 @@ class StateSpace:
     @property
     def width(self) -> int:
         """Number of spot coordinates (row and column of every spot)."""
-        return int(self.stated.spots.shape[0])
+        return int(self.prior.spots.shape[0])
 
     def outputs_of(self, motions: Sequence[int] | range) -> Array:
         """Return the effect of motions of one standard deviation, (D + P, m): spots in px, then parameters.
@@ -246,7 +246,7 @@ class StateSpace:
             Indices of m motions.
         """
         indices = list(motions)
-        return np.concatenate([self.stated.spots[:, indices], self.stated.parameters[:, indices]])
+        return np.concatenate([self.prior.spots[:, indices], self.prior.parameters[:, indices]])
 
     @property
     def level(self) -> slice:
@@ -333,8 +333,8 @@ class StateSpace:
             return states
         over = self._transition(now - then)
         out = np.asarray(states * over.kept[:, None])
-        for at, turn in over.turned:
-            out[..., at, :] = (turn.T if back else turn) @ out[..., at, :]
+        for at, rotation in over.turned:
+            out[..., at, :] = (rotation.T if back else rotation) @ out[..., at, :]
         return out
 
     def moved_both(self, square: Array, then: float, now: float, back: bool = False) -> Array:
@@ -359,10 +359,10 @@ class StateSpace:
             return square
         over = self._transition(now - then)
         out = np.asarray(square * over.kept_both)
-        for at, turn in over.turned:
-            turn = turn.T if back else turn
-            strip = turn @ out[at]
-            rotated = strip[:, at] @ turn.T
+        for at, rotation in over.turned:
+            rotation = rotation.T if back else rotation
+            strip = rotation @ out[at]
+            rotated = strip[:, at] @ rotation.T
             strip[:, at] = 0.5 * (rotated + rotated.T)
             out[at], out[:, at] = strip, strip.T
         return out
@@ -516,7 +516,7 @@ class StateSpace:
         """
         count, plain = len(times), [self._rows(float(time)).copy() for time in times]
         single = [self.acting(plain[k], means[k], covariance[k, :, k]) for k in range(count)]
-        values = np.array([one for one, _, _ in single]).reshape(count, len(self.basis))
+        values = np.array([mean for mean, _, _ in single]).reshape(count, len(self.basis))
         out = np.empty((count, len(self.basis), count, len(self.basis)))
         for i, j in itertools.product(range(count), repeat=2):
             across = covariance[i, :, j]
@@ -547,7 +547,7 @@ class StateSpace:
 
         Outputs are D spot coordinates (row and column of every spot), in px, then P camera parameters.
         """
-        rows = np.zeros((self.width + self.stated.parameters.shape[0], self.size))
+        rows = np.zeros((self.width + self.prior.parameters.shape[0], self.size))
         for block in self._blocks:
             rows[:, block.at.start : block.at.start + block.rank] = block.outputs
         return rows
@@ -582,7 +582,7 @@ class StateSpace:
         time : float
             Time, s.
         """
-        rows, out = self._rows(time), np.zeros(self.width + self.stated.parameters.shape[0])
+        rows, out = self._rows(time), np.zeros(self.width + self.prior.parameters.shape[0])
         for factor, at in self._heated if self.heat is not None else ():
             out += (1.0 + mean[factor]) * (rows[:, at] @ mean[at])
         return out
@@ -602,7 +602,7 @@ class StateSpace:
         assert self.heat is not None
         out = np.zeros((len(sensors), self.size))
         for motion, column in zip(self.heat.motions.tolist(), self.heat.rows.T, strict=True):
-            out[:, self._heat_states[motion]] = _gain(self.stated.laws[motion], time) * column[list(sensors)]
+            out[:, self._heat_states[motion]] = _gain(self.prior.laws[motion], time) * column[list(sensors)]
         return out
 
     def motion_gain(self, time: float, steps: Sequence[tuple[Sequence[int], float]] = ()) -> tuple[Array, Array]:
@@ -619,12 +619,12 @@ class StateSpace:
         steps : sequence of (sequence of int, float)
             Motions that have stepped in addition to their laws, and the variance of the step relative to the prior.
         """
-        count = len(self.stated.labels)
+        count = len(self.prior.labels)
         rows, left = np.zeros((count, self.size)), np.zeros((count, count))
         stepped = np.zeros((count, count))
         for motions, variance in steps:
             at = np.ix_(list(motions), list(motions))
-            stepped[at] += variance * self.stated.correlation[at]
+            stepped[at] += variance * self.prior.correlation[at]
         for block in self._blocks:
             if block.kind == "heat":
                 for k, motion in enumerate(block.motions):
@@ -637,9 +637,9 @@ class StateSpace:
                 root = np.array(
                     [math.sqrt(_step_variance(law, time)) if _is_level(law) else 0.0 for law in map(self._law, idx)]
                 )
-                prior = root[:, None] * self.stated.correlation[np.ix_(idx, idx)] * root + stepped[np.ix_(idx, idx)]
+                prior = root[:, None] * self.prior.correlation[np.ix_(idx, idx)] * root + stepped[np.ix_(idx, idx)]
             else:
-                prior = _variance(block.law, time) * self.stated.correlation[np.ix_(idx, idx)]
+                prior = _variance(block.law, time) * self.prior.correlation[np.ix_(idx, idx)]
             at_states = self._coordinates(block, idx)
             across = prior @ at_states.T
             gain = across @ np.linalg.pinv(at_states @ across, rcond=1e-10, hermitian=True)
@@ -649,7 +649,7 @@ class StateSpace:
         return rows, left
 
     def _law(self, motion: int) -> TimeLaw:
-        return self.stated.laws[motion]
+        return self.prior.laws[motion]
 
 
 def _is_level(law: TimeLaw) -> bool:

@@ -36,7 +36,7 @@ from analysis.mtf.edge_location import LARGEST_GREY, grey_fault
 from analysis.mtf.edge_pages import different_pages, mean_page, rounding_residual
 from analysis.mtf.slanted_edge import EdgeMtf
 from analysis.spots.noise import NoiseModel
-from analysis.statistics import chance_beyond, measured_bias, rice_sigma, signal_modulus
+from analysis.statistics import measured_bias, p_value_of, rice_sigma, signal_modulus
 
 _HARMONICS = (3, 5, 7)
 _LEAST_SIDE = 12
@@ -245,7 +245,7 @@ def bar_mtf(
     light = 2.0 * (float(parameters[0]) - low) / step - 1.0
     light_sigma = math.sqrt(4.0 * float(covariance[0, 0]) + low_sigma**2 + high_sigma**2) / step
     least = _LEAST_LIGHT if np.shape(dark) == np.shape(bright) == grey.shape else 0.0
-    uneven = chance_beyond((light / light_sigma) ** 2, 1) < FALSE_ALARM and abs(light) > least
+    uneven = p_value_of((light / light_sigma) ** 2, 1) < FALSE_ALARM and abs(light) > least
     relative = math.hypot(step_sigma / step, light if uneven else 0.0)
     sigma = math.hypot(scale * float(rice_sigma(signal, along_sigma, across_sigma)), mtf * relative)
     largest, least = float(grey.max()) - offset, float(grey.min()) - offset
@@ -340,11 +340,11 @@ def _start(grey: Array, frequency: ArrayLike | None) -> Array:
         near = cells + np.round(target[:, None, None] - cells)
         allowed = np.all(np.abs(near - target[:, None, None]) * shape[:, None, None] <= 1.0, axis=0)
         return _peak(power, near, allowed)
-    turns = np.arange(-math.ceil(abs(target)), math.ceil(abs(target)) + 1)
+    periods = np.arange(-math.ceil(abs(target)), math.ceil(abs(target)) + 1)
     best, strongest = np.zeros(2), -1.0
-    for row_turn in turns:
-        for column_turn in turns:
-            shifted = cells + np.array([row_turn, column_turn])[:, None, None]
+    for row_periods in periods:
+        for column_periods in periods:
+            shifted = cells + np.array([row_periods, column_periods])[:, None, None]
             allowed = np.abs(np.hypot(*shifted) - abs(target)) * shape.min() <= 1.0
             allowed &= (shifted[1] > 0) | ((shifted[1] == 0) & (shifted[0] > 0))
             if allowed.any() and power[allowed].max() > strongest * (1.0 + 1e-9):
@@ -360,8 +360,8 @@ def _other_alias(fitted: Array, frequency: ArrayLike | None) -> Array | None:
     if frequency is None or np.ndim(frequency) != 0:
         return None
     length = abs(float(np.asarray(frequency)))
-    turn = np.round(2.0 * fitted)
-    other = turn - fitted
+    multiple = np.round(2.0 * fitted)
+    other = multiple - fitted
     return other if abs(np.hypot(*other) - length) < abs(np.hypot(*fitted) - length) - 1e-6 else None
 
 
@@ -578,7 +578,7 @@ def _check_drift(pages: Array, mean: Array, bars: BarMtf, step: float) -> None:
     noise = max(noise, rounding_residual(noise, step), 1e-12 * bars.amplitude)
     phase = parts[:, 2] / bars.amplitude
     sigma = noise * math.sqrt(inverse[2, 2]) / bars.amplitude
-    if chance_beyond(float(np.sum((phase / sigma) ** 2)), len(pages) - 1) < FALSE_ALARM:
+    if p_value_of(float(np.sum((phase / sigma) ** 2)), len(pages) - 1) < FALSE_ALARM:
         moved = float(np.std(phase)) / (2.0 * math.pi * bars.cycles_per_pixel)
         raise BarError(
             f"the bars move by {moved:.2g} px rms from page to page (sigma of a page"

@@ -102,11 +102,11 @@ class EdgeDesign:
             Columns of uneven light; none by default. They are no part of the edge-spread function.
         """
         half = math.ceil(core * oversampling)
-        place = x * oversampling + half
-        inside = np.flatnonzero((place >= 0.0) & (place < 2 * half))
-        place = place[inside]
-        cell = place.astype(np.intp)
-        u = place - cell
+        bin_position = x * oversampling + half
+        inside = np.flatnonzero((bin_position >= 0.0) & (bin_position < 2 * half))
+        bin_position = bin_position[inside]
+        cell = bin_position.astype(np.intp)
+        u = bin_position - cell
         v = 1.0 - u
         basis = np.stack([v**3 / 6, u * u * (u / 2 - 1) + 2 / 3, v * v * (v / 2 - 1) + 2 / 3, u**3 / 6])
         extra = 0 if light is None else len(light)

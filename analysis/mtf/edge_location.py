@@ -179,8 +179,8 @@ def locate_edge(grey: Array) -> EdgeLine:
             "horizontal: tilt the target by 2 to 10 deg against rows or columns"
         )
     # the offset belongs to the middle row; the margin is that of the first or the last row
-    reach = abs(slope) * (rows - 1) / 2.0
-    margin = min(offset - reach, columns - 1 - offset - reach)
+    half_width = abs(slope) * (rows - 1) / 2.0
+    margin = min(offset - half_width, columns - 1 - offset - half_width)
     if margin < LEAST_MARGIN:
         where = "leaves the region" if margin < 0 else f"comes within {margin:.1f} px of the region's side"
         raise EdgeError(

@@ -24,7 +24,7 @@ from analysis.mtf.edge_fit import EdgeDesign, EdgeSpread, fit_edge_spread
 from analysis.mtf.edge_location import EdgeError, EdgeLine, checked_region, locate_edge
 from analysis.mtf.slanted_edge import EdgeMtf
 from analysis.spots.noise import NoiseModel
-from analysis.statistics import chance_beyond
+from analysis.statistics import p_value_of
 
 FALSE_ALARM = 1e-4
 """Probability that pages are aligned although the edge does not move in them."""
@@ -165,12 +165,12 @@ class _Run:
         result = slanted_edge.edge_result(
             pages, line, fitted, self.noise, frames // len(pages), slanted_edge.FREQUENCY, (rounded[0], rounded[1])
         )
-        place, slope = stack.line.T
-        spread = np.sqrt(np.stack([np.diag(one) for one in shift.covariance]))
+        position, slope = stack.line.T
+        spread = np.sqrt(np.stack([np.diag(matrix) for matrix in shift.covariance]))
         cosine = np.cos(np.arctan(slope)) ** 2
         # the fitted line and the edge at half height differ slightly
-        relative = place - place.mean()
-        places = slanted_edge.PagePositions(
+        relative = position - position.mean()
+        positions = slanted_edge.PagePositions(
             position=result.position + (relative if line.sign > 0 else -relative),
             position_sigma=spread[:, 0],
             angle=line.sign * np.arctan(slope),
@@ -182,7 +182,7 @@ class _Run:
             noise=shift.page_noise,
             rounded=(rounded[0], rounded[1]),
         )
-        return replace(result, pages=places)
+        return replace(result, pages=positions)
 
 
 @dataclass(frozen=True, eq=False)
@@ -214,14 +214,14 @@ class _Shift:
     @property
     def p_value(self) -> float:
         """Probability of a larger chi-square if the edge does not move; 1 for a single page."""
-        return float(chance_beyond(self.chi_square, 2 * (len(self.line) - 1))) if len(self.line) > 1 else 1.0
+        return float(p_value_of(self.chi_square, 2 * (len(self.line) - 1))) if len(self.line) > 1 else 1.0
 
     @property
     def turned(self) -> bool:
         """True if the edge rotates from page to page in addition to being shifted."""
         slope = self.line[:, 1] - self.line[:, 1].mean()
         chi_square = float(np.sum(slope**2 / self.covariance[:, 1, 1]))
-        return bool(chance_beyond(chi_square, len(slope) - 1) < FALSE_ALARM)
+        return bool(p_value_of(chi_square, len(slope) - 1) < FALSE_ALARM)
 
 
 @dataclass(frozen=True, eq=False)
@@ -439,7 +439,7 @@ def _aligned(pages: Array, line: EdgeLine, stack: _Stack | None, run: _Run) -> E
     levels = np.tile([fitted.spread.dark, fitted.spread.contrast], (len(upright), 1))
     even = (grey - fitted.light).reshape(upright.shape)
     final = _Stack(even, lines, fitted.spread, levels, fitted.rows.bend, stack.light)
-    sigma = np.stack([np.diag(one) for one in shift.covariance])
+    sigma = np.stack([np.diag(matrix) for matrix in shift.covariance])
     normal = np.cos(np.arctan(final.line[:, 1])) ** 2
     jitter = normal * (sigma[:, 0] + turning * sigma[:, 1] * np.mean(final.along**2))
     fitted = replace(fitted, jitter=float(np.mean(jitter)))

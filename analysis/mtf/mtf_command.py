@@ -33,7 +33,7 @@ _LENGTHS = {"nm": 1e-6, "um": 1e-3, "µm": 1e-3, "μm": 1e-3, "mm": 1.0}
 _HIGHEST = 2.0
 # Numbers of more digits occur in no image.
 _NUMBERS = re.compile(r"\s*" + r"\s*,\s*".join([r"([0-9]{1,10})"] * 4) + r"\s*")
-_LIGHT = tuple(f"{level}_change_{way}" for level in ("bright", "dark") for way in ("along", "across"))
+_LIGHT = tuple(f"{level}_change_{direction}" for level in ("bright", "dark") for direction in ("along", "across"))
 # Table rows, cycles/pixel.
 _ROWS = (0.05, 0.1, 0.15, 0.2, 0.25, 0.3, 0.35, 0.4, 0.45, 0.5)
 
@@ -68,7 +68,7 @@ def run_mtf(
     """
     errors = Console(stderr=True)
     try:
-        size = _pitch(_given_pitch(pitch, pixel_size, errors))
+        size = _pitch(_pitch_option(pitch, pixel_size, errors))
         frequency = _frequency(bars, size) if bars is not None else None
         _check_levels(saturation, offset)
         for path, kinds in ((plot, PLOT_KINDS), (csv_file, (".csv",))):
@@ -175,7 +175,7 @@ def _step(source: ImageFile, region: Array, gamma: str | None) -> float:
     return float(max(ends[1] - ends[0], ends[3] - ends[2]))
 
 
-def _given_pitch(pitch: str | None, pixel_size: str | None, errors: Console) -> str:
+def _pitch_option(pitch: str | None, pixel_size: str | None, errors: Console) -> str:
     """Return the text of the option for the pixel pitch, which may be given under its old name."""
     if pixel_size is not None:
         errors.print("note: --pixel-size is now --pitch; the old name is accepted for one version", soft_wrap=True)
@@ -270,14 +270,14 @@ def _draw(edge: EdgeMtf, pitch: float, path: Path) -> None:
     figure = Figure(figsize=(12, 4), dpi=150, layout="constrained")
     FigureCanvasAgg(figure)
     spread, line, curve = figure.subplots(1, 3)
-    reach = min(edge.core * 1.5, float(edge.place[-1]))
-    near = np.abs(edge.pixel_place) <= reach
-    spread.plot(edge.pixel_place[near], edge.pixel_grey[near], ".", ms=2, color="0.6", label="pixels")
-    shown = np.abs(edge.place) <= reach
-    spread.plot(edge.place[shown], edge.esf[shown], color="C0", label="least-squares curve")
+    half_range = min(edge.core * 1.5, float(edge.distance[-1]))
+    near = np.abs(edge.pixel_distance) <= half_range
+    spread.plot(edge.pixel_distance[near], edge.pixel_grey[near], ".", ms=2, color="0.6", label="pixels")
+    shown = np.abs(edge.distance) <= half_range
+    spread.plot(edge.distance[shown], edge.esf[shown], color="C0", label="least-squares curve")
     spread.set(title="edge-spread function", xlabel="along the normal / px", ylabel="grey value")
     spread.legend(loc="lower right")
-    line.plot(edge.place[shown], edge.lsf[shown], color="C0")
+    line.plot(edge.distance[shown], edge.lsf[shown], color="C0")
     line.axhline(0.0, color="0.7", lw=0.8, zorder=0)
     line.set(title="line-spread function", xlabel="along the normal / px", ylabel="1/px")
     curve.fill_between(
@@ -391,7 +391,7 @@ def _pages_text(edge: EdgeMtf) -> str:
     pages = edge.pages
     assert pages is not None
     sigma = float(np.sqrt(np.mean(pages.position_sigma**2)))
-    each = ", ".join(f"{place:+.3f}" for place in pages.position[:9] - edge.position)
+    each = ", ".join(f"{position:+.3f}" for position in pages.position[:9] - edge.position)
     more = f", ... ({len(pages.position)} pages)" if len(pages.position) > 9 else ""
     treatment = "aligned" if pages.aligned else "averaged"
     return f"edge in the pages, relative to {edge.position:.3f} px: {each}{more}, each ± {sigma:.3f} px; {treatment}"

@@ -29,7 +29,7 @@ from analysis.arrays import Array
 from analysis.mtf.edge_fit import OVERSAMPLING, EdgeDesign, EdgeSpread, FittedEdge, fit_edge, path_parts
 from analysis.mtf.edge_location import Axis, EdgeError, EdgeLine, checked_region, locate_edge, pixel_noise
 from analysis.spots.noise import NoiseModel
-from analysis.statistics import chance_beyond, measured_bias, rice_sigma, signal_modulus
+from analysis.statistics import measured_bias, p_value_of, rice_sigma, signal_modulus
 from optics.numerics.arguments import checked, finite
 
 # Fraction of the contrast by which means of blocks of 4 x 4 px may differ from the fitted edge.
@@ -199,7 +199,7 @@ def edge_result(
     spread, design = fitted.spread, fitted.design
     grey, columns = pages.ravel(), pages.shape[2]
     model = spread.value(design)
-    _check_one_edge((pages - model.reshape(pages.shape)).mean(axis=0), spread.contrast, line)
+    _check_single_edge((pages - model.reshape(pages.shape)).mean(axis=0), spread.contrast, line)
     levels = _Levels(pages.shape, grey, model, design, spread)
     variance, dark_variance, bright_variance = levels.variances(noise, frames, rounding)
     covariance = spread.covariance(design, variance)
@@ -228,8 +228,8 @@ def edge_result(
     if line.sign < 0:
         offset = columns - 1 - offset
     samples = math.floor(min(-design.x.min(), design.x.max()) * _SHOWN_PER_PIXEL)
-    place = np.arange(-samples, samples + 1) / _SHOWN_PER_PIXEL
-    shown = spread.design(place)
+    distance = np.arange(-samples, samples + 1) / _SHOWN_PER_PIXEL
+    shown = spread.design(distance)
     return EdgeMtf(
         axis=line.axis,
         frequency=frequency,
@@ -251,10 +251,10 @@ def edge_result(
         light=fitted.change,
         light_sigma=np.sqrt(np.diag(covariance)[spread.spline_count : -3]),
         structure=_structure(fitted, grey - model, variance),
-        place=place,
+        distance=distance,
         esf=spread.value(shown),
         lsf=spread.slope(shown) / spread.contrast,
-        pixel_place=design.x,
+        pixel_distance=design.x,
         pixel_grey=grey,
         dark=spread.dark,
         bright=spread.dark + spread.contrast,
@@ -264,7 +264,7 @@ def edge_result(
     )
 
 
-def _check_one_edge(residual: Array, contrast: float, line: EdgeLine) -> None:
+def _check_single_edge(residual: Array, contrast: float, line: EdgeLine) -> None:
     rows, columns = residual.shape[0] // 4, residual.shape[1] // 4
     blocks = np.abs(residual[: 4 * rows, : 4 * columns].reshape(rows, 4, columns, 4).mean(axis=(1, 3)))
     # six sigma: by chance once in 1e6 regions of 64 x 64 px
@@ -289,12 +289,12 @@ class Structure:
     ----------
     rms : float
         Rms of the differences beyond the noise, grey values.
-    chance : float
+    p_value : float
         Probability of such differences by independent noise of the pixels (p-value).
     """
 
     rms: float
-    chance: float
+    p_value: float
 
 
 def _structure(fitted: FittedEdge, residual: Array, variance: Array) -> Structure:
@@ -313,10 +313,10 @@ def _structure(fitted: FittedEdge, residual: Array, variance: Array) -> Structur
     for label in (along // _BLOCK * 10_000 + across // _BLOCK, strip - strip.min(), 2 * (along // _STRIP) + (x > 0.0)):
         label = np.unique(label, return_inverse=True)[1].ravel()
         count, total, noise = (np.bincount(label, weight) for weight in (None, residual, variance))
-        chance = float(chance_beyond(float(np.sum(total**2 / noise)), len(count)))
+        p_value = float(p_value_of(float(np.sum(total**2 / noise)), len(count)))
         excess = float(np.mean((total**2 - noise) / count**2, where=count >= _STRIP**2))
-        out.append(Structure(math.sqrt(max(excess, 0.0)), min(3.0 * chance, 1.0)))
-    return min(out, key=lambda found: found.chance)
+        out.append(Structure(math.sqrt(max(excess, 0.0)), min(3.0 * p_value, 1.0)))
+    return min(out, key=lambda structure: structure.p_value)
 
 
 def _path_errors(fitted: FittedEdge, residual: Array, variance: Array) -> tuple[float, float, float, Array]:
@@ -466,10 +466,10 @@ class EdgeMtf:
         bright, and the same of the dark level, grey values; (0,) where light was taken as even.
     structure : Structure
         Structure that the fit leaves in the region.
-    place, esf, lsf : (S,) ndarray
+    distance, esf, lsf : (S,) ndarray
         Distance along the normal from the dark side to the bright, px, 16 to a pixel, as far as there are pixels on
         both sides; edge-spread function, grey values; line-spread function, 1/px, integral 1.
-    pixel_place, pixel_grey : (N,) ndarray
+    pixel_distance, pixel_grey : (N,) ndarray
         Projected distance, px, and grey value of all pixels, as used.
     dark, bright : float
         Grey values far from the edge, tails accounted for.
@@ -495,10 +495,10 @@ class EdgeMtf:
     position_sigma: float
     curvature: float
     curvature_sigma: float
-    place: Array
+    distance: Array
     esf: Array
     lsf: Array
-    pixel_place: Array
+    pixel_distance: Array
     pixel_grey: Array
     dark: float
     bright: float
@@ -518,12 +518,12 @@ class EdgeMtf:
         Noise-free images of diffraction at an F/9 pupil leave a structure of 2.5e-5 of the contrast.
         """
         share = self.structure.rms / (self.bright - self.dark)
-        if self.structure.chance >= FALSE_ALARM or share < _LEAST_STRUCTURE:
+        if self.structure.p_value >= FALSE_ALARM or share < _LEAST_STRUCTURE:
             return ""
         form = "curved" if self.order > 1 else "straight"
         return (
             f"the region contains structure of {share:.2g} of the contrast (rms of means over blocks and strips, p ="
-            f" {self.structure.chance:.1g}) that a {form} edge between two planes does not explain:"
+            f" {self.structure.p_value:.1g}) that a {form} edge between two planes does not explain:"
             " light that is not a plane, a rough edge, specks, or noise correlated between pixels. sigma does not"
             " include its effect on the MTF: use even light or a smaller region"
         )

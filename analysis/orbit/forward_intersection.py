@@ -113,9 +113,9 @@ def spline_blend(time: Array, interval: float) -> tuple[NDArray[np.intp], Array]
 
     The knots lie at whole multiples of `interval`, in seconds. Indices have shape (n,), values (n, 4).
     """
-    place = np.asarray(time, np.float64) / interval
-    reading = np.floor(place)
-    u = place - reading
+    position = np.asarray(time, np.float64) / interval
+    reading = np.floor(position)
+    u = position - reading
     values = np.stack([(1 - u) ** 3, 3 * u**3 - 6 * u**2 + 4, 3 * u * (1 + u - u**2) + 1, u**3], axis=-1)
     return np.asarray(reading, np.intp) - 1, np.asarray(values / 6.0, np.float64)
 
@@ -514,10 +514,10 @@ def intersect_rays(
     >>> np.round(found.ground + 0.0, 6), np.round(found.miss, 6)
     (array([[0., 0., 0.]]), array([2.]))
     """
-    given = first_origin, first_direction, second_origin, second_direction
-    shaped = np.broadcast_arrays(*(np.atleast_2d(np.asarray(one, np.float64)) for one in given))
+    rays = first_origin, first_direction, second_origin, second_direction
+    shaped = np.broadcast_arrays(*(np.atleast_2d(np.asarray(vector, np.float64)) for vector in rays))
     if shaped[0].ndim != 2 or shaped[0].shape[1] != 3 or not np.all(np.isfinite(np.stack(shaped))):
-        raise IntersectionError(f"rays need finite origins and directions (n, 3), found {[np.shape(g) for g in given]}")
+        raise IntersectionError(f"rays need finite origins and directions (n, 3), found {[np.shape(g) for g in rays]}")
     origins = shaped[0], shaped[2]
     looks = [u / np.maximum(np.linalg.norm(u, axis=1, keepdims=True), 1e-300) for u in (shaped[1], shaped[3])]
     base = origins[1] - origins[0]

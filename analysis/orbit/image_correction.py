@@ -21,7 +21,7 @@ Kind = Literal["shift", "affine"]
 
 _FALSE_ALARM = 1e-3
 """Probability that any point is excluded from the control points of one file if none has a gross error."""
-_SAME_PLACE = 1e-6
+_LEAST_EXTENT = 1e-6
 """Smallest ratio of the minor to the major extent of points that do not lie on one line."""
 LEAST_POINTS = {"shift": 1, "affine": 3}
 """Smallest number of points that determine each kind of correction."""
@@ -96,8 +96,8 @@ class ImageCorrection:
 
 def _basis(kind: Kind, middle: Array, size: Array, position: Array) -> Array:
     """Return the K basis functions of a correction (constant, and scaled line and sample) at N positions, (N, K)."""
-    one = np.ones((len(position), 1))
-    return one if kind == "shift" else np.concatenate([one, (position - middle) / size], axis=1)
+    constant = np.ones((len(position), 1))
+    return constant if kind == "shift" else np.concatenate([constant, (position - middle) / size], axis=1)
 
 
 def _rows(basis: Array) -> Array:
@@ -172,7 +172,7 @@ def _require_spread(kind: Kind, position: Array, size: Array) -> None:
     """Raise ValueError if points on one line do not determine an affine function."""
     if kind == "affine":
         extent = np.linalg.svd((position - np.mean(position, axis=0)) / size, compute_uv=False)
-        if extent[-1] < _SAME_PLACE * extent[0] or not extent[0] > 0.0:
+        if extent[-1] < _LEAST_EXTENT * extent[0] or not extent[0] > 0.0:
             raise ValueError("the points lie on one straight line of the image and do not determine an affine function")
 
 

@@ -227,9 +227,9 @@ class Observations:
     def taken(self, keep: ArrayLike) -> Observations:
         """Return the observations that a boolean mask, with one element for each observation, selects."""
         where = np.asarray(keep)
-        some, group = np.unique(self.group[where], return_inverse=True)
+        groups, group = np.unique(self.group[where], return_inverse=True)
         value, weight, nuisance = self.value[where], self.weight[where], self.nuisance[where]
-        return Observations(value, group, self.time[some], weight, nuisance, self.mix[where])
+        return Observations(value, group, self.time[groups], weight, nuisance, self.mix[where])
 
     def factors(self) -> Array:
         """Return the estimated factor on the variance of each of K kinds of errors, (K,).
@@ -378,7 +378,7 @@ class Periodogram:
         """Number of amplitudes of one oscillation: sine and cosine about each axis."""
         return 2 * self.amplitude.shape[1]
 
-    def chance(self, power: ArrayLike) -> Array:
+    def p_value(self, power: ArrayLike) -> Array:
         """Return an upper bound of the probability that noise alone reaches a power at any searched frequency.
 
         The noise variance is estimated from the residuals, with `freedom` degrees of freedom.
@@ -391,7 +391,9 @@ class Periodogram:
 
     def threshold(self, false_alarm: float) -> float:
         """Return the power that noise alone exceeds anywhere with at most the probability `false_alarm`."""
-        level = optimize.brentq(lambda x: float(np.log(self.chance(x * self.total)) - np.log(false_alarm)), 1e-9, 0.999)
+        level = optimize.brentq(
+            lambda x: float(np.log(self.p_value(x * self.total)) - np.log(false_alarm)), 1e-9, 0.999
+        )
         return float(level * self.total)
 
     @property
@@ -606,8 +608,8 @@ def peaks(observations: Observations, lowest: float, highest: float) -> tuple[Ar
     inside = (frequency >= lowest) & (frequency <= highest)
     axes = observations.axes
 
-    def transformed(place: np.ndarray, weight: Array) -> Array:
-        return np.asarray(fft.rfft(np.bincount(place.ravel(), weight.ravel(), size))[inside])
+    def transformed(index: np.ndarray, weight: Array) -> Array:
+        return np.asarray(fft.rfft(np.bincount(index.ravel(), weight.ravel(), size))[inside])
 
     z = np.stack([transformed(at, sums[..., a]) for a in range(axes)], axis=-1)
     normal = np.empty((len(z), axes, axes), complex)
@@ -670,7 +672,7 @@ class Lines:
     covariance : (K (1 + 2 A), K (1 + 2 A)) ndarray
         Covariance of frequency, sine and cosine of the first line, then of the next, with the noise variance estimated
         from the observations.
-    chance : (K,) ndarray
+    p_value : (K,) ndarray
         Upper bound of the probability that noise alone would have shown such a line anywhere in the search.
     origin : float
         Reference time of the phases, in seconds.
@@ -682,7 +684,7 @@ class Lines:
     sine: Array
     cosine: Array
     covariance: Array
-    chance: Array
+    p_value: Array
     origin: float
     aliases: tuple[tuple[float, ...], ...] = ()
 
@@ -817,7 +819,7 @@ def search(
     used = _good(observations, None)
     used = _good(observations.rewhitened(observations.taken(used).factors()), None)
     frequency: list[float] = []
-    chance: list[float] = []
+    p_values: list[float] = []
     aliases: list[tuple[float, ...]] = []
     lines: Lines | None = None
     alias_band = lowest, farthest(observations, max(highest, beyond or highest))
@@ -831,27 +833,27 @@ def search(
         if not np.any(searchable) or len(frequency) >= MOST_LINES:
             break
         best = int(np.argmax(np.where(searchable, current.power, -1.0)))
-        probability = float(current.chance(current.power[best]))
+        probability = float(current.p_value(current.power[best]))
         if probability > false_alarm:
             break
-        chances = [*chance, probability]
+        p_values_with_line = [*p_values, probability]
         try:
             fitted = _fitted(
-                used_observations, np.array([*frequency, float(current.frequency[best])]), np.array(chances)
+                used_observations, np.array([*frequency, float(current.frequency[best])]), np.array(p_values_with_line)
             )
             fitted, alternatives = _unaliased(used_observations, lines, fitted, alias_band, false_alarm)
             good = _good(observations.rewhitened(_beside(observations.taken(used), fitted).factors()), fitted)
             used_observations = observations.taken(good).rewhitened(factors)
-            fitted = _fitted(used_observations, fitted.frequency, np.array(chances))
+            fitted = _fitted(used_observations, fitted.frequency, np.array(p_values_with_line))
             # the factors were estimated before with the new line as noise
             used_observations = observations.taken(good)
             factors = _beside(used_observations, fitted).factors()
             used_observations = used_observations.rewhitened(factors)
-            fitted = _fitted(used_observations, fitted.frequency, np.array(chances))
+            fitted = _fitted(used_observations, fitted.frequency, np.array(p_values_with_line))
         except JitterError:
             # the rest is not a stationary oscillation; its amplitude may change, for example
             break
-        lines, used, frequency, chance = fitted, good, fitted.frequency.tolist(), chances
+        lines, used, frequency, p_values = fitted, good, fitted.frequency.tolist(), p_values_with_line
         aliases.append(alternatives)
     before = current if lines is None else periodogram(used_observations, lowest, highest)
     if lines is None:
@@ -972,11 +974,11 @@ def _unaliased(
     fits = [(_left(observations, fitted), fitted)]
     for candidate in frequency[distinct & (power >= least)][:_MOST_ALIASES]:
         try:
-            other = _fitted(observations, np.append(fitted.frequency[:-1], candidate), fitted.chance)
+            other = _fitted(observations, np.append(fitted.frequency[:-1], candidate), fitted.p_value)
             rest = periodogram(_beside(observations, other), max(at - 2.0 * cell, band[0]), at + 2.0 * cell)
         except JitterError:
             continue
-        if rest.chance(rest.power[rest.best]) > false_alarm:
+        if rest.p_value(rest.power[rest.best]) > false_alarm:
             fits.append((_left(observations, other), other))
     least_square = min(square for square, _ in fits)
     equivalent = [
@@ -1037,7 +1039,7 @@ def _good(observations: Observations, lines: Lines | None) -> NDArray[np.bool_]:
     return keep
 
 
-def _fitted(observations: Observations, frequency: Array, chance: Array) -> Lines:
+def _fitted(observations: Observations, frequency: Array, p_value: Array) -> Lines:
     """Fit K oscillations together by Gauss-Newton from their start frequencies, in hertz.
 
     Raises
@@ -1057,7 +1059,7 @@ def _fitted(observations: Observations, frequency: Array, chance: Array) -> Line
             np.asarray(linear[:, 0], np.float64),
             np.asarray(linear[:, 1], np.float64),
             empty,
-            chance,
+            p_value,
             observations.middle,
         )
         design = observations.rest(_columns(observations, lines))

@@ -311,8 +311,8 @@ def _explicit(station: Station, strip: Strip, arm: Array, method: Method) -> Pla
     bias = across @ shrink / length
     fitted = normal
     if method == "printed":
-        half_turn = np.array([-1.0, -1.0, 1.0])
-        fitted, gain, bias = half_turn * normal, half_turn[:, None] * gain, half_turn * bias
+        half_rotation = np.array([-1.0, -1.0, 1.0])
+        fitted, gain, bias = half_rotation * normal, half_rotation[:, None] * gain, half_rotation * bias
     residual = arm @ fitted
     return PlaneFit(
         method=method,
@@ -390,30 +390,30 @@ class _DistanceNoise:
 
     Attributes
     ----------
-    own : (n,) ndarray
+    independent : (n,) ndarray
         Variances from the points, in m^2.
     shared : float
         Variance from the station, common to all points, in m^2.
     """
 
-    own: Array
+    independent: Array
     shared: float
 
     @classmethod
     def of(cls, station: Station, strip: Strip, normal: Array) -> _DistanceNoise:
-        own = np.einsum("i,nij,j->n", normal, strip.covariance, normal)
-        return cls(own, float(normal @ station.covariance @ normal))
+        independent = np.einsum("i,nij,j->n", normal, strip.covariance, normal)
+        return cls(independent, float(normal @ station.covariance @ normal))
 
     def weighted(self, rows: Array) -> Array:
         """Return the inverse covariance of the n distances times a vector (n,) or k columns (n, k)."""
-        weight = 1.0 / self.own
+        weight = 1.0 / self.independent
         scaled = (rows.T * weight).T
         ratio = self.shared / (1.0 + self.shared * weight.sum())
         return np.asarray(scaled - ratio * np.multiply.outer(weight, scaled.sum(axis=0)))
 
     def white(self, rows: Array) -> Array:
         """Return k columns, (n, k), whitened by the symmetric root of the inverse covariance of the n distances."""
-        unit = self.own**-0.5
+        unit = self.independent**-0.5
         total = float(unit @ unit)
         scaled = rows * unit[:, None]
         part = (1.0 - (1.0 + self.shared * total) ** -0.5) / total

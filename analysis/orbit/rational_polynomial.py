@@ -256,7 +256,10 @@ def _checked_points(image: ArrayLike, ground: ArrayLike) -> Array:
 
 def _monomials(unit: Array) -> Array:
     """Return the 20 monomials (..., 20) of scaled latitude, longitude and height (..., 3)."""
-    powers = [np.stack([np.ones_like(one), one, one**2, one**3]) for one in (unit[..., 1], unit[..., 0], unit[..., 2])]
+    powers = [
+        np.stack([np.ones_like(coordinate), coordinate, coordinate**2, coordinate**3])
+        for coordinate in (unit[..., 1], unit[..., 0], unit[..., 2])
+    ]
     return np.stack([powers[0][a] * powers[1][b] * powers[2][c] for a, b, c in _POWERS], axis=-1)
 
 

@@ -205,20 +205,20 @@ class LineModel:
     @cached_property
     def _turned(self) -> Array:
         """Rotation matrix (3, 3) of the camera's drift: Rx(d_beta) Ry(d_alpha) Rz(d_gamma)."""
-        return bias_rotation(self._turns)
+        return bias_rotation(self._angles)
 
     @cached_property
     def _turned_slopes(self) -> tuple[Array, ...]:
         """Derivatives of the drift's rotation matrix with respect to d_alpha, d_beta, d_gamma, per radian."""
-        slopes = _rotation_slopes(self._turns)
+        slopes = _rotation_slopes(self._angles)
         return tuple(slopes[axis] for axis in _DRIFT_AXIS)
 
     @property
-    def _turns(self) -> Array:
+    def _angles(self) -> Array:
         """Rotation angles (3,) of the drift about x, y and z, in radians."""
-        turns = np.empty(3, self.drift.dtype)
-        turns[list(_DRIFT_AXIS)] = self.drift[:3]
-        return turns
+        angles = np.empty(3, self.drift.dtype)
+        angles[list(_DRIFT_AXIS)] = self.drift[:3]
+        return angles
 
 
 @dataclass(frozen=True, eq=False)
@@ -362,10 +362,10 @@ def bias_rotation(bias: ArrayLike) -> Array:
 
 def _rotation_slopes(bias: Array) -> list[Array]:
     """Return the derivatives of the bias rotation matrix with respect to roll, pitch and yaw, 1/rad."""
-    turns = [_axis_rotation(axis, angle) for axis, angle in enumerate(bias)]
+    rotations = [_axis_rotation(axis, angle) for axis, angle in enumerate(bias)]
     out = []
     for axis, angle in enumerate(bias):
-        chain = [*turns]
+        chain = [*rotations]
         chain[axis] = _axis_rotation_slope(axis, angle)
         out.append(chain[0] @ chain[1] @ chain[2])
     return out

@@ -390,12 +390,12 @@ class PointReport:
     ----------
     observable : bool
         True if the sigma of p, or of a p fitted in addition to the other terms, is at most `POINT_TOLERANCE`.
-    statement : str
+    sentence : str
         Sentence that reports the result with its sigma.
     """
 
     observable: bool
-    statement: str
+    sentence: str
 
 
 def _point_report(names: tuple[str, ...], values: Array, angle: Array, noise: Array) -> PointReport:

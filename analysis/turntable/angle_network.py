@@ -19,7 +19,7 @@ from analysis.arrays import Array, MeasurementError
 
 Curve = Callable[[Array], Array]
 
-HIDDEN, RESTARTS = 20, 4
+NEURONS, RESTARTS = 20, 4
 DECAY, GAIN = 1e-2, 5.0
 """Weight decay of the network, and standard deviation to which its input angles are scaled.
 
@@ -66,14 +66,14 @@ def network(x: Array, y: Array, s: Array, seed: int) -> tuple[dict[str, float], 
     from sklearn.exceptions import ConvergenceWarning
     from sklearn.neural_network import MLPRegressor
 
-    hidden = min(HIDDEN, (len(x) - 1) // 2)
+    neurons = min(NEURONS, (len(x) - 1) // 2)
     middle, scale = float(np.mean(x)), GAIN / float(np.std(x))
     mean, scale_of_values = float(np.mean(y)), float(np.std(y)) or 1.0
     weight = s**-2 / np.mean(s**-2)
     nets: list[Any] = []
     for state in np.random.SeedSequence(seed).generate_state(RESTARTS):
         net = MLPRegressor(
-            hidden_layer_sizes=(hidden,),
+            hidden_layer_sizes=(neurons,),
             activation="tanh",
             solver="lbfgs",
             alpha=DECAY,
@@ -106,7 +106,7 @@ def network(x: Array, y: Array, s: Array, seed: int) -> tuple[dict[str, float], 
         at = scale * (a - middle)
         return np.asarray(np.mean([gradient(net, at) @ solve for net, solve in zip(nets, solves, strict=True)], axis=0))
 
-    return {"hidden": hidden, "trainings": RESTARTS, "converged": len(nets)}, curve, derivative
+    return {"hidden": neurons, "trainings": RESTARTS, "converged": len(nets)}, curve, derivative
 
 
 def gradient(net: Any, x: Array) -> Array:

@@ -364,7 +364,7 @@ def _linear(basis: Curve, solve: Array, value: Array) -> tuple[Curve, Curve]:
     return lambda a: np.asarray(basis(a) @ coefficients), lambda a: np.asarray(basis(a) @ solve)
 
 
-def _left_out(hat: Array, value: Array) -> float:
+def _cross_validation(hat: Array, value: Array) -> float:
     """Return the mean square of the leave-one-out residuals of the inner points.
 
     It follows from the hat matrix H, (N, N), which gives the predictions at N points from their values y.
@@ -402,7 +402,7 @@ def _polynomial(x: Array, y: Array, s: Array, seed: int) -> _FitResult:
     for order in range(1, min(MOST_ORDER, len(x) - 2) + 1):
         design = np.polynomial.chebyshev.chebvander((x - middle) / half, order)
         solve = _least_squares(design, s)
-        best = min(best, (_left_out(design @ solve, y), order, solve), key=lambda b: b[0])
+        best = min(best, (_cross_validation(design @ solve, y), order, solve), key=lambda b: b[0])
     order = best[1]
     basis = _chebyshev(middle, half, order)
     return {"order": order}, *_linear(basis, best[2], y)
@@ -420,7 +420,9 @@ def _fourier(x: Array, y: Array, s: Array, seed: int) -> _FitResult:
         for order in range(1, min(MOST_ORDER, (len(x) - 2) // 2) + 1):
             design = _harmonics(x[0], period * (x[-1] - x[0]), order)(x)
             solve = _least_squares(design, s)
-            best = min(best, (_left_out(design @ solve, y), order, period * (x[-1] - x[0]), solve), key=lambda b: b[0])
+            best = min(
+                best, (_cross_validation(design @ solve, y), order, period * (x[-1] - x[0]), solve), key=lambda b: b[0]
+            )
     _, order, length, solve = best
     return {"order": order, "period_deg": float(np.degrees(length))}, *_linear(
         _harmonics(x[0], length, order), solve, y
@@ -456,7 +458,7 @@ def _cubic_spline(x: Array, y: Array, s: Array, seed: int) -> _FitResult:
     best: tuple[float, float, Array] = (np.inf, 0.0, np.empty(0))
     for smoothing in SMOOTHINGS[1:]:
         hat = np.linalg.solve(np.diag(w) + smoothing * rough, np.diag(w))
-        best = min(best, (_left_out(hat, y), smoothing, hat), key=lambda b: b[0])
+        best = min(best, (_cross_validation(hat, y), smoothing, hat), key=lambda b: b[0])
     smoothing, hat = best[1:]
     if smoothing == SMOOTHINGS[1]:  # the smallest is best: interpolate without smoothing
         smoothing, hat = 0.0, np.eye(n)

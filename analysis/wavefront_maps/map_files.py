@@ -92,7 +92,7 @@ class WavefrontMap:
     notes: tuple[str, ...] = ()
 
     @property
-    def lit(self) -> NDArray[np.bool_]:
+    def illuminated(self) -> NDArray[np.bool_]:
         """Mask (rows, columns) of the measured pixels."""
         return np.isfinite(self.values)
 
@@ -173,7 +173,7 @@ def length_from(path: Path, text: str, key: str) -> float:
     return value * _LENGTHS[named]
 
 
-def agreed(path: Path, key: str, stated: float | None, found: float | None) -> float | None:
+def agreed(path: Path, key: str, specified: float | None, in_file: float | None) -> float | None:
     """Return a value that file or user specifies; raise MapError if both specify it differently.
 
     Parameters
@@ -182,9 +182,9 @@ def agreed(path: Path, key: str, stated: float | None, found: float | None) -> f
         File, for the message.
     key : str
         Name of the value, for the message.
-    stated : float or None
+    specified : float or None
         Value specified by the user, SI units.
-    found : float or None
+    in_file : float or None
         Value in the file.
 
     Raises
@@ -192,11 +192,13 @@ def agreed(path: Path, key: str, stated: float | None, found: float | None) -> f
     MapError
         The values differ by more than a millionth.
     """
-    if stated is None or found is None:
-        return found if stated is None else stated
-    if abs(stated - found) > 1e-6 * abs(found):
-        raise MapError(f"{path} states {key} {found:.8g} m, but {stated:.8g} m is specified: remove the specification")
-    return found
+    if specified is None or in_file is None:
+        return in_file if specified is None else specified
+    if abs(specified - in_file) > 1e-6 * abs(in_file):
+        raise MapError(
+            f"{path} states {key} {in_file:.8g} m, but {specified:.8g} m is specified: remove the specification"
+        )
+    return in_file
 
 
 MOST_BYTES = 100_000_000
@@ -209,7 +211,7 @@ _CODEV_NO_DATA = -32768
 """Integer value that marks missing data in CODE V files whose header does not define another by the keyword NDA."""
 _CODEV_DATA = ("WFR", "SUR", "FIL")
 _CODEV_KEY = re.compile(r"\b(GRD|ZFR|ZRN)\s+\d+", re.IGNORECASE)
-_STATEMENT = re.compile(r"#\s*([\w ]+?)\s*[:=]\s*(.*)")
+_HEADER_LINE = re.compile(r"#\s*([\w ]+?)\s*[:=]\s*(.*)")
 _WHAT = ("wavefront", "surface")
 
 Line = tuple[int, str]
@@ -441,7 +443,7 @@ def read_table(path: Path, text: str, wavelength: float | None) -> WavefrontMap:
     MapError
         The file holds no table or no unit, or the wavelength contradicts the file.
     """
-    stated = statements(path, text, ("unit", "spacing", "wavelength", "what"))
+    header = statements(path, text, ("unit", "spacing", "wavelength", "what"))
     lines = lines_of(text, "#")
     if not lines:
         raise MapError(f"{path} holds no numbers")
@@ -456,13 +458,13 @@ def read_table(path: Path, text: str, wavelength: float | None) -> WavefrontMap:
         path,
         "wavelength",
         wavelength,
-        length_from(path, stated["wavelength"], "wavelength") if "wavelength" in stated else None,
+        length_from(path, header["wavelength"], "wavelength") if "wavelength" in header else None,
     )
-    unit = unit_written(path, stated.get("unit"), "a line '# unit: nm' before the numbers")
-    what = stated.get("what")
+    unit = unit_written(path, header.get("unit"), "a line '# unit: nm' before the numbers")
+    what = header.get("what")
     if what is not None and what not in _WHAT:
         raise MapError(f"{path}: what is {what[:40]!r}; wavefront and surface are known")
-    spacing = length_from(path, stated["spacing"], "spacing") if "spacing" in stated else math.nan
+    spacing = length_from(path, header["spacing"], "spacing") if "spacing" in header else math.nan
     return WavefrontMap(table[::-1] * metres_per(path, unit, wavelength), spacing, wavelength, what, kind="text table")
 
 
@@ -485,7 +487,7 @@ def statements(path: Path, text: str, keys: tuple[str, ...]) -> dict[str, str]:
     """
     values: dict[str, str] = {}
     for number, line in enumerate(text.splitlines(), 1):
-        match = _STATEMENT.fullmatch(line.strip())
+        match = _HEADER_LINE.fullmatch(line.strip())
         if match is None or (key := match[1].lower()) not in keys:
             continue
         if key in values:
@@ -494,14 +496,14 @@ def statements(path: Path, text: str, keys: tuple[str, ...]) -> dict[str, str]:
     return values
 
 
-def unit_written(path: Path, found: str | None, remedy: str) -> str:
+def unit_written(path: Path, unit: str | None, remedy: str) -> str:
     """Return the unit specified in a file; raise MapError if it is missing or unknown.
 
     Parameters
     ----------
     path : Path
         File, for messages.
-    found : str or None
+    unit : str or None
         Unit in the file.
     remedy : str
         How the file could state it, for the message.
@@ -511,9 +513,9 @@ def unit_written(path: Path, found: str | None, remedy: str) -> str:
     MapError
         The unit is missing or unknown.
     """
-    if found is None:
+    if unit is None:
         raise MapError(f"{path} does not state its unit: add {remedy}")
-    return unit_named(path, found)
+    return unit_named(path, unit)
 
 
 def _grid(where: str, sizes: list[int]) -> tuple[int, int]:
@@ -586,7 +588,7 @@ def read_metropro(path: Path) -> WavefrontMap:
     data = path.read_bytes()
     if len(data) < _HEADERS[data[3]]:
         raise MapError(f"{path} is truncated in its header: copy it again from the interferometer")
-    head: dict[str, Any] = {key: struct.unpack_from(form, data, place)[0] for key, (form, place) in _FIELDS.items()}
+    head: dict[str, Any] = {key: struct.unpack_from(form, data, offset)[0] for key, (form, offset) in _FIELDS.items()}
     rows, columns = head["height"], head["width"]
     if not rows or not columns:
         raise MapError(f"{path} holds no phase map, only intensities: save the measurement with its phase data")

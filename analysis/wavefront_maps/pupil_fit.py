@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from analysis.arrays import Array, UndeterminedError
-from analysis.statistics import chance_beyond
+from analysis.statistics import p_value_of
 from analysis.wavefront_maps.map_files import MapError, WavefrontMap
 from analysis.wavefront_maps.zernike_table import circle_terms, noll_to_nm
 from optics.numerics.arguments import check_fields
@@ -97,8 +97,8 @@ class Orientation:
     @property
     def inverse(self) -> Orientation:
         """Inverse operation; a mirror is its own inverse."""
-        turns = self.quarter_turns if self.mirrored else -self.quarter_turns % 4
-        return Orientation(self.mirrored, turns, self.sign)
+        quarters = self.quarter_turns if self.mirrored else -self.quarter_turns % 4
+        return Orientation(self.mirrored, quarters, self.sign)
 
     def __str__(self) -> str:
         return self.name if self.sign > 0 else f"{self.name}, sign inverted"
@@ -189,7 +189,7 @@ class OrientationEvidence:
         Logarithm of the probability density of the measured coefficients under each.
     degrees : int
         Degrees of freedom of each chi-square.
-    chance : (K,) ndarray
+    p_value : (K,) ndarray
         p-value of each chi-square.
     allowed : tuple of Orientation
         Orientations that the data do not reject at the false-alarm rate.
@@ -201,12 +201,12 @@ class OrientationEvidence:
     chi_square: Array
     log_evidence: Array
     degrees: int
-    chance: Array
+    p_value: Array
     allowed: tuple[Orientation, ...]
     indistinguishable: tuple[Orientation, ...]
 
     @property
-    def found(self) -> Orientation | None:
+    def determined(self) -> Orientation | None:
         """Best orientation if it agrees with the data and no other one fits nearly as well, otherwise None."""
         return self.readings[0] if len(self.indistinguishable) == 1 and self.readings[0] in self.allowed else None
 
@@ -262,15 +262,15 @@ def orientation_evidence(
     ranks = np.argsort(chi_square, kind="stable")
     ranked = tuple(SIGNED_ORIENTATIONS[k] for k in ranks)
     chi_square = chi_square[ranks]
-    chance = np.asarray(chance_beyond(chi_square, size))
+    p_value = np.asarray(p_value_of(chi_square, size))
     limit = 2.0 * math.log(_ODDS)
     return OrientationEvidence(
         readings=ranked,
         chi_square=chi_square,
         log_evidence=-0.5 * chi_square - constant,
         degrees=size,
-        chance=chance,
-        allowed=tuple(orientation for orientation, p in zip(ranked, chance, strict=True) if p >= false_alarm),
+        p_value=p_value,
+        allowed=tuple(orientation for orientation, p in zip(ranked, p_value, strict=True) if p >= false_alarm),
         indistinguishable=tuple(
             orientation for orientation, c in zip(ranked, chi_square, strict=True) if c - chi_square[0] < limit
         ),
@@ -422,12 +422,12 @@ def find_pupil(values: ArrayLike) -> Pupil:
     return Pupil(float(best[0]), float(best[1]), float(best[2]))
 
 
-def _ends(lit: NDArray[np.bool_]) -> Array:
+def _ends(illuminated: NDArray[np.bool_]) -> Array:
     """Return the first and last edge of the illuminated pixels in each row of a mask, as points (column, row)."""
-    rows = np.flatnonzero(lit.any(axis=1))
-    first, last = lit[rows].argmax(axis=1), lit.shape[1] - 1 - lit[rows, ::-1].argmax(axis=1)
+    rows = np.flatnonzero(illuminated.any(axis=1))
+    first, last = illuminated[rows].argmax(axis=1), illuminated.shape[1] - 1 - illuminated[rows, ::-1].argmax(axis=1)
     left, right = np.stack([first - 0.5, rows], axis=1), np.stack([last + 0.5, rows], axis=1)
-    return np.concatenate([left[first > 0], right[last < lit.shape[1] - 1]])
+    return np.concatenate([left[first > 0], right[last < illuminated.shape[1] - 1]])
 
 
 def _circle(points: Array) -> tuple[float, float, float]:
@@ -504,12 +504,12 @@ def fit_wavefront_map(values: ArrayLike, terms: Sequence[int], pupil: Pupil | No
             f"{count} measured pixels lie within the pupil at column {pupil.x:.1f}, row {pupil.y:.1f} of radius"
             f" {pupil.radius:.1f}; {size} terms need more: specify the pupil, or fit fewer terms"
         )
-    lit_values = measured[rows, columns]
+    pupil_values = measured[rows, columns]
     # QR by chunks, each stacked below the triangle of those before; the last column holds the orthonormal coefficients
     triangle = np.zeros((0, size + 1))
     for part in _chunks(count):
         basis = circle_terms(terms, x[part], y[part])
-        both = np.column_stack([basis, lit_values[part]]) / math.sqrt(count)
+        both = np.column_stack([basis, pupil_values[part]]) / math.sqrt(count)
         triangle = np.asarray(np.linalg.qr(np.concatenate([triangle, both]), mode="r"))
     sign = np.where(np.diag(triangle)[:size] < 0.0, -1.0, 1.0)
     factor, parts = triangle[:size, :size] * sign[:, None], triangle[:size, size] * sign

@@ -264,10 +264,10 @@ def read_zernikes(path: Path, *, wavelength: float | None = None) -> ZernikeTabl
     statements = map_files.statements(path, text, ("order", "normalised", "unit", "wavelength"))
     order = _keyword(path, "order", statements.get("order"), ORDER_NAMES)
     scaled = _keyword(path, "normalised", statements.get("normalised"), NORMALISATIONS)
-    stated_wavelength = (
+    file_wavelength = (
         map_files.length_from(path, statements["wavelength"], "wavelength") if "wavelength" in statements else None
     )
-    wavelength = map_files.agreed(path, "wavelength", wavelength, stated_wavelength)
+    wavelength = map_files.agreed(path, "wavelength", wavelength, file_wavelength)
     indices, table, others, in_head = _table(path, text)
     units = {text_unit for text_unit in (statements.get("unit"), *in_head) if text_unit}
     if len(units) > 1:
@@ -299,15 +299,15 @@ def read_zernikes(path: Path, *, wavelength: float | None = None) -> ZernikeTabl
     )
 
 
-def _keyword(path: Path, key: str, found: str | None, known: Mapping[str, Any]) -> Any:
+def _keyword(path: Path, key: str, value: str | None, known: Mapping[str, Any]) -> Any:
     """Return the meaning of the value of a header key such as ``order``; raise MapError for an unknown value."""
-    if found is None:
+    if value is None:
         raise map_files.MapError(
             f"{path} does not state its {key}: add a line '# {key}: {next(iter(known))}' ({', '.join(known)})"
         )
-    if found.strip().lower() not in known:
-        raise map_files.MapError(f"{path}: {key} is {found[:40]!r}; {', '.join(known)} are known")
-    return known[found.strip().lower()]
+    if value.strip().lower() not in known:
+        raise map_files.MapError(f"{path}: {key} is {value[:40]!r}; {', '.join(known)} are known")
+    return known[value.strip().lower()]
 
 
 def _table(path: Path, text: str) -> tuple[list[int], Array, dict[str, tuple[str, ...]], set[str | None]]:

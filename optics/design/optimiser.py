@@ -428,7 +428,7 @@ For an aspheric coefficient it is relative to the largest nominal coefficient of
 """
 _SPREAD = {"conic": 0.3, "y": 1e-3, "tilt": 1e-3, BIAS: 1e-3}
 """Quantity -> standard deviation of its random change in a random start, SI units, for quantities not in ``_SHARE``."""
-_PLACE = 0.01
+_POSITION_SPREAD = 0.01
 """Standard deviation of the random change of positions along z in a random start, relative to the envelope's length."""
 
 
@@ -584,7 +584,7 @@ def drawn_start(
     for n, (variable, value) in enumerate(zip(variables, values, strict=True)):
         kind = variable.quantity
         if kind == "z":
-            spread[n] = _PLACE * envelope
+            spread[n] = _POSITION_SPREAD * envelope
         elif kind in _SHARE:
             spread[n] = _SHARE[kind] * (abs(value) if kind == "curvature" else largest[kind])
         else:

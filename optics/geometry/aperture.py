@@ -320,8 +320,8 @@ class Edge:
 
 def outer_edge(aperture: Aperture | None, edges: Sequence[Edge]) -> Aperture | None:
     """Return the smallest outer edge given for a surface (polygons excluded), or its aperture if there is none."""
-    stated = [edge.shape for edge in edges if not edge.blocks and isinstance(edge.shape, Aperture)]
-    return min(stated, key=lambda shape: shape.enclosing.radius, default=aperture)
+    apertures = [edge.shape for edge in edges if not edge.blocks and isinstance(edge.shape, Aperture)]
+    return min(apertures, key=lambda shape: shape.enclosing.radius, default=aperture)
 
 
 def flipped_y(edge: Edge) -> Edge:

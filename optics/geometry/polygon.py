@@ -207,12 +207,12 @@ def intersect(polygons: np.ndarray, normal: np.ndarray, limit: np.ndarray) -> np
     order = np.argsort(-beyond, axis=1, kind="stable")[:, : np.max(np.count_nonzero(beyond, axis=1), initial=0)]
     for column in order.T:
         rows = np.flatnonzero(np.take_along_axis(beyond, column[:, None], axis=1)[:, 0])
-        cut = clip(polygons[rows], normal[rows, column[rows]], limit[rows, column[rows]])
+        clipped = clip(polygons[rows], normal[rows, column[rows]], limit[rows, column[rows]])
         if len(rows) == len(polygons):
-            polygons = cut
+            polygons = clipped
         else:
-            polygons = padded(polygons, cut.shape[1]).copy()
-            polygons[rows] = padded(cut, polygons.shape[1])
+            polygons = padded(polygons, clipped.shape[1]).copy()
+            polygons[rows] = padded(clipped, polygons.shape[1])
     return polygons
 
 

@@ -102,7 +102,7 @@ def half_space_intersection(normals: np.ndarray, offsets: np.ndarray) -> Polyhed
     planes = [_integers((*n, d)) for n, d in zip(normals.tolist(), offsets.tolist(), strict=True)]
     corners, rings = _box(planes, count)
     for k in range(count):
-        _cut(corners, rings, planes, k)
+        _remove_beyond(corners, rings, planes, k)
     if any(k >= count for k in rings):
         raise OpenBodyError("the half-spaces leave the body open on one side")
     used = sorted({v for ring in rings.values() for v in ring})
@@ -140,7 +140,7 @@ def _box(planes: list[_Plane], first: int) -> tuple[list[_Corner], _Rings]:
     return corners, rings
 
 
-def _cut(corners: list[_Corner], rings: _Rings, planes: Sequence[_Plane], k: int) -> None:
+def _remove_beyond(corners: list[_Corner], rings: _Rings, planes: Sequence[_Plane], k: int) -> None:
     """Cut off the part of a body beyond plane number ``k``; a plane that cuts nothing off makes no face.
 
     ``corners`` and ``rings`` are the corners and faces of the body, which are changed.
@@ -162,19 +162,19 @@ def _cut(corners: list[_Corner], rings: _Rings, planes: Sequence[_Plane], k: int
         if all(side[v] >= 0 for v in ring):
             del rings[face]
             continue
-        cut_ring = []
+        new_ring = []
         for u, v in _edges(ring):
             if side[u] <= 0:
-                cut_ring.append(u)
+                new_ring.append(u)
             if side[u] * side[v] < 0:
                 edge = (min(u, v), max(u, v))
                 if edge not in new:
                     new[edge] = len(corners)
                     corners.append(_intersection(planes[face], planes[face_at[v, u]], planes[k]))
                     side[new[edge]] = 0
-                cut_ring.append(new[edge])
-        rings[face] = cut_ring
-        after.update({v: u for u, v in _edges(cut_ring) if side[u] == side[v] == 0})
+                new_ring.append(new[edge])
+        rings[face] = new_ring
+        after.update({v: u for u, v in _edges(new_ring) if side[u] == side[v] == 0})
     start = next(iter(after))
     cap = [start]
     while after[cap[-1]] != start:

@@ -153,8 +153,8 @@ class Disk:
     centre : (2,) ndarray
         Centre, metres.
     radius : float
-        Radius before the linear map ``stretch``, metres.
-    stretch : (2, 2) ndarray
+        Radius before the linear map ``linear_map``, metres.
+    linear_map : (2, 2) ndarray
         Linear map of the disk; the unit matrix for a circle.
 
     Raises
@@ -165,26 +165,26 @@ class Disk:
 
     centre: np.ndarray
     radius: float
-    stretch: np.ndarray = field(default_factory=lambda: np.eye(2))
+    linear_map: np.ndarray = field(default_factory=lambda: np.eye(2))
 
     def __post_init__(self) -> None:
         """Freeze the arrays, and check that the radius is positive and the stretch has an inverse."""
         object.__setattr__(self, "centre", _vector(self.centre, "the centre of a disk"))
-        object.__setattr__(self, "stretch", _frozen(self.stretch))
+        object.__setattr__(self, "linear_map", _frozen(self.linear_map))
         if not (np.isfinite(self.radius) and self.radius > 0.0):
             raise ValueError(f"a disk needs a positive radius, found {self.radius}")
-        if self.stretch.shape != (2, 2) or not self.area > 0.0:
+        if self.linear_map.shape != (2, 2) or not self.area > 0.0:
             raise ValueError("a disk needs a stretch of shape (2, 2) that has an inverse")
 
     @property
     def area(self) -> float:
         """Area of the disk or ellipse, m^2."""
-        return float(np.pi * self.radius**2 * abs(np.linalg.det(self.stretch)))
+        return float(np.pi * self.radius**2 * abs(np.linalg.det(self.linear_map)))
 
     @property
     def bounds(self) -> tuple[float, float, float, float]:
         """Bounding box (x_min, x_max, y_min, y_max), in metres."""
-        (x, y), (hx, hy) = self.centre, self.radius * np.hypot(self.stretch[:, 0], self.stretch[:, 1])
+        (x, y), (hx, hy) = self.centre, self.radius * np.hypot(self.linear_map[:, 0], self.linear_map[:, 1])
         return float(x - hx), float(x + hx), float(y - hy), float(y + hy)
 
     def spectrum(self, fx: np.ndarray, fy: np.ndarray) -> np.ndarray:
@@ -204,7 +204,7 @@ class Disk:
         from scipy.special import j1
 
         kx, ky, shape = _wave_numbers(fx, fy)
-        (a, b), (c, d) = self.radius * self.stretch
+        (a, b), (c, d) = self.radius * self.linear_map
         # the offset matters at q = 0 only, where 2 J1(q)/q becomes 1
         q = np.hypot(a * kx + c * ky, b * kx + d * ky) + 1e-300
         out = (2.0 * self.area * j1(q) / q) * _phasor(kx, self.centre[0])
@@ -229,7 +229,7 @@ class Disk:
 
         def rim(t: np.ndarray) -> np.ndarray:
             angle = 2.0 * np.pi / _RIM_POINTS * t
-            return self.centre + self.radius * np.stack([np.cos(angle), np.sin(angle)], axis=-1) @ self.stretch.T
+            return self.centre + self.radius * np.stack([np.cos(angle), np.sin(angle)], axis=-1) @ self.linear_map.T
 
         t = np.arange(float(_RIM_POINTS))
         wave = 2.0 * np.pi / _RIM_POINTS * t

@@ -127,13 +127,13 @@ class ABg:
         """Width l = B^(1/g) of the lobe, in direction cosines."""
         return self.b ** (1.0 / self.g) if self.g > 0.0 else 1.0
 
-    def _upper(self, reach: float) -> float:
-        """Return the integral of the lobe's upper bound over distances below ``reach``, per specular power.
+    def _upper(self, radius: float) -> float:
+        """Return the integral of the lobe's upper bound over distances below ``radius``, per specular power.
 
-        ``reach`` is in direction cosines.
+        ``radius`` is in direction cosines.
         """
         bound = self.a / self.b * _largest_ratio(self.g) if self.g > 0.0 else self.a / (1.0 + self.b)
-        return bound * _harvey_integral(self._scale, self.g, reach)
+        return bound * _harvey_integral(self._scale, self.g, radius)
 
 
 @dataclass(frozen=True)
@@ -167,12 +167,12 @@ class HarveyShack:
         """Parameters from which scattered directions are drawn."""
         return _require_samplable(Lobe(self._upper(MAX_DISTANCE), self.l, -self.s, False))
 
-    def _upper(self, reach: float) -> float:
-        """Return the integral of the lobe over distances below ``reach``, as a fraction of the specular power.
+    def _upper(self, radius: float) -> float:
+        """Return the integral of the lobe over distances below ``radius``, as a fraction of the specular power.
 
-        ``reach`` is in direction cosines; the lobe is its own upper bound.
+        ``radius`` is in direction cosines; the lobe is its own upper bound.
         """
-        return self.b0 * _harvey_integral(self.l, -self.s, reach)
+        return self.b0 * _harvey_integral(self.l, -self.s, radius)
 
 
 Scatter = ABg | HarveyShack
@@ -271,9 +271,9 @@ def _largest_ratio(g: float) -> float:
     return float(2.0 ** max(0.5 * g - 1.0, 0.0))
 
 
-def _harvey_integral(scale: float, g: float, reach: float) -> float:
-    """Return the integral of (1 + (d/l)^2)^(-g/2) over the disk of distances d below ``reach``; l is ``scale``."""
-    q, level = 1.0 - 0.5 * g, float(np.log1p((reach / scale) ** 2))
+def _harvey_integral(scale: float, g: float, radius: float) -> float:
+    """Return the integral of (1 + (d/l)^2)^(-g/2) over the disk of distances d below ``radius``; l is ``scale``."""
+    q, level = 1.0 - 0.5 * g, float(np.log1p((radius / scale) ** 2))
     return float(np.pi * scale**2 * (level if abs(q) < _FLAT else np.expm1(q * level) / q))
 
 

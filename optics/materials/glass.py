@@ -484,11 +484,11 @@ def find_glass(name: str) -> Glass | CatalogueGlass:
     ...     print(str(error).partition(" (")[0])
     unknown glass 'N-BK8'; did you mean 'N-BK7'?
     """
-    every: dict[str, Glass | CatalogueGlass] = {**GLASSES, **common_glasses()}
-    for known, entry in every.items():
+    glasses: dict[str, Glass | CatalogueGlass] = {**GLASSES, **common_glasses()}
+    for known, entry in glasses.items():
         if known.lower() == name.lower():
             return entry
-    raise unknown_name("glass", name, every)
+    raise unknown_name("glass", name, glasses)
 
 
 def refractive_index(

@@ -17,7 +17,7 @@ from typing import Any, Literal, ParamSpec, TypeVar, Union, get_args, get_origin
 
 import numpy as np
 
-Given = ParamSpec("Given")
+Parameters = ParamSpec("Parameters")
 Result = TypeVar("Result")
 
 
@@ -48,7 +48,7 @@ def public(value: Any, package: str, name: str) -> Any:
     return wrapped
 
 
-def checked(function: Callable[Given, Result], name: str = "") -> Callable[Given, Result]:
+def checked(function: Callable[Parameters, Result], name: str = "") -> Callable[Parameters, Result]:
     """Return a function that raises `WrongKindError` where an argument has another kind than its annotation.
 
     Parameters
@@ -67,7 +67,7 @@ def checked(function: Callable[Given, Result], name: str = "") -> Callable[Given
         return {p.name: _evaluated(p.annotation, names) for p in parameters if p.kind not in varied}
 
     @functools.wraps(function)
-    def call(*args: Given.args, **kwargs: Given.kwargs) -> Result:
+    def call(*args: Parameters.args, **kwargs: Parameters.kwargs) -> Result:
         for key, value in (*zip(hints(), args, strict=False), *kwargs.items()):
             _check(name or function.__qualname__, key, value, hints().get(key, Any))
         return function(*args, **kwargs)

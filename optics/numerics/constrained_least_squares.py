@@ -141,7 +141,7 @@ def constrained_least_squares(
     for _ in range(iterations):
         assert sample.d_residuals is not None
         widths = np.maximum(widths, np.linalg.norm(sample.d_residuals, axis=0))
-        fraction, growth, moved = 1.0, 2.0, False
+        fraction, factor, moved = 1.0, 2.0, False
         while True:
             model = _Model.of(sample, widths, damping, equal, (low - x, high - x))
             step, step_multipliers = model.solve(sample.residuals, sample.constraints, fraction)
@@ -165,7 +165,7 @@ def constrained_least_squares(
                 break
             if promised <= tolerance * sample.cost or damping > _MOST_DAMPING:
                 break
-            damping, growth, fraction = damping * growth, 2.0 * growth, 0.5 * fraction
+            damping, factor, fraction = damping * factor, 2.0 * factor, 0.5 * fraction
         violated = float(violations(sample.constraints, equal).max(initial=0.0))
         if not moved:
             return Solution(x, sample, multipliers, violated <= constraint_tolerance, jacobians)

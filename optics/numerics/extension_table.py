@@ -66,20 +66,20 @@ class ExtensionTable(UserDict[str, Value]):
     ----------
     name : str
         Name of the group of entry points, without ``PREFIX``.
-    own : mapping of str to value
+    built_in : mapping of str to value
         Entries of this program, by name.
     kind : type
         Class of the values. An entry may also be a class whose instance without arguments is of that kind.
     """
 
-    def __init__(self, name: str, own: Mapping[str, Value], kind: Any = Callable) -> None:
+    def __init__(self, name: str, built_in: Mapping[str, Value], kind: Any = Callable) -> None:
         self.group = PREFIX + name
-        self._own, self._kind = own, kind
+        self._built_in, self._kind = built_in, kind
 
     @cached_property
     def data(self) -> dict[str, Any]:  # type: ignore[override]
         """Name -> value, or the entry point that provides it, or the error to raise if the entry point is broken."""
-        table: dict[str, Any] = dict(self._own)
+        table: dict[str, Any] = dict(self._built_in)
         for entry in entries():
             if entry.group == self.group and (other := table.setdefault(entry.name, entry)) is not entry:
                 owner = other.distribution if isinstance(other, Entry) else "the twin or of a third distribution"

@@ -238,10 +238,10 @@ class UploadedSystems:
         import drjit as dr
 
         if isinstance(self.numbers, tuple):
-            return map_leaves(lambda place: self.numbers[place], self.form[0])
+            return map_leaves(lambda index: self.numbers[index], self.form[0])
         system = dr.arange(self.backend.UInt, self.count)
         return map_leaves(
-            lambda place: dr.gather(self.backend.Float, self.numbers, system + place * self.count), self.form[0]
+            lambda index: dr.gather(self.backend.Float, self.numbers, system + index * self.count), self.form[0]
         )
 
     def section(self, first: int, last: int) -> UploadedSystems:

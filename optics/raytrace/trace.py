@@ -461,7 +461,7 @@ class _TracePlan:
         last = leg.stop == len(self.structure)
         if self.alone or not (self.differentiable or last):
             lookup.advance((form[1] if last else form[0][leg.stop].frame).x.shift)
-            dr.eval(*rays, lookup.place)
+            dr.eval(*rays, lookup.index)
         if last and self.evaluate:
             dr.eval(*rays, hits, outside)
 
@@ -551,20 +551,20 @@ class _TracePlan:
         kept = sum(i in self.keep for i in leg)
         arrays = self._allocated(rays[0].x, 2 + kept + 2 * (pose is not None))
 
-        def ray(place: Any) -> tuple[Any, ...]:
-            index = first + place
+        def ray(lane: Any) -> tuple[Any, ...]:
+            index = first + lane
             mine = tuple(array if dr.width(array) == 1 else dr.gather(type(array), array, index) for array in rays)
-            own_hits: list[Any] = []
-            own_outside: list[Any] = []
-            end = self._along(leg, elements, grids, mine, own_hits)
+            ray_hits: list[Any] = []
+            ray_outside: list[Any] = []
+            end = self._along(leg, elements, grids, mine, ray_hits)
             if leg.stop == len(self.structure):
-                end = self._at_end(end, pose, own_outside)
-            for target, value in zip(arrays, (*end, *own_hits, *own_outside), strict=True):
+                end = self._at_end(end, pose, ray_outside)
+            for target, value in zip(arrays, (*end, *ray_hits, *ray_outside), strict=True):
                 dr.scatter(target, value, index)
-            return (place + 1,)
+            return (lane + 1,)
 
         (ended,) = dr.while_loop(
-            (dr.zeros(self.backend.UInt, dr.width(systems)),), lambda place: place < shared, ray, mode="symbolic"
+            (dr.zeros(self.backend.UInt, dr.width(systems)),), lambda lane: lane < shared, ray, mode="symbolic"
         )
         dr.eval(arrays, ended)
         hits += arrays[4 : 4 + kept]
@@ -706,13 +706,13 @@ class _Lookup:
     def __init__(self, backend: Backend, numbers: Any, stride: Any, start: Any, system: Any, row: int) -> None:
         self._number, self._count = backend.Float, backend.UInt
         self._numbers, self._stride, self._system, self._row = numbers, stride, system, row
-        self.place = None if isinstance(numbers, tuple) else system if start is None else system + start
+        self.index = None if isinstance(numbers, tuple) else system if start is None else system + start
 
     def __call__(self, form: Any) -> Any:
         """Return the numbers whose rows in the table are given by ``form``, for each ray or lane."""
         import drjit as dr
 
-        if self.place is not None:
+        if self.index is not None:
             return map_leaves(lambda row: dr.gather(self._number, self._numbers, self._after(row)), form)
         if self._system is None:
             return map_leaves(lambda row: self._numbers[row], form)
@@ -720,12 +720,12 @@ class _Lookup:
 
     def advance(self, row: int) -> None:
         """Set the row of the table at which the numbers of the next element begin."""
-        if self.place is not None:
-            self.place, self._row = self._after(row), row
+        if self.index is not None:
+            self.index, self._row = self._after(row), row
 
     def _after(self, row: int) -> Any:
         """Return the position in memory of a row's number, for each ray or lane."""
-        return self.place + self._count(row - self._row) * self._stride
+        return self.index + self._count(row - self._row) * self._stride
 
 
 def _to_frame(backend: Backend, p: Any, d: Any, frame: FrameNumbers) -> tuple[Any, Any]:

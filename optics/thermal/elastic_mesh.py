@@ -285,7 +285,7 @@ def _slabs(corners: np.ndarray, faces: list[_Edges], spacing: float) -> list[tup
         count = round((high - low) / target)
         cuts += [low + (high - low) * (k + 0.5) / count for k in range(count)]
     pieces = []
-    for cut in cuts:
+    for height in cuts:
         new: dict[tuple[int, int], int] = {}
         parts: tuple[list[_Edges], list[_Edges]] = ([], [])  # below, above
         section: _Edges = []
@@ -293,17 +293,17 @@ def _slabs(corners: np.ndarray, faces: list[_Edges], spacing: float) -> list[tup
             halves: tuple[_Edges, _Edges] = ([], [])
             ends = {}
             for u, v in edges:
-                side = along[u] > cut
-                if side == (along[v] > cut):
+                side = along[u] > height
+                if side == (along[v] > height):
                     halves[side].append((u, v))
                     continue
                 key = (min(u, v), max(u, v))
                 if key not in new:
                     a, b = key
-                    fraction = (cut - along[a]) / (along[b] - along[a])
+                    fraction = (height - along[a]) / (along[b] - along[a])
                     new[key] = len(nodes)
                     nodes.append(nodes[a] + fraction * (nodes[b] - nodes[a]))
-                    along.append(cut)
+                    along.append(height)
                 halves[side].append((u, new[key]))
                 halves[not side].append((new[key], v))
                 ends[side] = new[key]
@@ -351,12 +351,12 @@ def _bisected(nodes: np.ndarray, tetrahedra: np.ndarray, spacing: float) -> tupl
         rank[np.lexsort((np.arange(len(edges)), np.round(length / spacing, 9)))] = np.arange(len(edges))
         longest = edge_index[np.arange(len(edge_index)), np.argmax(rank[edge_index], axis=1)]
         around = np.bincount(edge_index.ravel(), minlength=len(edges))
-        cut = (np.bincount(longest, minlength=len(edges)) == around) & (length > spacing * (1.0 + 1e-9))
-        if not np.any(cut):
+        bisected = (np.bincount(longest, minlength=len(edges)) == around) & (length > spacing * (1.0 + 1e-9))
+        if not np.any(bisected):
             return nodes, tetrahedra
-        new = np.cumsum(cut) - 1 + len(nodes)
-        nodes = np.concatenate([nodes, 0.5 * (nodes[edges[cut, 0]] + nodes[edges[cut, 1]])])
-        split = cut[longest]
+        new = np.cumsum(bisected) - 1 + len(nodes)
+        nodes = np.concatenate([nodes, 0.5 * (nodes[edges[bisected, 0]] + nodes[edges[bisected, 1]])])
+        split = bisected[longest]
         old, edge = tetrahedra[split], longest[split]
         halves = [np.where(old == edges[edge, k][:, None], new[edge][:, None], old) for k in (0, 1)]
         tetrahedra = np.concatenate([tetrahedra[~split], *halves])

@@ -86,13 +86,13 @@ class NodalDeformation:
         Exact rotation vector about the frame's origin, radians.
     shift : tuple of float
         Translation of the frame's origin, metres.
-    growth : float
+    expansion : float
         Relative scale of the surface about the origin.
     figure : FrozenMap of int to float
         Noll index -> amplitude of the change of sag along +z, metres rms over the disk; from Z1 on.
     grid : GridFigure, optional
         Change of sag beyond these terms, on a grid; None where it is below rounding.
-    places : (K, 2) ndarray
+    points : (K, 2) ndarray
         Positions x, y of the K nodes used, on the moved face, metres.
     weight : (K,) ndarray
         Fraction of the clear aperture that belongs to each of these nodes.
@@ -112,10 +112,10 @@ class NodalDeformation:
 
     rotate: tuple[float, float, float]
     shift: tuple[float, float, float]
-    growth: float
+    expansion: float
     figure: FrozenMap[int, float]
     grid: GridFigure | None
-    places: np.ndarray
+    points: np.ndarray
     weight: np.ndarray
     change: np.ndarray
     residual: np.ndarray
@@ -140,7 +140,7 @@ class NodalDeformation:
 
     def motion(self) -> Motion:
         """Return the deformation as a motion of the face's body."""
-        return Motion(self.rotate, self.shift, figure=self.figure, expansion=self.growth, grid=self.grid)
+        return Motion(self.rotate, self.shift, figure=self.figure, expansion=self.expansion, grid=self.grid)
 
 
 def nodal_deformation(
@@ -268,7 +268,7 @@ def _filled(aperture: Aperture) -> float:
     return len(_lattice(aperture, step)) / float(np.prod(np.clip(counts, 40, _FINEST)))
 
 
-def _cells(places: np.ndarray, aperture: Aperture, spacing: float) -> np.ndarray:
+def _cells(points: np.ndarray, aperture: Aperture, spacing: float) -> np.ndarray:
     """Return, for each of K positions, the fraction of the aperture that is nearer to it than to the others, (K,).
 
     Raises
@@ -279,13 +279,13 @@ def _cells(places: np.ndarray, aperture: Aperture, spacing: float) -> np.ndarray
     from scipy.spatial import cKDTree
 
     lattice = _lattice(aperture, spacing / _LATTICE)
-    distance, nearest = cKDTree(places).query(lattice)
+    distance, nearest = cKDTree(points).query(lattice)
     worst = int(np.argmax(distance))
     if distance[worst] > MAX_GAP * spacing:
         x, y = 1e3 * lattice[worst]
         text = f"no node within {1e3 * distance[worst]:.3g} mm of x, y = {x:.4g}, {y:.4g} mm in the clear aperture"
         raise NodesError(text, f"nodes over all of it, at most {1e3 * MAX_GAP * spacing:.2g} mm from any point of it")
-    return np.asarray(np.bincount(nearest, minlength=len(places)) / len(lattice))
+    return np.asarray(np.bincount(nearest, minlength=len(points)) / len(lattice))
 
 
 def _similarity(points: np.ndarray, moves: np.ndarray, weight: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
@@ -336,7 +336,7 @@ class _Spline:
 
     Parameters
     ----------
-    places : (K, 2) ndarray
+    points : (K, 2) ndarray
         K positions inside the bounds, metres.
     bounds : tuple of float
         (x_min, x_max, y_min, y_max) of the first and last samples, metres.
@@ -344,24 +344,24 @@ class _Spline:
         Number of samples along y and x.
     """
 
-    def __init__(self, places: np.ndarray, bounds: tuple[float, float, float, float], shape: tuple[int, int]) -> None:
+    def __init__(self, points: np.ndarray, bounds: tuple[float, float, float, float], shape: tuple[int, int]) -> None:
         from scipy import sparse
 
         self._bounds, self._shape = bounds, shape
         rows, columns = shape
-        u = (places[:, 0] - bounds[0]) / (bounds[1] - bounds[0]) * (columns - 1)
-        v = (places[:, 1] - bounds[2]) / (bounds[3] - bounds[2]) * (rows - 1)
+        u = (points[:, 0] - bounds[0]) / (bounds[1] - bounds[0]) * (columns - 1)
+        v = (points[:, 1] - bounds[2]) / (bounds[3] - bounds[2]) * (rows - 1)
         along, column = _cubic(u, columns)
         across, row = _cubic(v, rows)
-        values = (across[:, :, None] * along[:, None, :]).reshape(len(places), 16)
-        index = (row[:, :, None] * columns + column[:, None, :]).reshape(len(places), 16)
-        number = np.repeat(np.arange(len(places)), 16)
+        values = (across[:, :, None] * along[:, None, :]).reshape(len(points), 16)
+        index = (row[:, :, None] * columns + column[:, None, :]).reshape(len(points), 16)
+        number = np.repeat(np.arange(len(points)), 16)
         size = rows * columns
-        self._design = sparse.csr_array((values.ravel(), (number, index.ravel())), shape=(len(places), size))
-        one_x, one_y = _second(columns), _second(rows)
+        self._design = sparse.csr_array((values.ravel(), (number, index.ravel())), shape=(len(points), size))
+        second_x, second_y = _second(columns), _second(rows)
         plain_x, plain_y = sparse.eye_array(columns), sparse.eye_array(rows)
         twist = sparse.kron(_first(rows), _first(columns))
-        bending = [sparse.kron(plain_y, one_x), sparse.kron(one_y, plain_x)]
+        bending = [sparse.kron(plain_y, second_x), sparse.kron(second_y, plain_x)]
         self._bending = _BENDING * (sum(b.T @ b for b in bending) + 2.0 * twist.T @ twist)
 
     def fit(self, values: np.ndarray, used: np.ndarray) -> GridFigure:

@@ -190,21 +190,21 @@ class NodalTemperature:
         points : (P, 3) array_like
             Points in the frame of the nodes, metres.
         """
-        places = np.asarray(points, np.float64)
-        rest = self._inside_rest(places)
+        scaled = np.asarray(points, np.float64)
+        rest = self._inside_rest(scaled)
         beyond = np.isnan(rest)
         if np.any(beyond):
-            rest[beyond] = self._deviations[self._tree.query(places[beyond])[1]]
-        return self._linear_at(places) + rest
+            rest[beyond] = self._deviations[self._tree.query(scaled[beyond])[1]]
+        return self._linear_at(scaled) + rest
 
-    def _inside_rest(self, places: np.ndarray) -> np.ndarray:
+    def _inside_rest(self, scaled: np.ndarray) -> np.ndarray:
         """Return the interpolated deviation from the nodes' linear fit at points, kelvin; NaN outside the nodes.
 
-        ``places`` are the points relative to the nodes' mean position, in units of the nodes' extents.
+        ``scaled`` are the points relative to the nodes' mean position, in units of the nodes' extents.
         """
         if self._inside is None:
-            return np.full(len(places), np.nan)
-        return self._inside(self._placed(places))
+            return np.full(len(scaled), np.nan)
+        return self._inside(self._placed(scaled))
 
     def coverage(self, points: Any, weights: Any) -> Coverage:
         """Return how well the nodes cover a body's volume, which P points with their volumes represent.
@@ -216,9 +216,9 @@ class NodalTemperature:
         weights : (P,) array_like
             Volume that each point represents, m^3.
         """
-        places, share = np.asarray(points, np.float64), np.asarray(weights, np.float64)
-        distance = self._tree.query(places)[0]
-        beyond = np.isnan(self._inside_rest(places)) & (distance > self.spacing)
+        scaled, share = np.asarray(points, np.float64), np.asarray(weights, np.float64)
+        distance = self._tree.query(scaled)[0]
+        beyond = np.isnan(self._inside_rest(scaled)) & (distance > self.spacing)
         return Coverage(float(np.sum(share[beyond]) / np.sum(share)), float(np.max(distance)))
 
     @property
@@ -229,15 +229,15 @@ class NodalTemperature:
         smooth.
         """
         if self._leave_out_error is None:
-            left_out = np.arange(len(self.points)) % 2 == 1
+            excluded = np.arange(len(self.points)) % 2 == 1
             errors = np.zeros(0)
             if not self.flat:
                 scaled = self._placed(self.points)
                 try:
-                    predicted = _Interpolator(scaled[~left_out], self._deviations[~left_out])(scaled[left_out])
-                    errors = (predicted - self._deviations[left_out])[np.isfinite(predicted)]
+                    predicted = _Interpolator(scaled[~excluded], self._deviations[~excluded])(scaled[excluded])
+                    errors = (predicted - self._deviations[excluded])[np.isfinite(predicted)]
                 except QhullError:
-                    errors = self._deviations[left_out]
+                    errors = self._deviations[excluded]
             self._leave_out_error = float(np.sqrt(np.mean(errors**2))) if len(errors) else 0.0
         return self._leave_out_error
 
@@ -261,10 +261,10 @@ def linear_part(points: Any, values: Any, weights: Any) -> tuple[Temperature, np
     remainder : (P,) ndarray
         Values minus the field, kelvin.
     """
-    places, heat, root = np.asarray(points), np.asarray(values), np.sqrt(np.asarray(weights))
-    middle, scale = places.mean(axis=0), np.ptp(places, axis=0)
+    positions, heat, root = np.asarray(points), np.asarray(values), np.sqrt(np.asarray(weights))
+    middle, scale = positions.mean(axis=0), np.ptp(positions, axis=0)
     level = float(np.mean(heat))  # subtracted first, so that a uniform temperature stays exactly uniform
-    matrix = np.column_stack([np.ones(len(places)), (places - middle) / scale])
+    matrix = np.column_stack([np.ones(len(positions)), (positions - middle) / scale])
     solved = np.linalg.lstsq(matrix * root[:, None], (heat - level) * root, rcond=None)[0]
     slope = solved[1:] / scale
     field = Temperature(float(level + solved[0] - slope @ middle), triple(slope))

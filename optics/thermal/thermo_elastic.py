@@ -168,8 +168,8 @@ class Finder:
 def rigid_modes(points: np.ndarray) -> np.ndarray:
     """Return the displacements of P points (P, 3) due to unit shifts along and rotations about the axes, (6, 3 P)."""
     shifts = np.broadcast_to(np.eye(3)[:, None, :], (3, len(points), 3))
-    turns = np.cross(np.eye(3)[:, None, :], points[None])
-    return np.concatenate([shifts, turns]).reshape(6, -1)
+    rotations = np.cross(np.eye(3)[:, None, :], points[None])
+    return np.concatenate([shifts, rotations]).reshape(6, -1)
 
 
 @dataclass(frozen=True)
@@ -365,7 +365,7 @@ class ElasticBody:
     ----------
     nodes : (N, 3) ndarray
         All N nodes of the quadratic elements, metres.
-    places : (P, 3) ndarray
+    points : (P, 3) ndarray
         P quadrature points at which loads are evaluated, metres.
     volumes : (P,) ndarray
         Volumes that the quadrature points represent, m^3.
@@ -380,7 +380,7 @@ class ElasticBody:
         self._material = material
         self._finder = Finder(mesh, element, basis.element_dofs)
         self._points = np.moveaxis(np.asarray(basis.global_coordinates()), 0, -1)  # (cells, Q, 3)
-        self.places = self._points.reshape(-1, 3)
+        self.points = self._points.reshape(-1, 3)
         # uniform within a cell, since Gauss weights of tetrahedra may be negative
         self.volumes = np.repeat(np.mean(basis.dx, axis=1), self._points.shape[1])
         gradient = np.stack([np.asarray(b[0].grad) for b in basis.basis]).transpose(2, 0, 1, 3)  # (cells, I, 3, Q)
@@ -445,7 +445,7 @@ class ElasticBody:
 
     def _load(self, temperature: Field) -> np.ndarray:
         """Return the thermal forces at the N nodes divided by Young's modulus, (3 N,), m^2."""
-        points = self.places
+        points = self.points
         change = np.asarray(temperature(points), np.float64)
         if change.shape != (len(points),):
             raise ValueError(f"a temperature field needs one value for each of {len(points)} points: {change.shape}")

@@ -369,15 +369,15 @@ def at_intersections(field: PupilField, x: np.ndarray, y: np.ndarray) -> np.ndar
     y : (B, R) ndarray
         Positions of the rows, metres.
     """
-    turns = 1.0 / field.wavelength
+    wave_number = 1.0 / field.wavelength
 
     def waves(cycles: np.ndarray) -> np.ndarray:
         phase = (2.0 * np.pi * (cycles - np.rint(cycles))).astype(np.float32)
         return np.asarray(np.cos(phase) + 1j * np.sin(phase))
 
-    rows = waves(turns * (field.eikonal[:, None] + y[..., None] * field.v[:, None]))
+    rows = waves(wave_number * (field.eikonal[:, None] + y[..., None] * field.v[:, None]))
     rows *= field.amplitude[:, None].astype(np.float32)
-    columns = waves(turns * x[..., None] * field.u[:, None])
+    columns = waves(wave_number * x[..., None] * field.u[:, None])
     wave = rows @ np.swapaxes(columns, 1, 2)
     return np.asarray((wave.real.astype(np.float64) ** 2 + wave.imag.astype(np.float64) ** 2) / field.wavelength**2)
 
@@ -467,7 +467,7 @@ def airy(radius: ArrayLike, wavelength: float, f_number: float, obscuration: flo
 FIT_ERROR = 1e-6
 """Largest accepted error of the kernel's transfer function; the kernel is enlarged until it is below."""
 
-MAX_REACH = 10
+MAX_HALF_WIDTH = 10
 """Largest half-width of the pixel filter's kernel, in pixels.
 
 It suffices for images with frequencies up to three quarters of what the pixels can sample.
@@ -501,14 +501,14 @@ class PixelResponse:
 
     Attributes
     ----------
-    kernel : (2 reach + 1, 2 reach + 1) ndarray
+    kernel : (2 half_width + 1, 2 half_width + 1) ndarray
         Filter kernel.
     """
 
     kernel: np.ndarray
 
     @property
-    def reach(self) -> int:
+    def half_width(self) -> int:
         """Number of pixels by which the filter shrinks an image on every side."""
         return self.kernel.shape[0] // 2
 
@@ -542,8 +542,8 @@ class PixelResponse:
         inside = np.hypot(fx, fy) <= limit
         fx, fy = fx[inside], fy[inside]
         wanted = np.sinc(fx) * np.sinc(fy) * _jinc(np.pi * np.hypot(fx, fy) * disk / pitch)
-        for reach in range(1, MAX_REACH + 1):
-            kernel, error = _symmetric_kernel(fx, fy, wanted, reach)
+        for half_width in range(1, MAX_HALF_WIDTH + 1):
+            kernel, error = _symmetric_kernel(fx, fy, wanted, half_width)
             if error <= FIT_ERROR:
                 kernel.setflags(write=False)
                 return cls(kernel)
@@ -555,14 +555,14 @@ class PixelResponse:
         )
 
     def apply(self, images: np.ndarray) -> np.ndarray:
-        """Return the filtered images, smaller by ``reach`` pixels on every side.
+        """Return the filtered images, smaller by ``half_width`` pixels on every side.
 
-        ``images`` (B, R, C) are B images of R rows and C columns; the result is (B, R - 2 reach, C - 2 reach).
+        ``images`` (B, R, C) are B images of R rows and C columns; the result is (B, R - 2 h, C - 2 h), h the half width.
         """
         # imported late, since commands that only check files import this module
         import cv2
 
-        r = self.reach
+        r = self.half_width
         out = np.empty((len(images), images.shape[1] - 2 * r, images.shape[2] - 2 * r))
 
         def work(number: int) -> None:
@@ -573,22 +573,22 @@ class PixelResponse:
         return out
 
 
-def _symmetric_kernel(fx: np.ndarray, fy: np.ndarray, wanted: np.ndarray, reach: int) -> tuple[np.ndarray, float]:
+def _symmetric_kernel(fx: np.ndarray, fy: np.ndarray, wanted: np.ndarray, half_width: int) -> tuple[np.ndarray, float]:
     """Return the kernel of eightfold symmetry whose transfer function is nearest to ``wanted``, and the largest error.
 
     It is a least-squares fit at the frequencies ``fx``, ``fy``, in cycles per pixel.
     """
     orbits = []
-    for i in range(reach + 1):
+    for i in range(half_width + 1):
         for j in range(i + 1):
             orbits.append(sorted({(a * p, b * q) for p, q in ((i, j), (j, i)) for a in (1, -1) for b in (1, -1)}))
     columns = [sum(np.cos(2.0 * np.pi * (fx * a + fy * b)) for a, b in orbit) for orbit in orbits]
     matrix = np.stack(columns, axis=-1)
     solution, *_ = np.linalg.lstsq(matrix, wanted, rcond=1e-13)
-    kernel = np.zeros((2 * reach + 1, 2 * reach + 1))
+    kernel = np.zeros((2 * half_width + 1, 2 * half_width + 1))
     for orbit, value in zip(orbits, solution, strict=True):
         for a, b in orbit:
-            kernel[reach + a, reach + b] = value
+            kernel[half_width + a, half_width + b] = value
     return kernel, float(np.max(np.abs(matrix @ solution - wanted)))
 
 

@@ -99,14 +99,14 @@ class StopOutlines:
             K convex polygons of W corners that do not overlap; some are empty.
         """
         # each image separately: one piece in one of them may be many in another
-        shadows = [self._of_one(number, further) for number in range(count)]
+        shadows = [self._of_beam(number, further) for number in range(count)]
         pieces, corners = (max(shape[k] for shape in (polygons.shape for polygons in shadows)) for k in (0, 1))
         out = np.zeros((count, pieces, corners, 2))
         for number, polygons in enumerate(shadows):
             out[number, : len(polygons)] = padded(polygons, corners)
         return out
 
-    def _of_one(self, number: int, further: Sequence[np.ndarray]) -> np.ndarray:
+    def _of_beam(self, number: int, further: Sequence[np.ndarray]) -> np.ndarray:
         """Return the shadows in the pupil of image ``number``: K polygons of W corners without overlap, (K, W, 2)."""
         image = slice(number, number + 1)
         open_area = _window(1)
@@ -497,22 +497,22 @@ class SurfaceEdges:
     ----------
     edges : mapping of str to tuple of Edge
         Surface -> its edges, in the order of the light, of every surface that has some.
-    places : mapping of str to (B, N, 2) ndarray
+    points : mapping of str to (B, N, 2) ndarray
         Surface -> points where N rays meet it, stopped or not, in its own x and y, metres of nominal size.
     nodes : PupilNodes
         Points of the stop, through which the rays go.
     """
 
     edges: Mapping[str, tuple[Edge, ...]]
-    places: Mapping[str, np.ndarray]
+    points: Mapping[str, np.ndarray]
     nodes: PupilNodes
 
     @cached_property
     def passed(self) -> list[np.ndarray]:
         """Masks of the rays that no edge up to and including each surface blocks, (B, N) for N rays of B images."""
         through = [
-            np.all([edge.passes(place[..., 0], place[..., 1]) for edge in self.edges[name]], axis=0)
-            for name, place in self.places.items()
+            np.all([edge.passes(points[..., 0], points[..., 1]) for edge in self.edges[name]], axis=0)
+            for name, points in self.points.items()
         ]
         return list(accumulate(through, np.logical_and))
 
@@ -525,8 +525,8 @@ class SurfaceEdges:
             Rays meet a surface at places that no polynomials follow.
         """
         outlines = StopOutlines()
-        for (name, place), bright in zip(self.places.items(), [None, *self.passed[:-1]], strict=True):
-            outlines += outlines_on_stop(place, self.edges[name], self.nodes, round_sides, bright)
+        for (name, points), bright in zip(self.points.items(), [None, *self.passed[:-1]], strict=True):
+            outlines += outlines_on_stop(points, self.edges[name], self.nodes, round_sides, bright)
         return outlines
 
 

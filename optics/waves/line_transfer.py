@@ -66,7 +66,7 @@ In polygons that represent round outlines it is smaller.
 _SHORT_CELLS = 0.005, 0.04
 """Largest lengths of a cell, in radii of the pupil, with which one and two nodes suffice; longer cells get three."""
 
-_TURNS = 0.2
+_SMALL_PHASE = 0.2
 """Largest change of phase over a cell, radians, for which the cell gets no additional node.
 
 Near the cut-off there are few cells without an edge.
@@ -165,13 +165,13 @@ def vignetted_pupils(
     return tuple(VignettedPupil(pupil, tuple(c), tuple(b)) for pupil, (c, b) in zip(pupils, edges, strict=True))
 
 
-def unvignetted_at(cut: VignettedPupil, points: np.ndarray) -> np.ndarray:
+def unvignetted_at(vignetted: VignettedPupil, points: np.ndarray) -> np.ndarray:
     """Return the mask (N,) of N pupil points, complex, that no edge except the pupil's own blocks.
 
     Points are in normalised coordinates, in which the pupil's edge is near the unit circle.
     """
     out = np.ones(len(points), bool)
-    for polygons, clear in ((cut.clear, True), (cut.blocked, False)):
+    for polygons, clear in ((vignetted.clear, True), (vignetted.blocked, False)):
         for polygon in polygons:
             left, right = _chords(polygon, points.imag)
             out &= ((left <= points.real) & (points.real <= right)) == clear
@@ -179,7 +179,7 @@ def unvignetted_at(cut: VignettedPupil, points: np.ndarray) -> np.ndarray:
 
 
 def line_transfers(
-    cut: Sequence[VignettedPupil],
+    vignetted: Sequence[VignettedPupil],
     wavelengths: Sequence[float],
     directions: np.ndarray,
     step: float,
@@ -190,7 +190,7 @@ def line_transfers(
 
     Parameters
     ----------
-    cut : sequence of VignettedPupil
+    vignetted : sequence of VignettedPupil
         Pupils of B images.
     wavelengths : sequence of float
         Wavelength of each image, metres.
@@ -214,7 +214,7 @@ def line_transfers(
     UnphysicalError
         Even with the largest number of lines the result differs from that of a third of them.
     """
-    tasks = [(p, wave, unit) for p, wave in zip(cut, wavelengths, strict=True) for unit in np.asarray(directions)]
+    tasks = [(p, wave, unit) for p, wave in zip(vignetted, wavelengths, strict=True) for unit in np.asarray(directions)]
 
     def computed(task: tuple[VignettedPupil, float, np.ndarray]) -> LineTransfer:
         pupil, wave, direction = task
@@ -227,17 +227,17 @@ def line_transfers(
 
 
 def _line_transfer(
-    cut: VignettedPupil, wavelength: float, direction: np.ndarray, step: float, count: int, lines: Sequence[int]
+    vignetted: VignettedPupil, wavelength: float, direction: np.ndarray, step: float, count: int, lines: Sequence[int]
 ) -> LineTransfer:
     """Return the transfer function of one image along one direction, with as many lines as its error requires."""
-    shift = complex(cut.pupil.normalised(*direction))
+    shift = complex(vignetted.pupil.normalised(*direction))
     pitch, unit = wavelength * step * abs(shift), shift / abs(shift)
     cells_per_step = int(np.ceil(pitch / _LONGEST_CELL))
     pitch, count = pitch / cells_per_step, (count - 1) * cells_per_step + 1
-    tables, outlines = _rotated_tables(cut.pupil, unit), _rotated(cut, unit)
+    tables, outlines = _rotated_tables(vignetted.pupil, unit), _rotated(vignetted, unit)
     wave, error = 2.0 * np.pi / wavelength, np.inf
     nodes = _first_nodes(pitch, wave * pitch * _steepest(tables[0]))
-    many = len(cut.clear) + len(cut.blocked) > FEW_OUTLINES
+    many = len(vignetted.clear) + len(vignetted.blocked) > FEW_OUTLINES
     for number in lines or LINES[int(many) :]:
         rows = _Lines.across(*outlines, number)
         fine = _autocorrelation(rows, tables, wave, pitch, count, nodes)
@@ -260,15 +260,15 @@ def _counterclockwise(polygon: np.ndarray) -> np.ndarray:
     return polygon[::-1] if clockwise else polygon
 
 
-def _rotated(cut: VignettedPupil, unit: complex) -> tuple[list[np.ndarray], list[np.ndarray]]:
+def _rotated(vignetted: VignettedPupil, unit: complex) -> tuple[list[np.ndarray], list[np.ndarray]]:
     """Return the clear and the blocked outlines of a pupil, rotated so that the direction ``unit`` is along x.
 
     The pupil's own edge is the first of the clear outlines.
     """
     angle = 2.0 * np.pi * np.arange(RIM_SIDES) / RIM_SIDES
-    rim = _counterclockwise(np.sqrt(angle[1] / np.sin(angle[1])) * cut.pupil.edge.boundary(angle)[0])
+    rim = _counterclockwise(np.sqrt(angle[1] / np.sin(angle[1])) * vignetted.pupil.edge.boundary(angle)[0])
     back = np.conj(unit)
-    return [back * p for p in (rim, *cut.clear)], [back * p for p in cut.blocked]
+    return [back * p for p in (rim, *vignetted.clear)], [back * p for p in vignetted.blocked]
 
 
 def _rotated_tables(pupil: PupilFunction, unit: complex) -> tuple[np.ndarray, np.ndarray]:
@@ -300,7 +300,7 @@ def _first_nodes(pitch: float, phase: float) -> int:
 
     ``phase`` is the largest change of the wavefront's phase over the cell, radians.
     """
-    more = nodes_for(phase, 0) if phase > 1.0 else int(phase > _TURNS)
+    more = nodes_for(phase, 0) if phase > 1.0 else int(phase > _SMALL_PHASE)
     return int(np.searchsorted(_SHORT_CELLS, pitch)) + 1 + more
 
 

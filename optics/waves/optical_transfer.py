@@ -381,7 +381,7 @@ class TransferTable:
         Centroid (x, y) of the image from its origin, metres; its phase multiplies the spline.
     to_shift : (2, 2) ndarray
         Matrix from cycles/m to normalised shifts at the shortest wavelength.
-    reach : ndarray
+    extent : ndarray
         Complex coefficients of a polynomial in exp(2 i direction), whose real part is the longest shift with an overlap
         (the cut-off) in that direction, in normalised pupil coordinates.
     spline : ndarray
@@ -390,7 +390,7 @@ class TransferTable:
 
     centroid: np.ndarray
     to_shift: np.ndarray
-    reach: np.ndarray
+    extent: np.ndarray
     spline: np.ndarray
 
     @classmethod
@@ -449,9 +449,9 @@ class TransferTable:
         padded = np.pad(dense, ((0, 0), (_PAD, _PAD)), mode="wrap")
         coefficients = spline_filter(padded.real) + 1j * spline_filter(padded.imag)
         direction = np.pi * np.arange(64) / 64
-        reach = np.fft.fft(pupil.edge.reach(direction)[0])[:9] / 64
-        reach[1:] *= 2.0
-        return cls(centroid, np.min(wavelengths) * np.linalg.inv(pupil.axes), reach, coefficients)
+        extent = np.fft.fft(pupil.edge.extent(direction)[0])[:9] / 64
+        extent[1:] *= 2.0
+        return cls(centroid, np.min(wavelengths) * np.linalg.inv(pupil.axes), extent, coefficients)
 
     def __call__(self, fx: np.ndarray, fy: np.ndarray) -> np.ndarray:
         """Return the complex transfer function at frequencies (cycles/m) of any shapes that broadcast."""
@@ -471,7 +471,7 @@ class TransferTable:
         x, y = a * fx + b * fy, c * fx + d * fy
         size = np.hypot(x, y)
         twice = (x + 1j * y) ** 2 / np.where(size == 0.0, 1.0, size) ** 2
-        radius = size / np.polynomial.polynomial.polyval(twice, self.reach).real
+        radius = size / np.polynomial.polynomial.polyval(twice, self.extent).real
         out = np.zeros(len(fx), complex)
         inside = np.flatnonzero(radius < 1.0)
         angle = np.arctan2(y[inside], x[inside]) % (2.0 * np.pi)
@@ -506,7 +506,7 @@ def _polar_terms(
     node = np.cos(np.pi * (np.arange(rings) + 0.5) / rings)
     direction = np.pi * np.arange(arms) / arms
     ratio = np.cos(0.25 * np.pi * (node + 1.0))
-    shift = ratio[:, None] * pupil.edge.reach(direction)[0] * np.exp(1j * direction)
+    shift = ratio[:, None] * pupil.edge.extent(direction)[0] * np.exp(1j * direction)
     values = _about(pupil, shift, wavelengths, defocus, centroid, "clear")
     circle = np.concatenate([values, np.conj(values)], axis=-1)
     transform = np.polynomial.chebyshev.chebvander(node, rings - 1).T * (2.0 / rings)
@@ -559,7 +559,7 @@ def _shadow_table(
     rings, arms = _SHADOW_GRID
     direction = np.pi * np.arange(arms) / arms
     ratio = np.arange(rings) / rings
-    shift = ratio[:, None] * pupil.edge.reach(direction)[0] * np.exp(1j * direction)
+    shift = ratio[:, None] * pupil.edge.extent(direction)[0] * np.exp(1j * direction)
     half = _about(pupil, shift, wavelengths, defocus, centroid, "shadow")
     circle = np.concatenate([half, np.conj(half)], axis=-1)
     # zero beyond the cut-off; at zero frequency is a cusp, at which the spline starts as the series do

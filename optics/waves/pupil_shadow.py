@@ -92,7 +92,7 @@ class PupilShadow:
             Number of sides of the polygon that represents an edge.
         """
         radius = edge_radius(harmonics)
-        return cls(tiled(cut(polygons, radius, rim_sides))[0], radius)
+        return cls(tiled(within_edge(polygons, radius, rim_sides))[0], radius)
 
     @property
     def area(self) -> np.ndarray:
@@ -174,11 +174,11 @@ class PupilShadow:
         full_at = np.nonzero(inside & full[:, None, None])
         b, s, g, k = np.nonzero(~inside & near & full[:, None, None])
         corners = self._corners
-        cut_points, cut_weights = np.empty((len(b), count**2), complex), np.empty((len(b), count**2))
+        polygon_points, polygon_weights = np.empty((len(b), count**2), complex), np.empty((len(b), count**2))
         for group, (corner_limit,) in _similar(corners[b, k]):
             moved = self.pieces[b[group], k[group], :corner_limit] - offset[b[group], s[group], g[group]][:, None]
-            cut_points[group], cut_weights[group] = quadrature_within(moved, self.radius[b[group]], count)
-        cut_points += (sign[g] * shift[b, s])[:, None]
+            polygon_points[group], polygon_weights[group] = quadrature_within(moved, self.radius[b[group]], count)
+        polygon_points += (sign[g] * shift[b, s])[:, None]
         pair = self._pairs(moves, full)
         shared_points, shared_weights = np.empty((len(pair[0]), count**2), complex), np.empty((len(pair[0]), count**2))
         for group, (corner_limit, others) in _similar(corners[pair[0], pair[2]], corners[pair[0], pair[3]]):
@@ -197,8 +197,8 @@ class PupilShadow:
             sign=np.concatenate([sign[full_at[2]], sign[g], np.ones(len(pair[0]))]),
             piece=full_at[3],
             whole=points,
-            points=np.concatenate([points[full_at[0], full_at[3]], cut_points, shared_points]),
-            weights=np.concatenate([-weights[full_at[0], full_at[3]], -cut_weights, shared_weights]),
+            points=np.concatenate([points[full_at[0], full_at[3]], polygon_points, shared_points]),
+            weights=np.concatenate([-weights[full_at[0], full_at[3]], -polygon_weights, shared_weights]),
         )
 
     @cached_property
@@ -333,8 +333,8 @@ def without(part: np.ndarray, before: np.ndarray, fewest: bool = False) -> list[
         # the part does not extend beyond the other sides
         height = np.einsum("bvx,bwx->bwv", part[..., :2], normal)
         beyond = np.flatnonzero(np.any(height > limit[..., None], axis=(0, 2)))
-        cut_area = [float(np.mean(area(clip(part, -normal[:, w], -limit[:, w])))) for w in beyond]
-        pieces = difference(part, before, beyond[np.argsort(cut_area)[::-1]])
+        remaining_area = [float(np.mean(area(clip(part, -normal[:, w], -limit[:, w])))) for w in beyond]
+        pieces = difference(part, before, beyond[np.argsort(remaining_area)[::-1]])
     else:
         pieces = difference(part, before)
     # a polygon empty to rounding still has sides, and would return the part a second time
@@ -412,7 +412,7 @@ def _radius(terms: np.ndarray, phasor: np.ndarray) -> np.ndarray:
     return np.asarray(total.real + terms[:, 0].real[over])
 
 
-def cut(polygons: np.ndarray, radius: np.ndarray, rim_sides: int) -> np.ndarray:
+def within_edge(polygons: np.ndarray, radius: np.ndarray, rim_sides: int) -> np.ndarray:
     """Return the part of each polygon inside an edge, counterclockwise.
 
     A polygon of the same area represents the edge.

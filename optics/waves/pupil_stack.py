@@ -398,10 +398,10 @@ class PupilStack:
         along = np.array([nodes_for(float(span), LEAST_ALONG) for span in wave * self.span])
         for count in np.unique(along):
             rows = int(count) + LEAST_ACROSS - LEAST_ALONG
-            some = np.flatnonzero(along == count)
+            pieces = np.flatnonzero(along == count)
             room = max(1, points // (shifts * rows * int(count)))
-            for start in range(0, len(some), room):
-                yield some[start : start + room], rows, int(count)
+            for start in range(0, len(pieces), room):
+                yield pieces[start : start + room], rows, int(count)
 
     def _sums(self, points: np.ndarray, weight: np.ndarray, shift: np.ndarray, wave: np.ndarray) -> np.ndarray:
         """Return integrals over the overlaps of B pupils with themselves at S shifts, (B, S).
@@ -572,7 +572,7 @@ class PupilFunction:
         """
         unit = np.asarray(direction) / np.linalg.norm(direction, axis=-1, keepdims=True)
         shift = self.normalised(unit[..., 0], unit[..., 1])
-        return np.asarray(self.edge.reach(np.angle(shift))[0] / (np.abs(shift) * wavelength))
+        return np.asarray(self.edge.extent(np.angle(shift))[0] / (np.abs(shift) * wavelength))
 
     @cached_property
     def power(self) -> float:

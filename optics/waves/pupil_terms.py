@@ -223,7 +223,7 @@ class PupilEdge:
             power = power * phasor
         return point, slope
 
-    def reach(self, direction: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def extent(self, direction: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the length of the longest chord along each direction, and its half angle on the stop's rim, radians.
 
         Directions are in radians, in normalised coordinates. A longer shift leaves no overlap of the pupil with itself:
@@ -302,7 +302,7 @@ class PupilEdge:
             True where the copies overlap.
         """
         direction, size = np.angle(shift), np.abs(shift)
-        longest, middle = self.reach(direction)
+        longest, middle = self.extent(direction)
         inside = size < longest
         want = np.arccos(np.minimum(size / longest, 1.0))
         out = []

@@ -237,10 +237,10 @@ def annular_mtf(frequency: ArrayLike, wavelength: float, f_number: float, obscur
         apart = np.clip(shift, abs(first - second), first + second)
         apart = np.where(apart == 0.0, 1e-300, apart)
         parts = []
-        for one, other in ((first, second), (second, first)):
-            near = (apart**2 + one**2 - other**2) / (2.0 * apart)
-            angle = np.arccos(np.clip(near / one, -1.0, 1.0))
-            parts.append(one**2 * (angle - 0.5 * np.sin(2.0 * angle)))
+        for radius, other in ((first, second), (second, first)):
+            near = (apart**2 + radius**2 - other**2) / (2.0 * apart)
+            angle = np.arccos(np.clip(near / radius, -1.0, 1.0))
+            parts.append(radius**2 * (angle - 0.5 * np.sin(2.0 * angle)))
         return np.asarray(parts[0] + parts[1])
 
     overlap = common(1.0, 1.0)

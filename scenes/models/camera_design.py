@@ -50,8 +50,8 @@ def prescription_of(camera: CameraSpec) -> Prescription:
     """Return the optical prescription of a camera's file."""
     surfaces = {name: surface_of(mirror) for name, mirror in camera.mirrors.items()}
     image = VertexPose(camera.image.z, tilt=camera.image.tilt or 0.0)
-    stands = {n: VertexPose(m.z) for n, m in camera.mirrors.items()}
-    return Prescription({**surfaces, IMAGE: plane()}, {**stands, IMAGE: image}, camera.stop, camera.field_bias)
+    vertices = {n: VertexPose(m.z) for n, m in camera.mirrors.items()}
+    return Prescription({**surfaces, IMAGE: plane()}, {**vertices, IMAGE: image}, camera.stop, camera.field_bias)
 
 
 def beams_of(camera: CameraSpec) -> Beams:

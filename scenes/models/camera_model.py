@@ -117,15 +117,15 @@ def check_focal_length(spec: CameraSpec, traced: TracedFocalLengths, focal_lengt
         The two differ by more than ``LARGEST_DIFFERENCE``. The error names the number whose other sign or unit brings
         the focal length to the specified one, where there is one.
     """
-    stated, real = spec.focal_length, bool(np.all(traced.light > 0.0))
-    in_place, in_focus = (_difference(np.abs(one), stated) <= LARGEST_DIFFERENCE for one in traced)
-    if in_focus and in_place and real:
+    specified, real = spec.focal_length, bool(np.all(traced.light > 0.0))
+    at_image, in_focus = (_difference(np.abs(length), specified) <= LARGEST_DIFFERENCE for length in traced)
+    if in_focus and at_image and real:
         return
     cause, suggestion = _cause(spec, float(traced.image[0]), focal_lengths, in_focus and real)
     if suggestion is None and in_focus:
         return
-    off = float(traced.light[-1] if in_place else traced.image[0])
-    problem = f"the stated focal length is {stated:.4g} m, but that of the surfaces is {off:.4g} m"
+    off = float(traced.light[-1] if at_image else traced.image[0])
+    problem = f"the stated focal length is {specified:.4g} m, but that of the surfaces is {off:.4g} m"
     allowed = f"the traced focal length within {100 * LARGEST_DIFFERENCE:.0f} %, or surfaces that have the stated one"
     raise spec.error(problem + cause, ("focal_length",), allowed=allowed, suggestion=suggestion)
 
@@ -147,18 +147,20 @@ def check_entrance_pupil(spec: CameraSpec, traced: float) -> None:
             problem, ("stop",), allowed="a stop away from a focus, which rays of each height meet elsewhere"
         )
     if off > LARGEST_PUPIL_DIFFERENCE:
-        stated, actual = (format_quantity(float(f"{d:.4g}"), LENGTH) for d in (spec.entrance_pupil, traced))
-        problem = f"a stop of this size has an entrance pupil of {actual} on the axis, but the file states {stated}"
+        specified, actual = (format_quantity(float(f"{d:.4g}"), LENGTH) for d in (spec.entrance_pupil, traced))
+        problem = f"a stop of this size has an entrance pupil of {actual} on the axis, but the file states {specified}"
         allowed = f"both within {100 * LARGEST_PUPIL_DIFFERENCE:.0f} %, or the entrance pupil alone"
         raise spec.error(problem, ("stop_diameter",), allowed=allowed)
 
 
-def _difference(traced: np.ndarray, stated: float) -> float:
+def _difference(traced: np.ndarray, specified: float) -> float:
     """Return the relative difference of the traced from the specified focal length, the smaller of both directions'."""
-    return float(np.min(np.abs(traced / stated - 1.0)))
+    return float(np.min(np.abs(traced / specified - 1.0)))
 
 
-def _cause(spec: CameraSpec, traced: float, focal_lengths: FocalLengths, place: bool) -> tuple[str, str | None]:
+def _cause(
+    spec: CameraSpec, traced: float, focal_lengths: FocalLengths, surfaces_agree: bool
+) -> tuple[str, str | None]:
     """Return the likely mistake as a sentence and as the corrected line of the file.
 
     The sentence is empty if no single mistake explains the difference.
@@ -168,11 +170,13 @@ def _cause(spec: CameraSpec, traced: float, focal_lengths: FocalLengths, place: 
             right = format_quantity(spec.focal_length / factor, LENGTH)
             return f"; the stated one is probably {what}", f"focal_length: {right}"
     # Surfaces with the stated focal length are right: only the position of the image or the field may be wrong.
-    for among in (_places(spec),) if place else (_single(spec), _places(spec), _together(spec)):
+    for among in (
+        (_image_and_field(spec),) if surfaces_agree else (_single(spec), _image_and_field(spec), _together(spec))
+    ):
         fits = []
         for words, line, changed in among:
             try:
-                off = max(_difference(one, spec.focal_length) for one in focal_lengths(changed))
+                off = max(_difference(length, spec.focal_length) for length in focal_lengths(changed))
             except _NO_LIGHT:
                 continue
             if off <= LARGEST_DIFFERENCE:
@@ -205,7 +209,7 @@ def _together(spec: CameraSpec) -> Candidates:
     yield "the sign of every radius", line, spec.model_copy(update={"mirrors": FrozenMap(flipped)})
 
 
-def _places(spec: CameraSpec) -> Candidates:
+def _image_and_field(spec: CameraSpec) -> Candidates:
     """Yield the camera with one number of the image plane or of the field corrected, for each likely mistake."""
     image = spec.image
     changes: list[tuple[KeyPath, str, dict[str, Any]]] = []
@@ -339,7 +343,7 @@ def _along(
     start, on_axis = -LAUNCH_DISTANCE * direction, np.array_equal(direction, PARENT_AXIS)
     centre = aim_collimated(backend, to_stop, direction[None], start[None], np.zeros((1, 2)))[0][0, 0]
     optics = [mirror for mirror in spec.mirrors.values() if mirror.light != "passes"]
-    centred = on_axis and not any(one.decentre or one.rotate or one.sag for one in optics)
+    centred = on_axis and not any(element.decentre or element.rotate or element.sag for element in optics)
     axis = CameraAxis(direction, start if centred else centre, centre, on_axis)
     _require_light(backend, imaging, axis.base[None], direction)
     if spec.stop_diameter is not None:
@@ -843,7 +847,7 @@ def _chief(
     return to_stop, imaging, launch, ray_matrix(backend, imaging, stop, launch, centre[None], axes)
 
 
-def _derived(spec: CameraSpec, backend: Backend, check_stated: bool) -> CameraModel:
+def _derived(spec: CameraSpec, backend: Backend, check_specified: bool) -> CameraModel:
     """Trace a prescription and return its camera model; errors of the ray trace are raised unchanged.
 
     `derive_camera` reports them as input errors.
@@ -857,7 +861,7 @@ def _derived(spec: CameraSpec, backend: Backend, check_stated: bool) -> CameraMo
     axis, stop_radius = find_axis(spec, backend, to_stop, imaging, centre)
     about_axis = axis_data(backend, imaging, spec, axis, LINE_AXIS)
     pupil = pupil_diameter(backend, to_stop, axis, stop_radius)
-    if check_stated:
+    if check_specified:
         focal_lengths = _focal_lengths(matrix, about_axis)
         check_focal_length(spec, focal_lengths, lambda other: _traced_focal_lengths(other, backend))
 
@@ -879,7 +883,7 @@ def _derived(spec: CameraSpec, backend: Backend, check_stated: bool) -> CameraMo
     apertures = _apertures(spec, backend, to_stop, imaging, stop_radius)
     distance = float(abs(chief.scale[0, 0, 0]))  # along the line, as in the papers
     rear_node = image_centre - distance * image_direction
-    if check_stated or spec.stop_diameter is None:
+    if check_specified or spec.stop_diameter is None:
         check_entrance_pupil(spec, pupil)
     frames = (camera_frame, focal_plane, chief, image_direction, rear_node)
     return CameraModel(spec, surfaces, apertures, *frames, axis, about_axis, pupil)

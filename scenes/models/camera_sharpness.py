@@ -93,7 +93,7 @@ radius; its result is a mask, (F, N).
 """
 
 
-def stop_nodes(model: CameraModel, rings: int, cut: bool = False) -> PupilNodes:
+def stop_nodes(model: CameraModel, rings: int, vignetted: bool = False) -> PupilNodes:
     """Return the points of the stop, with quadrature weights, at which a camera's light is evaluated.
 
     Where nothing but the stop limits a beam, these are Gauss' rule with ``rings`` rings, exact for smooth wavefronts.
@@ -106,10 +106,10 @@ def stop_nodes(model: CameraModel, rings: int, cut: bool = False) -> PupilNodes:
         The camera.
     rings : int
         Number of rings of Gauss' rule.
-    cut : bool
+    vignetted : bool
         Whether bodies about the camera vignette the beam, too.
     """
-    return quadrature.even_disk(EVEN) if model.edges or cut else quadrature.disk(rings)
+    return quadrature.even_disk(EVEN) if model.edges or vignetted else quadrature.disk(rings)
 
 
 @dataclass(frozen=True, eq=False)
@@ -153,10 +153,10 @@ class FieldBeams:
         backend: Backend,
         fields: tuple[tuple[float, float], ...],
         rings: int,
-        cut: Cut | None = None,
+        vignetting: Cut | None = None,
         wavelength: float | None = None,
     ) -> FieldBeams:
-        """Trace the beams through the camera as designed, limited by the stop, by edges of surfaces and by ``cut``.
+        """Trace the beams through the camera as designed, limited by the stop, surface edges and ``vignetting``.
 
         ``wavelength`` is that of the light, in metres, by default the design wavelength. Errors stay in waves of the
         design wavelength.
@@ -170,7 +170,7 @@ class FieldBeams:
         ValueError
             The index of a glass is not known at the wavelength.
         """
-        spec, nodes = model.spec, stop_nodes(model, rings, cut is not None)
+        spec, nodes = model.spec, stop_nodes(model, rings, vignetting is not None)
         bare = model.bare_assembly(apertures=False)
         states = [coloured(spec, "", {}, spec.wavelength if wavelength is None else wavelength)]
         to_stop = assemble(bare, [model.mirrors[: model.mirrors.index(spec.stop) + 1]], states)
@@ -197,8 +197,8 @@ class FieldBeams:
                 raise spec.error(
                     "edges block practically all light", key, found=found, allowed="a smaller field, or wider edges"
                 )
-        if cut is not None:
-            free = ~cut(np.array(fields), points[1:] / radius)
+        if vignetting is not None:
+            free = ~vignetting(np.array(fields), points[1:] / radius)
             illuminated = free if illuminated is None else illuminated & free
         require_rays(valid.reshape(shape), f"camera {spec.name}")
         position, direction = position.reshape(*shape, 3), direction.reshape(*shape, 3)
@@ -222,7 +222,7 @@ class FieldBeams:
         backend: Backend,
         fields: Sequence[tuple[float, float]],
         rings: int,
-        cut: Cut | None = None,
+        vignetting: Cut | None = None,
     ) -> np.ndarray:
         """Return the rms wavefront error at each of F field points on the image plane of the camera's file, in waves.
 
@@ -236,7 +236,7 @@ class FieldBeams:
             F field points, as fractions of the half field.
         rings : int
             Number of rings of Gauss' rule over the stop.
-        cut : callable or None
+        vignetting : callable or None
             Function that returns the rays that bodies about the camera block.
 
         Returns
@@ -250,10 +250,10 @@ class FieldBeams:
             Light of a field does not come through, or edges block all of it.
         """
         # Fields are traced in parts, which limits the memory to some 100 MB.
-        step = max(1, _MOST_RAYS // stop_nodes(model, rings, cut is not None).count)
+        step = max(1, _MOST_RAYS // stop_nodes(model, rings, vignetting is not None).count)
         parts = [tuple(fields[k : k + step]) for k in range(0, len(fields), step)]
         plane = FocalPlane.of(model.spec)
-        return np.concatenate([cls.trace(model, backend, part, rings, cut).errors(plane) for part in parts])
+        return np.concatenate([cls.trace(model, backend, part, rings, vignetting).errors(plane) for part in parts])
 
     @property
     def share(self) -> np.ndarray:
@@ -293,7 +293,9 @@ class FieldBeams:
         basis = zernike.basis(3, self.nodes.x, self.nodes.y)
         error = (to_sphere[:, :1] - to_sphere)[:, 1:] / self.camera.wavelength
         if self.illuminated is not None:
-            return np.stack([_levelled(one, basis, share) for one, share in zip(error, self.share, strict=True)])
+            return np.stack(
+                [_levelled(field_error, basis, share) for field_error, share in zip(error, self.share, strict=True)]
+            )
         # The first three terms are orthonormal over the disk, and the rule is exact for their products.
         return np.asarray(error - (error * self.nodes.share) @ basis @ basis.T)
 
@@ -311,9 +313,9 @@ class FieldBeams:
 
         def moved(step: np.ndarray) -> FocalPlane:
             """Return the plane shifted by ``step[0]`` and rotated by ``step[1]`` at the middle of the fields."""
-            turn = start.tilt + (float(step[1]) if tilt else 0.0)
+            tilt_angle = start.tilt + (float(step[1]) if tilt else 0.0)
             there = start.z + middle * np.tan(start.tilt) + float(step[0])
-            return FocalPlane(float(there - middle * np.tan(turn)), turn)
+            return FocalPlane(float(there - middle * np.tan(tilt_angle)), tilt_angle)
 
         def residuals(step: np.ndarray) -> np.ndarray:
             return np.asarray((self.wavefronts(moved(step)) * root).ravel())
@@ -397,9 +399,9 @@ def sharpness(camera: CameraSpec, backend: Backend) -> Sharpness:
 
 def cameras_of(setup: Spec) -> Mapping[str, CameraSpec]:
     """Return the cameras of a job or test, by the file or name in it; empty if it has none."""
-    many, one = getattr(setup, "cameras", None), getattr(setup, "camera", None)
-    if isinstance(one, CameraSpec):
-        return {one.name: one}
+    many, single = getattr(setup, "cameras", None), getattr(setup, "camera", None)
+    if isinstance(single, CameraSpec):
+        return {single.name: single}
     return {name: camera for name, camera in (many or {}).items() if isinstance(camera, CameraSpec)}
 
 

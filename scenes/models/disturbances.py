@@ -329,7 +329,7 @@ def states_of(
             moves[s].append({body: motion})
     if heat:
         moves = [[state] for state in thermal.states(heat, compose_each(moves, bodies))]
-    return compose_each([[*own, motions or {}] for own in moves], bodies)
+    return compose_each([[*moved, motions or {}] for moved in moves], bodies)
 
 
 def _groups(components: Sequence[Component]) -> Iterator[tuple[tuple[str, str, str], list[int]]]:
@@ -366,16 +366,20 @@ def _motions(values: _Values, pivot: str) -> list[Motion]:
     if all(kind in HEAT for kind, _ in values):
         return []
     vectors = (map(tuple, _three(values, kind).tolist()) for kind in ("rotate", "shift", "index_gradient"))
-    numbers = {kind: own.tolist() for (kind, _), own in values.items() if kind in ("scale", "index", "radius", "conic")}
-    figures = {axis: own.tolist() for (kind, axis), own in values.items() if kind == "figure"}
+    numbers = {
+        kind: values_of_kind.tolist()
+        for (kind, _), values_of_kind in values.items()
+        if kind in ("scale", "index", "radius", "conic")
+    }
+    figures = {axis: values_of_kind.tolist() for (kind, axis), values_of_kind in values.items() if kind == "figure"}
     return [
         Motion(
             rotate,
             shift,
             pivot,
             index_gradient=slope,
-            figure={axis: own[s] for axis, own in figures.items()},
-            **{kind: own[s] for kind, own in numbers.items()},
+            figure={axis: values_of_kind[s] for axis, values_of_kind in figures.items()},
+            **{kind: values_of_kind[s] for kind, values_of_kind in numbers.items()},
         )
         for s, (rotate, shift, slope) in enumerate(zip(*vectors, strict=True))
     ]
@@ -409,11 +413,11 @@ def _issue_at(resolved: ResolvedJob, cause: str, key: KeyPath, wrong: Problem) -
     else a line of the disturbances file.
     """
     changes = resolved.job.disturbances
-    own = changes.causes.get(cause) if changes is not None else None
+    changed_cause = changes.causes.get(cause) if changes is not None else None
     at: KeyPath = ("disturbances", "causes", cause)
-    if own is not None and (not key or key[0] in own.set_keys):
+    if changed_cause is not None and (not key or key[0] in changed_cause.set_keys):
         return resolved.job.issue(wrong, (*at, *key))
-    if own is not None and "bodies" in own.set_keys:
+    if changed_cause is not None and "bodies" in changed_cause.set_keys:
         text = f"{key[0]} of {cause}: {wrong.problem}"
         return resolved.job.issue(Problem(text, wrong.found, wrong.allowed, wrong.suggestion), (*at, "bodies"))
     assert resolved.disturbances is not None
@@ -476,10 +480,10 @@ def _of_cause(
     issues = []
     if turned:
         known = tuple(dict.fromkeys((ORIGIN, *instrument.nodes[turned[0]].pivots)))
-        issues.append(where(name, ("pivot",), unknown(f"{_some(turned)} has no such pivot", cause.pivot, known)))
+        issues.append(where(name, ("pivot",), unknown(f"{_paths_text(turned)} has no such pivot", cause.pivot, known)))
     for key, paths in refused.items():
         allowed = names_text(sorted(_possible(instrument.nodes[paths[0]], paths[0] in glass))) or "nothing"
-        issues.append(where(name, key, Problem(f"{_some(paths)} does not allow {key[0]}", allowed=allowed)))
+        issues.append(where(name, key, Problem(f"{_paths_text(paths)} does not allow {key[0]}", allowed=allowed)))
     return components, issues
 
 
@@ -526,7 +530,7 @@ def _of_joint(
     return [components[k] for k in moving], matrix[np.ix_(moving, moving)], []
 
 
-def _some(paths: Sequence[str]) -> str:
+def _paths_text(paths: Sequence[str]) -> str:
     """Return a text that names the first path and the number of the others."""
     return paths[0] if len(paths) == 1 else f"{paths[0]}, like {len(paths) - 1} more,"
 
@@ -787,7 +791,10 @@ def joint_disturbances(
         "name": name,
         "description": description,
         "joint": {
-            "components": {said: written_sigma(said, float(sigma[k])) for said, k in zip(names, moving, strict=True)},
+            "components": {
+                component_name: written_sigma(component_name, float(sigma[k]))
+                for component_name, k in zip(names, moving, strict=True)
+            },
             "correlation": correlation.tolist(),
             "time": (time or TimeLawSpec(kind="constant")).plain(),
             "reason": reason,

@@ -187,7 +187,7 @@ def _built(built: _BuildArguments) -> Instrument:
 
 def _no_cameras(camera_specs: Mapping[str, object], backend: Backend) -> tuple[Issue, ...]:
     """Return an issue for each camera of an instrument that forms no image, which explains why the build failed."""
-    return no_cameras([one for one in camera_specs.values() if isinstance(one, CameraSpec)], backend)
+    return no_cameras([spec for spec in camera_specs.values() if isinstance(spec, CameraSpec)], backend)
 
 
 def _build(
@@ -215,36 +215,36 @@ def _build(
         model = derived[site.camera]
         root = f"{BASE}/{name}"
         to_base = Pose(about_axis(1, site.look), np.array(site.position))
-        own = _channels(spec, name, model)
-        bodies += [*camera_bodies(root, to_base, model), *_monitor_bodies(focal_plane_body(root), own)]
-        elements.update({**camera_elements(name, root, model), **_ccd_elements(own)})
+        camera_channels = _channels(spec, name, model)
+        bodies += [*camera_bodies(root, to_base, model), *_monitor_bodies(focal_plane_body(root), camera_channels)]
+        elements.update({**camera_elements(name, root, model), **_ccd_elements(camera_channels)})
         sequences.update(camera_sequences(name, model))
         index |= {f"{root}/{lens}": n for lens, n in glass_indices(model.spec).items()}
         above_d |= {f"{root}/{lens}": step for lens, step in above_d_line(model.spec).items()}
-        if not own:
+        if not camera_channels:
             continue
-        bodies += [Body(f"{root}/monitor"), *(Body(f"{root}/monitor/{channel.name}") for channel in own)]
-        given = spec.channels_of(name)
-        distances = {channel: given[channel.name].prism_180.distance for channel in own}
+        bodies += [Body(f"{root}/monitor"), *(Body(f"{root}/monitor/{channel.name}") for channel in camera_channels)]
+        specs = spec.channels_of(name)
+        distances = {channel: specs[channel.name].prism_180.distance for channel in camera_channels}
         beams = monitor_chain.leaving_beams(model, distances, to_base, backend)
         facets = monitor_chain.facet_positions(spec, beams)
-        for channel in own:
+        for channel in camera_channels:
             chain = monitor_chain.monitor_chain(
-                spec, channel, given[channel.name], beams[channel], facets[channel], to_base
+                spec, channel, specs[channel.name], beams[channel], facets[channel], to_base
             )
             bodies += chain.bodies
             elements.update({e.name: e for e in chain.elements})
-            way = tuple(e.name for e in chain.elements)
+            names = tuple(e.name for e in chain.elements)
             forward = tuple(f"{name}/{m}" for m in model.mirrors)
-            sequences[f"{channel.key}/outgoing"] = (*forward[::-1], *way)
-            there, back = (*forward[::-1], *way), (*way[-2::-1], *forward, f"{channel.key}/area_ccd")
+            sequences[f"{channel.key}/outgoing"] = (*forward[::-1], *names)
+            there, back = (*forward[::-1], *names), (*names[-2::-1], *forward, f"{channel.key}/area_ccd")
             sequences[f"{channel.key}/monitor"] = (*there, *back)
             chains[channel.key] = chain
-        channels += own
+        channels += camera_channels
     solids = tuple(solid for chain in chains.values() for solid in chain.solids)
     if (block := spec.central_prism) is not None:
         mirrors = {f"facet_{c.camera}_{c.name}": c.face_body for c in channels}
-        farthest = [one.spread for name in spec.cameras for one in spec.channels_of(name).values()]
+        farthest = [channel_spec.spread for name in spec.cameras for channel_spec in spec.channels_of(name).values()]
         spread = max(x for x, _ in farthest), max(y for _, y in farthest)
         solids = (*solids, facet_block(CENTRAL_PRISM, block.material, mirrors, spread, block.height))
     _check_temperature(spec, solids)
@@ -318,8 +318,8 @@ def _check_temperature(spec: InstrumentSpec, solids: Sequence[Solid]) -> None:
 def _check_alike(spec: InstrumentSpec, assembly: Assembly) -> None:
     """Raise InputError if the cameras are too different to be traced in one batch."""
     try:
-        for way in ("image_to_stop", "image_to_object"):
-            assemble(assembly, [f"{name}/{way}" for name in spec.cameras], [{}])
+        for sequence in ("image_to_stop", "image_to_object"):
+            assemble(assembly, [f"{name}/{sequence}" for name in spec.cameras], [{}])
     except ValueError as error:
         text = f"these cameras are too different for one instrument ({error})"
         alike = "cameras with the same sequence of mirrors, planes and kinds of apertures"
@@ -342,10 +342,10 @@ def _channels(spec: InstrumentSpec, camera: str, model: CameraModel) -> list[Cha
     ccd = spec.monitor.area_ccd
     dx, dy = ccd.offset
     out = []
-    for name, one in spec.channels_of(camera).items():
-        place = model.line_principal_distance * float(np.tan(one.field))
-        beam = one.pupil_offset, one.return_face.aperture, one.photons_per_frame
-        out.append(Channel(camera, name, (-dx, place - dy), (0.0, place), *beam))
+    for name, channel_spec in spec.channels_of(camera).items():
+        field_height = model.line_principal_distance * float(np.tan(channel_spec.field))
+        beam = channel_spec.pupil_offset, channel_spec.return_face.aperture, channel_spec.photons_per_frame
+        out.append(Channel(camera, name, (-dx, field_height - dy), (0.0, field_height), *beam))
     half = 0.5 * ccd.pitch * np.array([ccd.columns, ccd.rows])
     edge = 0.5 * spec.monitor.reticle.pinhole
     for first, second in combinations(out, 2):

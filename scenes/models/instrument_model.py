@@ -89,8 +89,8 @@ class Instrument:
         """
         out: dict[str, float] = {}
         for name in self.cameras if self.channels else ():
-            places = {c.name: c.ccd[1] for c in self.channels if c.camera == name}
-            pair = [places[side] for side in SIDES] if set(SIDES) <= set(places) else list(places.values())
+            positions = {c.name: c.ccd[1] for c in self.channels if c.camera == name}
+            pair = [positions[side] for side in SIDES] if set(SIDES) <= set(positions) else list(positions.values())
             out[name] = abs(max(pair) - min(pair))
         return out
 

@@ -128,9 +128,9 @@ class HeatedBody:
         out = {}
         for path, face in self.faces.items():
             other = gridded[path].grid if gridded is not None and path in gridded else None
-            own = face.motion.grid
+            grid = face.motion.grid
             out[path] = (
-                face.motion if own is None or other is None else replace(face.motion, grid=own.sampled_as(other))
+                face.motion if grid is None or other is None else replace(face.motion, grid=grid.sampled_as(other))
             )
         return out
 
@@ -232,7 +232,7 @@ def _heated(thermal: ThermalModel, path: str, nodes: NodalTemperature) -> Heated
         residual = float(np.sqrt(np.mean(nodes.departures**2))), nodes.departure()
         return HeatedBody(len(nodes.points), nodes.spacing, nodes.linear, residual, nodes.between, None, {}, 0.0)
     elastic, _ = fine
-    coverage = nodes.coverage(elastic.places, elastic.volumes)
+    coverage = nodes.coverage(elastic.points, elastic.volumes)
     if coverage.outside > 1.0 - LEAST_INSIDE:
         low, high = (1e3 * side for side in (elastic.nodes.min(axis=0), elastic.nodes.max(axis=0)))
         body = ", ".join(f"{a:.4g} .. {b:.4g}" for a, b in zip(low, high, strict=True))
@@ -243,7 +243,7 @@ def _heated(thermal: ThermalModel, path: str, nodes: NodalTemperature) -> Heated
             + " mm",
             f"nodes throughout the body, in {body} mm of its frame: check frame and unit",
         )
-    linear, rest = linear_part(elastic.places, nodes.at(elastic.places), elastic.volumes)
+    linear, rest = linear_part(elastic.points, nodes.at(elastic.points), elastic.volumes)
     largest = float(np.max(np.abs(rest)))
     residual = float(np.sqrt(np.average(rest**2, weights=elastic.volumes))), largest
     index_path = thermal.index_path(path, linear, largest)
@@ -256,8 +256,8 @@ def _heated(thermal: ThermalModel, path: str, nodes: NodalTemperature) -> Heated
     faces: dict[str, HeatedFace] = {}
     if largest > ROUNDING and thermal.materials[path].expansion != 0.0:
 
-        def field(places: np.ndarray) -> np.ndarray:
-            return nodes.at(places) - linear.change - places @ np.array(linear.gradient)
+        def field(points: np.ndarray) -> np.ndarray:
+            return nodes.at(points) - linear.change - points @ np.array(linear.gradient)
 
         solved = [body.solve_many([field], support)[0] for body, support in (coarse, fine)]
         coarser, finer = (thermal.changes(path, moved, TERMS) for moved in solved)
@@ -291,12 +291,12 @@ def _elastic(thermal: ThermalModel, path: str) -> tuple[Held | None, Held | None
     return coarse, fine
 
 
-def _apart(one: FaceChange, other: FaceChange, radius: float) -> float:
+def _apart(change: FaceChange, other: FaceChange, radius: float) -> float:
     """Return the rms difference in sag of two changes of a face, in metres, over the disk of their Zernike terms."""
-    piston = one.shift[2] - other.shift[2]
+    piston = change.shift[2] - other.shift[2]
     # a tilt t of a disk of radius R is t R / 2 rms
-    tilts = [0.5 * radius * (a - b) for a, b in zip(one.rotate[:2], other.rotate[:2], strict=True)]
-    terms = [a - other.figure.get(j, 0.0) for j, a in one.figure.items()]
+    tilts = [0.5 * radius * (a - b) for a, b in zip(change.rotate[:2], other.rotate[:2], strict=True)]
+    terms = [a - other.figure.get(j, 0.0) for j, a in change.figure.items()]
     return float(np.sqrt(np.sum(np.square([piston, *tilts, *terms]))))
 
 
@@ -460,10 +460,10 @@ def on_deformed(
         Path of each body with a table of temperatures -> its effects.
     """
     bodies = {body.path: body for body in instrument.assembly.tree.bodies}
-    own = {path: face.motion() for path, face in deformed.items()}
+    face_motions = {path: face.motion() for path, face in deformed.items()}
     for warm in (heated or {}).values():
-        moved = compose(warm.state(own), moved, bodies) if warm.faces else moved
-    return compose(own, moved, bodies) if own else moved
+        moved = compose(warm.state(face_motions), moved, bodies) if warm.faces else moved
+    return compose(face_motions, moved, bodies) if face_motions else moved
 
 
 def motions_of(job: JobSpec, time: int | None = None) -> State:
@@ -479,10 +479,10 @@ def motions_of(job: JobSpec, time: int | None = None) -> State:
     out = {path: what.motion() for path, what in job.perturb.items()}
     if job.course is not None and time is not None:
         for path, added in job.course.motions(time).items():
-            own = out.get(path, Motion())
-            rotate = triple(a + b for a, b in zip(own.rotate, added.rotate, strict=True))
-            shift = triple(a + b for a, b in zip(own.shift, added.shift, strict=True))
-            out[path] = replace(own, rotate=rotate, shift=shift, pivot=added.pivot, scale=own.scale + added.scale)
+            motion = out.get(path, Motion())
+            rotate = triple(a + b for a, b in zip(motion.rotate, added.rotate, strict=True))
+            shift = triple(a + b for a, b in zip(motion.shift, added.shift, strict=True))
+            out[path] = replace(motion, rotate=rotate, shift=shift, pivot=added.pivot, scale=motion.scale + added.scale)
     return out
 
 

@@ -279,12 +279,12 @@ def monitor_chain(
     x_axes = {hand: (length * toward + hand * 2.0 * off * turned) / transfer for hand in (1.0, -1.0)}
     hand = min(x_axes, key=lambda h: abs(x_axes[h][1]))
     pose = Pose(_columns(x_axes[hand], up), beam.middle + 0.5 * transfer * toward)
-    pose = pose @ _turn(large.tilt, large.reflector.null_point(length, large.width))
+    pose = pose @ _tilt_about(large.tilt, large.reflector.null_point(length, large.width))
     names = channel.prism_body(PRISM_180), channel.prism_elements(PRISM_180)
     mount = Mount(names[0], into_camera @ pose, names[1], large.material, length, large.width, hand, large.angle_errors)
     first = _made(spec, channel, PRISM_180, "width", large.reflector, mount)
     pose = Pose(_columns(toward, -up), centre + small.distance * up - 0.5 * small.shift * toward)
-    pose = pose @ _turn(small.tilt, small.reflector.null_point(small.shift, small.width))
+    pose = pose @ _tilt_about(small.tilt, small.reflector.null_point(small.shift, small.width))
     names = channel.prism_body(PRISM_0), channel.prism_elements(PRISM_0)
     mount = Mount(
         names[0], into_camera @ pose, names[1], small.material, small.shift, small.width, errors=small.angle_errors
@@ -314,10 +314,10 @@ def _made(
         raise spec.error(problem, where, allowed=least or "dimensions with which the prism can be made") from error
 
 
-def _turn(tilt: tuple[float, float], about: tuple[float, float, float]) -> Pose:
+def _tilt_about(tilt: tuple[float, float], about: tuple[float, float, float]) -> Pose:
     """Return the rotation by small angles about x and y, in radians, that leaves the point ``about`` in place."""
-    turn = rotation_matrix(np.array([*tilt, 0.0]))
-    return Pose(turn, np.array(about) - matvec(turn, np.array(about)))
+    rotation = rotation_matrix(np.array([*tilt, 0.0]))
+    return Pose(rotation, np.array(about) - matvec(rotation, np.array(about)))
 
 
 def check_prisms(spec: InstrumentSpec) -> None:

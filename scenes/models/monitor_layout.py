@@ -72,19 +72,19 @@ class MonitorDesignSetup(ExperimentSetup[MonitorDesignSpec]):
         if not references:
             problem = f"{start.name} names no disturbance prior"
             raise test.error(problem, ("disturbances",), allowed="disturbances files, by name or path")
-        stated = {}
+        priors = {}
         for k, reference in enumerate(references):
             key: KeyPath = ("disturbances", k) if owner is test else ("disturbances",)
-            stated[str(reference)] = load.load_disturbances(reference, owner, key)
+            priors[str(reference)] = load.load_disturbances(reference, owner, key)
         sheets = {
-            name: load.load_detector(one.detector, test, ("area_ccds", name, "detector"))
-            for name, one in (test.area_ccds or {}).items()
+            name: load.load_detector(ccd.detector, test, ("area_ccds", name, "detector"))
+            for name, ccd in (test.area_ccds or {}).items()
         }
         return {
             "instrument": start,
             "cameras": load.load_cameras(start),
             "detector": load.load_detector(start.autocollimator.area_ccd.detector, start, load.AREA_CCD),
-            "disturbances": FrozenMap(stated),
+            "disturbances": FrozenMap(priors),
             "detectors": FrozenMap(sheets),
         }
 
@@ -162,18 +162,28 @@ def start_beams(setup: MonitorDesignSetup) -> Layout:
     """
     start, first = setup.instrument, next(iter(setup.instrument.cameras))
     sign, beams = _toward(start, start.cameras[first]), []
-    for one in start.channels_of(first).values():
-        if one.field > 0.0:
-            made, small = one.prism_180, one.prism_0
-            x, y = one.pupil_offset
-            numbers = (sign * x, y, one.return_face.aperture, one.field, made.distance, small.distance, small.shift)
-            light = setup.test.photons_per_frame or one.photons_per_frame
-            beams.append(Beam(*numbers, *one.spread, _prisms_of(setup, one), light, _ccd_of(setup)))
+    for channel in start.channels_of(first).values():
+        if channel.field > 0.0:
+            made, small = channel.prism_180, channel.prism_0
+            x, y = channel.pupil_offset
+            numbers = (
+                sign * x,
+                y,
+                channel.return_face.aperture,
+                channel.field,
+                made.distance,
+                small.distance,
+                small.shift,
+            )
+            light = setup.test.photons_per_frame or channel.photons_per_frame
+            beams.append(Beam(*numbers, *channel.spread, _prisms_of(setup, channel), light, _ccd_of(setup)))
     again = layout_spec(setup, tuple(beams))
     for camera in start.cameras:
-        own, made_again = start.channels_of(camera), again.channels_of(camera)
-        places = [sorted((c.field, c.pupil_offset, c.spread) for c in them.values()) for them in (own, made_again)]
-        if len(own) != len(made_again) or not np.allclose(_flat(places[0]), _flat(places[1]), atol=1e-12):
+        channels, made_again = start.channels_of(camera), again.channels_of(camera)
+        layouts = [
+            sorted((c.field, c.pupil_offset, c.spread) for c in them.values()) for them in (channels, made_again)
+        ]
+        if len(channels) != len(made_again) or not np.allclose(_flat(layouts[0]), _flat(layouts[1]), atol=1e-12):
             problem = f"the channels of {camera} do not mirror those of {first}"
             raise setup.test.error(problem, ("instrument",), found=start.name, allowed="the same beams, mirrored")
     return tuple(beams)
@@ -206,9 +216,9 @@ def _ccd_of(setup: MonitorDesignSetup) -> str:
     return AS_STARTED
 
 
-def _flat(places: Sequence[tuple[float, tuple[float, float], tuple[float, float]]]) -> np.ndarray:
+def _flat(beams: Sequence[tuple[float, tuple[float, float], tuple[float, float]]]) -> np.ndarray:
     """Return fields, pupil offsets and facet positions of channels as one array, with a row per channel."""
-    return np.array([[field, *offset, *spread] for field, offset, spread in places])
+    return np.array([[field, *offset, *spread] for field, offset, spread in beams])
 
 
 def _toward(spec: instruments.InstrumentSpec, site: instruments.MountedCameraSpec) -> float:
@@ -243,8 +253,8 @@ def layout_spec(setup: MonitorDesignSetup, beams: Layout) -> instruments.Instrum
         sites[name] = site.model_copy(update={"pupil_offset": None, "channels": FrozenMap(channels)})
     reticle = monitor.reticle.model_copy(update={"photons_per_frame": _light(setup)})
     chosen = (test.area_ccds or {}).get(beams[0].area_ccd)
-    own = {} if chosen is None else {name: getattr(chosen, name) for name in type(chosen).model_fields}
-    ccd = monitor.area_ccd.model_copy(update=own)
+    changes = {} if chosen is None else {name: getattr(chosen, name) for name in type(chosen).model_fields}
+    ccd = monitor.area_ccd.model_copy(update=changes)
     monitor = monitor.model_copy(update={"reticle": reticle, "frames": test.frames or monitor.frames, "area_ccd": ccd})
     block = start.reference_prism
     block = block.model_copy(update={"material": test.central_material or block.material})
@@ -287,7 +297,7 @@ def _channel(
     monitor = setup.instrument.autocollimator
     rim = monitor.prism_180.width - monitor.return_face.aperture, monitor.prism_0.width - monitor.return_face.aperture
     chosen = (setup.test.prisms or {}).get(beam.prisms)
-    kinds = [{} if chosen is None else dict(one) for one in _parts(chosen)]
+    kinds = [{} if chosen is None else dict(part) for part in _parts(chosen)]
     large = {"distance": beam.prism_180_distance, "width": beam.width + rim[0], **kinds[0]}
     small = {"distance": beam.prism_0_distance, "shift": beam.shift, "width": beam.width + rim[1], **kinds[1]}
     return instruments.ChannelSpec.model_construct(
@@ -303,8 +313,8 @@ def _channel(
 
 def _parts(chosen: PrismChoiceSpec | None) -> Iterator[Mapping[str, object]]:
     """Yield material and kind of both prisms, as changed keys of their specifications."""
-    for one in (None, None) if chosen is None else (chosen.prism_180, chosen.prism_0):
-        yield {} if one is None else {"material": one.material, "kind": one.kind}
+    for prism in (None, None) if chosen is None else (chosen.prism_180, chosen.prism_0):
+        yield {} if prism is None else {"material": prism.material, "kind": prism.kind}
 
 
 def kinds_of(setup: MonitorDesignSetup, beam: Beam) -> tuple[str | None, str | None]:

@@ -179,9 +179,9 @@ def convex_bodies(instrument: Instrument, placed: PlacedBodies | None = None) ->
 def find_overlaps(instrument: Instrument) -> tuple[Overlap, ...]:
     """Return all pairs of bodies that overlap or are nearer than ``LEAST_GAP`` in the nominal state, deepest first."""
     known = Clearances.of(instrument)
-    found = [(*pair, gap) for pair, gap in zip(known.pairs, known.gaps, strict=True) if gap < LEAST_GAP]
+    close_pairs = [(*pair, gap) for pair, gap in zip(known.pairs, known.gaps, strict=True) if gap < LEAST_GAP]
     out = []
-    for i, j, gap in sorted(found, key=lambda one: one[2]):
+    for i, j, gap in sorted(close_pairs, key=lambda overlap: overlap[2]):
         first, second = (known.poses[k].apply(known.corners[k]) for k in (i, j))
         out.append(Overlap(known.paths[i], known.paths[j], -gap, separating_move(first, second)))
     return tuple(out)
@@ -257,8 +257,8 @@ class Clearances:
         poses = [placed.pose(path) for path in self.paths]
         moved = np.array(
             [
-                np.linalg.norm(now.apply(own) - then.apply(own), axis=-1).max()
-                for now, then, own in zip(poses, self.poses, self.corners, strict=True)
+                np.linalg.norm(now.apply(corners) - then.apply(corners), axis=-1).max()
+                for now, then, corners in zip(poses, self.poses, self.corners, strict=True)
             ]
         )
         overlaps = []
@@ -294,15 +294,15 @@ def _issue(instrument: Instrument, overlap: Overlap) -> Issue:
     problem = f"{overlap.first} {how} {overlap.second}"
     allowed = f"{allowed} that leaves a gap of at least {1e6 * LEAST_GAP:.3g} um"
     if overlap.move is not None:
-        axis, way = overlap.move
-        allowed += f": move it by {_move_text(axis, way if path == overlap.second else -way)} of the base"
+        axis, distance = overlap.move
+        allowed += f": move it by {_move_text(axis, distance if path == overlap.second else -distance)} of the base"
     return instrument.spec.issue(problem, key, allowed=allowed)
 
 
-def _move_text(axis: int, way: float) -> str:
+def _move_text(axis: int, distance: float) -> str:
     """Return a move along an axis of the base as text, ``+x 135 mm``, rounded up so that it is far enough."""
-    digits = 10.0 ** (np.floor(np.log10(abs(1e3 * way))) - 2)
-    return f"{'+' if way > 0.0 else '-'}{'xyz'[axis]} {np.ceil(abs(1e3 * way) / digits) * digits:.3g} mm"
+    digits = 10.0 ** (np.floor(np.log10(abs(1e3 * distance))) - 2)
+    return f"{'+' if distance > 0.0 else '-'}{'xyz'[axis]} {np.ceil(abs(1e3 * distance) / digits) * digits:.3g} mm"
 
 
 def remedy(instrument: Instrument, path: str) -> tuple[KeyPath, str]:
@@ -360,11 +360,11 @@ def _check_inside(element: Element, face: Face, solid: Solid, placed: PlacedBodi
     assert element.aperture is not None
     rim = element.aperture.outline()
     points = placed.pose(element.body).apply(np.column_stack([rim, np.zeros(len(rim))]))
-    _, own = face_plane(face, placed)
+    _, face_normal = face_plane(face, placed)
     over, across = 0.0, ""
     for other in solid.faces:
         point, normal = face_plane(other, placed)
-        slope = float(np.linalg.norm(normal - (normal @ own) * own))
+        slope = float(np.linalg.norm(normal - (normal @ face_normal) * face_normal))
         if other is face or slope < PARALLEL:
             continue
         beyond = float(np.max((points - point) @ normal)) / slope
@@ -475,15 +475,15 @@ def blocked_rays(segments: np.ndarray, planes: np.ndarray, touching: float = _TO
     touching : float
         Length inside the body, in metres, below which a ray only touches it.
     """
-    start, way = segments[:, :, 0], segments[:, :, 1] - segments[:, :, 0]
+    start, displacement = segments[:, :, 0], segments[:, :, 1] - segments[:, :, 0]
     height = start @ planes[:, :3].T + planes[:, 3]
-    slope = way @ planes[:, :3].T
+    slope = displacement @ planes[:, :3].T
     with np.errstate(divide="ignore", invalid="ignore"):
         at = -height / slope
     enter = np.max(np.where(slope < 0.0, at, 0.0), axis=-1, initial=0.0)
     leave = np.min(np.where(slope > 0.0, at, 1.0), axis=-1, initial=1.0)
     beside = np.any((slope == 0.0) & (height >= 0.0), axis=-1)
-    length = (leave - enter) * np.linalg.norm(way, axis=-1)
+    length = (leave - enter) * np.linalg.norm(displacement, axis=-1)
     return np.asarray(np.any((length > touching) & ~beside, axis=-1))
 
 
@@ -611,12 +611,12 @@ def monitor_beams(
     hits, valid = [traced.hit(k) for k in range(len(chains[0]))], traced.numpy()[3]
     out = []
     for i, (channel, chain) in enumerate(zip(channels, chains, strict=True)):
-        places = [position[i]]
+        points_of_beam = [position[i]]
         for hit, name in zip(hits, chain, strict=True):
-            places.append(placed.pose(assembly.elements[name].body).apply(hit[i]))
+            points_of_beam.append(placed.pose(assembly.elements[name].body).apply(hit[i]))
         media = media_along(assembly.sequence(f"{channel.key}/monitor"))
         inside = tuple(medium.solid for medium in media[:-1])
-        out.append(MonitorBeam(channel, _segments(places), inside, position[i], direction[i], valid[i]))
+        out.append(MonitorBeam(channel, _segments(points_of_beam), inside, position[i], direction[i], valid[i]))
     return out
 
 
@@ -764,10 +764,10 @@ def _vignetting_issue(instrument: Instrument, backend: Backend, beam: MonitorBea
     )
 
 
-def _segments(places: list[np.ndarray]) -> np.ndarray:
+def _segments(points: list[np.ndarray]) -> np.ndarray:
     """Return start and end points, (N, K, 2, 3), of the K segments between consecutive points of N rays."""
-    way = np.stack(places, axis=1)
-    return np.stack([way[:, :-1], way[:, 1:]], axis=2)
+    path = np.stack(points, axis=1)
+    return np.stack([path[:, :-1], path[:, 1:]], axis=2)
 
 
 def _aimed_rays(

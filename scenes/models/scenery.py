@@ -551,11 +551,11 @@ def build_scenery(
 def _optical_side(instrument: Instrument, element: Element) -> float:
     """Return +1 if light meets a mirror from its +z side, -1 if from its -z side, by its neighbours in a sequence."""
     nominal = instrument.assembly.place()
-    own = nominal.pose(element.body).inverse()
+    to_body = nominal.pose(element.body).inverse()
     for names in instrument.assembly.sequences.values():
         if element.name in names[1:]:
             before = instrument.assembly.elements[names[names.index(element.name, 1) - 1]]
-            there = own.apply(nominal.pose(before.body).apply(_middle(before)))
+            there = to_body.apply(nominal.pose(before.body).apply(_middle(before)))
             return float(np.sign(there[2] - _middle(element)[2]))
     return 1.0
 
@@ -566,7 +566,7 @@ def _middle(element: Element) -> np.ndarray:
     return np.array([x, y, float(element.surface.sag(x, y))])
 
 
-def _reach(instrument: Instrument, camera: str) -> tuple[float, float]:
+def _half_extent(instrument: Instrument, camera: str) -> tuple[float, float]:
     """Return half the size of a focal plane's board along its x and y, in metres."""
     line = instrument.cameras[camera].spec.line
     channels = [c for c in instrument.channels if c.camera == camera]
@@ -583,12 +583,12 @@ def _focal_plane(
     body = f"{BASE}/{camera}/focal_plane"
     line, element = model.spec.line, f"{camera}/line"
     channels = [c for c in instrument.channels if c.camera == camera]
-    reach_x, reach_y = _reach(instrument, camera)
+    half_x, half_y = _half_extent(instrument, camera)
     facing = placed.pose(body) @ FACING_THE_LIGHT
     if whole:
         pitch = 1e-3
         name = f"{camera}/focal_plane"
-        grid = Detector(name, round(2.0 * reach_x / pitch), round(2.0 * reach_y / pitch), (pitch, pitch))
+        grid = Detector(name, round(2.0 * half_x / pitch), round(2.0 * half_y / pitch), (pitch, pitch))
         return [detector_surface(grid, facing, finishes, (element,))], [grid]
     chip = line_body(f"{BASE}/{camera}")
     pitch = line.pitch * float(placed.size(chip)[0])
@@ -602,5 +602,5 @@ def _focal_plane(
         grids.append(grid)
         surfaces.append(detector_surface(grid, placed.pose(channel.ccd_body), finishes, (name,)))
     board = Pose(np.eye(3), np.array([0.0, 0.0, BOARD]))
-    plate = Plate(f"{camera}/board", body, board, Rectangle(reach_x, reach_y), finishes.board)
+    plate = Plate(f"{camera}/board", body, board, Rectangle(half_x, half_y), finishes.board)
     return surfaces + plate_surfaces([plate], placed), grids

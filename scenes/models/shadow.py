@@ -175,11 +175,11 @@ def casters(instrument: Instrument, camera: str) -> tuple[Caster, ...]:
     """Return all bodies that may cast a shadow into a camera's beam."""
     placed = instrument.assembly.place()
     root = f"{BASE}/{camera}"
-    own_parts = {f"{root}/focal_plane", *(f"{root}/{mirror}" for mirror in instrument.cameras[camera].mirrors)}
+    camera_parts = {f"{root}/focal_plane", *(f"{root}/{mirror}" for mirror in instrument.cameras[camera].mirrors)}
     out = [
         Caster(path, path, placed.pose(path).inverse().apply(corners))
         for path, corners in convex_bodies(instrument, placed).items()
-        if path not in own_parts
+        if path not in camera_parts
     ]
     return (*out, *(caster for plate in instrument.baffles for caster in _plate(plate)))
 
@@ -189,8 +189,8 @@ def _plate(plate: Plate) -> list[Caster]:
     match plate.outline:
         case Circle() as disk:
             angle = 2.0 * np.pi * np.arange(RING_SIDES + 1) / RING_SIDES
-            turn = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
-            outer, inner = (np.array(disk.centre) + r * turn for r in (disk.radius, disk.inner))
+            circle = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+            outer, inner = (np.array(disk.centre) + r * circle for r in (disk.radius, disk.inner))
             parts = [outer[:-1]]
             if disk.inner:
                 parts = [np.concatenate([outer[k : k + 2], inner[k : k + 2]]) for k in range(RING_SIDES)]
@@ -313,13 +313,13 @@ class ImagingShadows:
         """
         placed, launched = beams.placed, beams.rays.launched
         chain = beams.assembly.sequences[f"{self.camera}/imaging"]
-        way = np.broadcast_to(np.broadcast_to(beams.heading, (len(launched), 3))[:, None], launched.shape)
-        traced = trace(self.backend, beams.systems, make_rays(self.backend, launched, way), keep=range(len(chain)))
+        heading = np.broadcast_to(np.broadcast_to(beams.heading, (len(launched), 3))[:, None], launched.shape)
+        traced = trace(self.backend, beams.systems, make_rays(self.backend, launched, heading), keep=range(len(chain)))
         out = []
         for k, name in enumerate(chain):
             body = placed.index[beams.assembly.elements[name].body]
-            turn, shift = placed.rotation[beams.owner, body].real, placed.translation[beams.owner, body].real
-            out.append(traced.hit(k) @ np.swapaxes(turn, 1, 2) + shift[:, None])
+            rotation, shift = placed.rotation[beams.owner, body].real, placed.translation[beams.owner, body].real
+            out.append(traced.hit(k) @ np.swapaxes(rotation, 1, 2) + shift[:, None])
         return out
 
 
@@ -346,17 +346,17 @@ class PupilEdges(SurfaceEdges):
         backend : Backend
             Backend that traces the rays.
         """
-        cut = {name: model.mirrors.index(name) for name in model.edges}
+        numbers = {name: model.mirrors.index(name) for name in model.edges}
         launched = beams.rays.launched
         heading = np.broadcast_to(beams.heading, (len(launched), 3))[:, None]
         sent = make_rays(backend, launched, np.broadcast_to(heading, launched.shape))
-        traced = trace(backend, beams.systems, sent, keep=tuple(cut.values()))
-        places = {}
-        for name, number in cut.items():
+        traced = trace(backend, beams.systems, sent, keep=tuple(numbers.values()))
+        points = {}
+        for name, number in numbers.items():
             body = beams.assembly.elements[f"{camera}/{name}"].body
             size = beams.placed.scale[beams.owner, beams.placed.index[body]].real
-            places[name] = np.asarray(traced.hit(number) / size[:, None, None])[..., :2]
-        return cls(model.edges, places, beams.nodes)
+            points[name] = np.asarray(traced.hit(number) / size[:, None, None])[..., :2]
+        return cls(model.edges, points, beams.nodes)
 
 
 @lru_cache(maxsize=8)
@@ -437,8 +437,8 @@ class _Bundle:
         middle = np.einsum("n,bknx->bkx", weight, both)
         # Over the disk x and y are orthogonal, and the means of their squares are 1/4.
         spread = 4.0 * np.einsum("n,ni,bknx->bkxi", weight, np.stack([nodes.x, nodes.y], axis=-1), both)
-        way = middle[:, 1] - middle[:, 0]
-        along = way / np.linalg.norm(way, axis=-1, keepdims=True)
+        displacement = middle[:, 1] - middle[:, 0]
+        along = displacement / np.linalg.norm(displacement, axis=-1, keepdims=True)
         least = np.eye(3)[np.argmin(np.abs(along), axis=-1)]
         terms = to_terms(nodes, DEGREE) @ both
         return cls(terms[:, 0], terms[:, 1], middle, spread, along, transverse_axes(along, least))
@@ -493,28 +493,28 @@ class _Bundle:
         packed = np.concatenate([self._guess(corners)[0], corners], axis=-1)
         angle = 2.0 * np.pi * (np.arange(_WINDOW_SIDES) + 0.5) / _WINDOW_SIDES
         normal = np.broadcast_to(np.stack([np.cos(angle), np.sin(angle)], axis=-1), (len(packed), _WINDOW_SIDES, 2))
-        cut = intersect(hull(packed), normal, np.full(normal.shape[:2], _WINDOW))
-        empty = area(cut) < SMALLEST
+        clipped = intersect(hull(packed), normal, np.full(normal.shape[:2], _WINDOW))
+        empty = area(clipped) < SMALLEST
         if np.all(empty):
-            return np.zeros((len(cut), 3, 2))
-        out, place = cut[..., :2], cut[..., 2:]
-        slope = self._guess(place)[1]
+            return np.zeros((len(clipped), 3, 2))
+        out, points = clipped[..., :2], clipped[..., 2:]
+        slope = self._guess(points)[1]
         for _ in range(_STEPS):
             basis = products(out[..., 0], out[..., 1], DEGREE)
             start = basis @ self.start
-            way = basis @ self.end - start
-            arm = place - start
-            ahead = np.einsum("bvx,bx->bv", arm, self.along) / np.einsum("bvx,bx->bv", way, self.along)
-            miss = np.einsum("bix,bvx->bvi", self.axes, arm - ahead[..., None] * way)
+            displacement = basis @ self.end - start
+            arm = points - start
+            ahead = np.einsum("bvx,bx->bv", arm, self.along) / np.einsum("bvx,bx->bv", displacement, self.along)
+            miss = np.einsum("bix,bvx->bvi", self.axes, arm - ahead[..., None] * displacement)
             out = out + _solved(slope, miss)
         return np.where(empty[:, None, None], out[:, :1], out)
 
-    def _guess(self, place: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def _guess(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return approximate stop coordinates of the rays that pass through given points.
 
         Parameters
         ----------
-        place : (B, C, 3) ndarray
+        points : (B, C, 3) ndarray
             C points in each of B beams, in metres.
 
         Returns
@@ -523,19 +523,19 @@ class _Bundle:
             Stop coordinates, (B, C, 2), in stop radii; and derivatives of the rays' transverse position at the points
             with respect to them, (B, C, 2, 2), in metres.
         """
-        first, way = self.middle[:, :1], (self.middle[:, 1:] - self.middle[:, :1])
-        ahead = self._ahead(place)[..., None]
-        off = np.einsum("bix,bcx->bci", self.axes, place - first - ahead * way)
+        first, displacement = self.middle[:, :1], (self.middle[:, 1:] - self.middle[:, :1])
+        ahead = self._ahead(points)[..., None]
+        off = np.einsum("bix,bcx->bci", self.axes, points - first - ahead * displacement)
         near, far = (np.einsum("bix,bxj->bij", self.axes, self.spread[:, k])[:, None] for k in (0, 1))
         slope = near + ahead[..., None] * (far - near)
         return _solved(slope, off), slope
 
-    def _ahead(self, place: np.ndarray) -> np.ndarray:
+    def _ahead(self, points: np.ndarray) -> np.ndarray:
         """Return how far along the path from the first to the second surface points lie, as a fraction of it.
 
         Parameters
         ----------
-        place : (B, C, 3) ndarray
+        points : (B, C, 3) ndarray
             C points in each of B beams, in metres.
 
         Returns
@@ -543,8 +543,8 @@ class _Bundle:
         (B, C) ndarray
             0 at the first surface, 1 at the second.
         """
-        way = np.einsum("bx,bx->b", self.middle[:, 1] - self.middle[:, 0], self.along)
-        return np.asarray(np.einsum("bcx,bx->bc", place - self.middle[:, :1], self.along) / way[:, None])
+        length = np.einsum("bx,bx->b", self.middle[:, 1] - self.middle[:, 0], self.along)
+        return np.asarray(np.einsum("bcx,bx->bc", points - self.middle[:, :1], self.along) / length[:, None])
 
     def _inside(self, corners: np.ndarray) -> np.ndarray:
         """Return a convex body cut off at both ends of the light path.
@@ -567,12 +567,12 @@ class _Bundle:
             i, j = np.triu_indices(corners.shape[1], 1)
             crossing = (depth[:, i] >= 0.0) != (depth[:, j] >= 0.0)
             share = depth[:, i] / np.where(crossing, depth[:, i] - depth[:, j], 1.0)
-            cut = corners[:, i] + np.where(crossing, share, 0.0)[..., None] * (corners[:, j] - corners[:, i])
+            crossings = corners[:, i] + np.where(crossing, share, 0.0)[..., None] * (corners[:, j] - corners[:, i])
             deepest = np.argmax(depth, axis=-1)
             inside = np.take_along_axis(corners, deepest[:, None, None], axis=1)
             kept = np.where((depth >= 0.0)[..., None], corners, inside)
-            cut = np.where(crossing[..., None], cut, inside)
-            corners = np.concatenate([kept, cut], axis=1)
+            crossings = np.where(crossing[..., None], crossings, inside)
+            corners = np.concatenate([kept, crossings], axis=1)
         return corners
 
 

@@ -130,15 +130,15 @@ def lenses_of(name: str, model: CameraModel, bodies: Mapping[str, Body]) -> list
         groups.setdefault(first, []).append(face)
     out = []
     for first, faces in groups.items():
-        own = bodies[f"{root}/{first}"].pose
-        poses = {f"{root}/{face}": own.inverse() @ bodies[f"{root}/{face}"].pose for face in faces}
+        lens_pose = bodies[f"{root}/{first}"].pose
+        poses = {f"{root}/{face}": lens_pose.inverse() @ bodies[f"{root}/{face}"].pose for face in faces}
         centres = [pose.apply(np.array(bodies[face].pivots["centre"])) for face, pose in poses.items()]
         glass, unknown = None, ""
         try:
             glass = model.spec.warm_glass(first)
         except ValueError as error:
             unknown = str(error)
-        out.append(Lens(f"{root}/{first}", poses, own, np.mean(centres, axis=0), glass, unknown))
+        out.append(Lens(f"{root}/{first}", poses, lens_pose, np.mean(centres, axis=0), glass, unknown))
     return out
 
 
@@ -173,8 +173,8 @@ class _Response:
         numbers = [
             [
                 n
-                for f, own in terms.items()
-                for n in (*u[f].rotate, *u[f].shift, *(u[f].figure.get(j, 0.0) for j in own))
+                for f, figure in terms.items()
+                for n in (*u[f].rotate, *u[f].shift, *(u[f].figure.get(j, 0.0) for j in figure))
             ]
             for u in units
         ]
@@ -243,7 +243,7 @@ class _Carried:
         The N other bodies.
     mount : (N, 3) ndarray
         Points at which those bodies are held, in their own frames, in metres.
-    place : (N, 3) ndarray
+    position : (N, 3) ndarray
         The same points in the carrier's frame, in metres.
     inward : (N, 3, 3) ndarray
         Rotation matrices from the carrier's frame to theirs.
@@ -252,7 +252,7 @@ class _Carried:
     lenses: tuple[Lens, ...]
     bodies: tuple[Body, ...]
     mount: np.ndarray
-    place: np.ndarray
+    position: np.ndarray
     inward: np.ndarray
 
 
@@ -277,8 +277,8 @@ class ThermalModel:
             for mirror in model.mirrors
             if model.spec.mirrors[mirror].light is None
         }
-        every = (lens for name, model in instrument.cameras.items() for lens in lenses_of(name, model, self._bodies))
-        self.lenses: dict[str, Lens] = {lens.path: lens for lens in every}
+        lenses = (lens for name, model in instrument.cameras.items() for lens in lenses_of(name, model, self._bodies))
+        self.lenses: dict[str, Lens] = {lens.path: lens for lens in lenses}
         self._lens_of = {face: lens for lens in self.lenses.values() for face in lens.faces}
         self._responses: dict[str, _Response] = {}
         self._extents: dict[str, np.ndarray] = {}
@@ -296,8 +296,8 @@ class ThermalModel:
             if self._owner(path) not in (None, path):
                 continue
             if path in self.lenses:
-                if (own := self.lenses[path].glass) is not None:
-                    out[path] = own
+                if (glass := self.lenses[path].glass) is not None:
+                    out[path] = glass
                 continue
             if path in self.solids:
                 name = self.solids[path].material
@@ -419,9 +419,9 @@ class ThermalModel:
         """Return P points that enclose a body, (P, 3), in its frame, in metres; cached for series of states."""
         if path not in self._extents:
             if path in self.solids:
-                own = self._placed.pose(path).inverse()
+                to_body = self._placed.pose(path).inverse()
                 meshes = ((p.path, solid_mesh(p, self._placed).vertices) for p in self._pieces(path))
-                points = np.concatenate([own.apply(self._placed.pose(name).apply(mesh)) for name, mesh in meshes])
+                points = np.concatenate([to_body.apply(self._placed.pose(name).apply(mesh)) for name, mesh in meshes])
             elif path in self.mirrors:
                 points = self._mirror_outline(path)
             elif path in self.lenses:
@@ -449,8 +449,8 @@ class ThermalModel:
         progress : callable
             Function called with the path of each body whose finite-element solution begins.
         """
-        one = {path: Temperatures.of([field]) for path, field in temperatures.items()}
-        return self.states(one, [motions or {}], progress)[0]
+        heat = {path: Temperatures.of([field]) for path, field in temperatures.items()}
+        return self.states(heat, [motions or {}], progress)[0]
 
     def states(
         self,
@@ -474,9 +474,9 @@ class ThermalModel:
         warm = (change != 0.0) | np.any(gradient, axis=-1)
         thermal: list[list[State]] = [[] for _ in motions]
         for (path, field), states in zip(fields.items(), warm, strict=True):
-            own = np.flatnonzero(states)
-            for part in self._warmed(path, field[own], progress) if len(own) else ():
-                for k, s in enumerate(own.tolist()):
+            heated = np.flatnonzero(states)
+            for part in self._warmed(path, field[heated], progress) if len(heated) else ():
+                for k, s in enumerate(heated.tolist()):
                     thermal[s].append({moved: m for moved, each in part.items() if (m := each[k]) is not None})
         return compose_each([[*heat, more] for heat, more in zip(thermal, motions, strict=True)], self._bodies)
 
@@ -507,14 +507,14 @@ class ThermalModel:
             moves = zip(*carried_motion(data.expansion, field.gradient, lens.mount - about), expansions, strict=True)
             faces = [lens.carried(*each) for each in moves]
             out.update({face: [motions.get(face) for motions in faces] for face in lens.faces})
-        turn, move = carried_motion(data.expansion, field.gradient[:, None], carried.place - about)
+        rotation, move = carried_motion(data.expansion, field.gradient[:, None], carried.position - about)
         # The expansion in the tree moves the child's origin, but it is the child's mount that moves with this body.
-        rotate = matvec(carried.inward, turn)
+        rotate = matvec(carried.inward, rotation)
         shift = matvec(carried.inward, move) + expansion[:, None, None] * carried.mount
-        moved = np.any(turn, axis=2) | np.any(shift, axis=2)
+        moved = np.any(rotation, axis=2) | np.any(shift, axis=2)
         for k in np.flatnonzero(np.any(moved, axis=0)).tolist():
-            child, places = carried.bodies[k], zip(*(a[:, k].tolist() for a in (moved, rotate, shift)), strict=True)
-            out[child.path] = [Motion(tuple(r), tuple(s), _mount(child)) if yes else None for yes, r, s in places]
+            child, values = carried.bodies[k], zip(*(a[:, k].tolist() for a in (moved, rotate, shift)), strict=True)
+            out[child.path] = [Motion(tuple(r), tuple(s), _mount(child)) if yes else None for yes, r, s in values]
         return [out]
 
     def _carried_by(self, path: str) -> _Carried:
@@ -524,9 +524,9 @@ class ThermalModel:
             lenses = [self.lenses[body.path] for body in bodies if body.path in self.lenses]
             others = [body for body in bodies if body.path not in self._lens_of]
             mount = np.array([body.pivots[_mount(body)] for body in others]).reshape(-1, 3)
-            place = np.array([body.pose.apply(at) for body, at in zip(others, mount, strict=True)]).reshape(-1, 3)
+            position = np.array([body.pose.apply(at) for body, at in zip(others, mount, strict=True)]).reshape(-1, 3)
             inward = np.array([body.pose.rotation.T for body in others]).reshape(-1, 3, 3)
-            self._carried[path] = _Carried(tuple(lenses), tuple(others), mount, place, inward)
+            self._carried[path] = _Carried(tuple(lenses), tuple(others), mount, position, inward)
         return self._carried[path]
 
     def _within(self, path: str) -> tuple[str, ...]:
@@ -540,12 +540,12 @@ class ThermalModel:
         assert lens.glass is not None
         here = (self.reference + field.change).tolist()
         motions = [lens.expanded(expansion) for expansion in (lens.glass.expansion * field.at(lens.middle)).tolist()]
-        for own, temperature, gradient in zip(motions, here, field.gradient, strict=True):
+        for moves, temperature, gradient in zip(motions, here, field.gradient, strict=True):
             index = lens.glass.change(self.reference, temperature), triple(lens.glass.slope(temperature) * gradient)
-            own[lens.path] = replace(own[lens.path], index=index[0], index_gradient=index[1])
+            moves[lens.path] = replace(moves[lens.path], index=index[0], index_gradient=index[1])
         return [
             *self._bent(lens.path, field.gradient, progress),
-            {face: [own[face] for own in motions] for face in lens.faces},
+            {face: [moves[face] for moves in motions] for face in lens.faces},
         ]
 
     def _indices(self, path: str, field: Temperatures) -> Iterator[tuple[float, tuple[float, float, float]]]:
@@ -586,7 +586,10 @@ class ThermalModel:
 
     def face_radii(self, path: str) -> dict[str, float]:
         """Return each optical face of a body -> radius of the disk on which its figure terms are defined, in metres."""
-        return {face: self.surface(face).figure_disk(own).radius for face, (own, _) in self.faces_of(path).items()}
+        return {
+            face: self.surface(face).figure_disk(face_shape).radius
+            for face, (face_shape, _) in self.faces_of(path).items()
+        }
 
     def index_path(self, path: str, field: Temperature, rest: float) -> float:
         """Return the largest change of optical path that residual temperatures may cause in a body's glass, in metres.
@@ -740,8 +743,8 @@ def _within(corners: np.ndarray, middle: np.ndarray, arms: np.ndarray) -> float:
         N vectors, in metres.
     """
     sides = ConvexHull(corners).equations
-    room, reach = -(sides[:, :3] @ middle + sides[:, 3]), arms @ sides[:, :3].T
-    longest = np.min(np.where(reach > 0.0, room / np.where(reach > 0.0, reach, 1.0), np.inf))
+    room, advance = -(sides[:, :3] @ middle + sides[:, 3]), arms @ sides[:, :3].T
+    longest = np.min(np.where(advance > 0.0, room / np.where(advance > 0.0, advance, 1.0), np.inf))
     return 1.0 if longest > 1.0 else 0.5 * float(longest)
 
 

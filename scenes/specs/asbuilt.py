@@ -35,10 +35,10 @@ from scenes.yaml.units import ANGLE, LENGTH, TEMPERATURE_DIFFERENCE
 Fields = Annotated[tuple[tuple[FieldShare, FieldShare], ...], Field(min_length=1, max_length=200)]
 Sigma = Annotated[float, Quantity(LENGTH, above_zero=True, largest="1 m")]
 Common = Annotated[float, Quantity(LENGTH, smallest="0 m", largest="1 m")]
-Place = Annotated[float, Quantity(LENGTH, largest="100 m")]
-Places = Annotated[tuple[Place, ...], Field(min_length=1, max_length=200)]
+Position = Annotated[float, Quantity(LENGTH, largest="100 m")]
+Positions = Annotated[tuple[Position, ...], Field(min_length=1, max_length=200)]
 AngleSigma = Annotated[float, Quantity(ANGLE, above_zero=True, largest="10 deg")]
-Turn = Annotated[float, Quantity(ANGLE, largest="10 deg")]
+SmallAngle = Annotated[float, Quantity(ANGLE, largest="10 deg")]
 Warmth = Annotated[float, Quantity(TEMPERATURE_DIFFERENCE, largest="300 K")]
 WarmthSigma = Annotated[float, Quantity(TEMPERATURE_DIFFERENCE, above_zero=True, largest="100 K")]
 Place3 = Annotated[tuple[float, float, float], Vector(Quantity(LENGTH, largest="1 m"))]
@@ -152,7 +152,7 @@ class FocusReadingsSpec(ReadingsSpec):
     """
 
     fields: Fields | None = None
-    values: Places | None = None
+    values: Positions | None = None
     sigma: Sigma
     common: Common = 0.0
     file: Reference | None = None
@@ -288,10 +288,10 @@ class SightReadingsSpec(ReadingsSpec):
         they are uncorrelated.
     """
 
-    alpha: Turn | None = None
-    beta: Turn | None = None
-    gamma: Turn | None = None
-    principal_distance: Place | None = None
+    alpha: SmallAngle | None = None
+    beta: SmallAngle | None = None
+    gamma: SmallAngle | None = None
+    principal_distance: Position | None = None
     sigma_alpha: AngleSigma | None = None
     sigma_beta: AngleSigma | None = None
     sigma_gamma: AngleSigma | None = None
@@ -468,7 +468,7 @@ class ActuatorSpec(CompensatorSpec):
     response: Annotated[Number, Field(ge=0.0, le=1.0)] = 0.0
 
 
-def _some_amounts(value: Mapping[str, Amount]) -> Mapping[str, Amount]:
+def _require_amounts(value: Mapping[str, Amount]) -> Mapping[str, Amount]:
     if not value:
         raise Problem("nothing is moved", None, "by: {M2_z: 15 um}")
     return FrozenMap(value)
@@ -483,7 +483,7 @@ class MoveSpec(Spec):
         Actuator -> amount of its move, with its unit.
     """
 
-    by: Annotated[dict[Name, Amount], AfterValidator(_some_amounts)]
+    by: Annotated[dict[Name, Amount], AfterValidator(_require_amounts)]
 
 
 class SimulatedInstrumentSpec(Spec):

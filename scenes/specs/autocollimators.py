@@ -106,11 +106,11 @@ class AutocollimatorSpec(Spec):
         half = [0.5 * n * self.area_ccd.pitch for n in (self.area_ccd.columns, self.area_ccd.rows)]
         room = 0.5 * self.reticle.pinhole
         if all(abs(o) < h + room for o, h in zip(self.area_ccd.offset, half, strict=True)):
-            reach = format_quantity(max(half) + room, LENGTH)
+            least = format_quantity(max(half) + room, LENGTH)
             raise Problem(
                 "the pinhole lies on the area CCD",
                 ", ".join(format_quantity(o, LENGTH) for o in self.area_ccd.offset),
-                f"{reach} or more along one of the axes",
+                f"{least} or more along one of the axes",
                 within=("area_ccd", "offset"),
             )
         return self
@@ -230,7 +230,7 @@ class AutocollimatorTestSpec(TitledSpec):
 
     @model_validator(mode="after")
     def _mirrors_fit(self) -> AutocollimatorTestSpec:
-        least = min(self.programme.narrow, *self._stand_angles())
+        least = min(self.programme.narrow, *self._pose_angles())
         # neighbouring rims touch where the mirrors' planes intersect: at radius tan(theta) from either centre
         from_middle = self.mirrors.radius * math.tan(least)
         if 0.5 * self.mirrors.aperture >= from_middle:
@@ -249,9 +249,9 @@ class AutocollimatorTestSpec(TitledSpec):
             )
         return self
 
-    def _stand_angles(self) -> tuple[float, float, float]:
-        stands = self.programme.stands
-        return stands.X, stands.Y, stands.Z
+    def _pose_angles(self) -> tuple[float, float, float]:
+        angles = self.programme.stands
+        return angles.X, angles.Y, angles.Z
 
 
 @dataclass(frozen=True)

@@ -363,7 +363,7 @@ class MonitorDesignSpec(Spec):
     seed: Seed = 0
 
 
-Turn = Annotated[tuple[float, float, float], Vector(Quantity(ANGLE, largest="180 deg"), 3)]
+Rotation = Annotated[tuple[float, float, float], Vector(Quantity(ANGLE, largest="180 deg"), 3)]
 Light = Literal["refracts", "passes"]
 
 
@@ -402,7 +402,7 @@ class MirrorSpec(Spec):
 
     z: Length
     decentre: Vector2 | None = None
-    rotate: Turn | None = None
+    rotate: Rotation | None = None
     radius: Radius
     conic: Number = 0.0
     aspheric: AsphereTerms = Field(default_factory=FrozenMap)
@@ -543,7 +543,7 @@ class CameraSpec(TitledSpec):
 
     focal_length: PositiveLength
     entrance_pupil: PositiveLength
-    field_bias: instruments.FieldPlace = 0.0
+    field_bias: instruments.FieldAngle = 0.0
     field: FieldSpec
     wavelength: Wavelength
     stop: Name
@@ -563,7 +563,7 @@ class CameraSpec(TitledSpec):
         return self
 
     @model_validator(mode="after")
-    def _lenses_stand_in_air(self) -> CameraSpec:
+    def _check_lenses_in_air(self) -> CameraSpec:
         inside = ""
         for name, mirror in self.mirrors.items():
             if mirror.light != "refracts":

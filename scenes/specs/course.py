@@ -65,7 +65,7 @@ FEWEST, MOST = 2, 1000
 """Smallest and largest number of times that a course (time series of states) may have."""
 
 
-def _some_times(times: tuple[float, ...]) -> tuple[float, ...]:
+def _check_count(times: tuple[float, ...]) -> tuple[float, ...]:
     if not FEWEST <= len(times) <= MOST:
         raise Problem("wrong number of times in a course", f"{len(times)} of them", f"{FEWEST} to {MOST} times")
     return times
@@ -179,7 +179,7 @@ class CourseSpec(Spec):
         the last one.
     """
 
-    times: Annotated[tuple[Moment, ...], AfterValidator(_some_times), AfterValidator(ascending)] = ()
+    times: Annotated[tuple[Moment, ...], AfterValidator(_check_count), AfterValidator(ascending)] = ()
     temperature: Paths[TemperatureCourse] = Field(default_factory=FrozenMap)
     motion: Paths[MotionCourse] = Field(default_factory=FrozenMap)
     table: Reference | None = None
@@ -282,7 +282,7 @@ class _Column:
     unit: str
 
     @property
-    def place(self) -> KeyPath:
+    def path(self) -> KeyPath:
         """Key path in the course, without the index of the time."""
         if self.what == TIME:
             return ("times",)
@@ -310,7 +310,7 @@ def read_course(path: Path, named: CourseSpec) -> CourseSpec:
         raise InputError(Issue("a table needs a row of heads and a row for each time", file, line, allowed=HEADS))
     (head_line, heads), body = rows[0], rows[1:]
     columns = [_column(head, file, head_line) for head in heads]
-    keys = [(*column.place, column.axis) for column in columns]
+    keys = [(*column.path, column.axis) for column in columns]
     twice = next((head for k, head in enumerate(heads) if keys[k] in keys[:k]), None)
     if twice is not None:
         raise InputError(Issue("a second column with this head", file, head_line, (twice.strip(),)))
@@ -325,7 +325,7 @@ def read_course(path: Path, named: CourseSpec) -> CourseSpec:
             raise InputError(Issue(text, file, line, allowed="as many cells as heads, with commas between them"))
         for column, cell in zip(columns, cells, strict=True):
             _put(data, lines, column, k, f"{cell.strip()} {column.unit}", (line, len(body)))
-            lines.setdefault(column.place[:2], head_line)
+            lines.setdefault(column.path[:2], head_line)
     for node, moves in named.motion.items():
         if node not in data["motion"]:
             allowed = names_text(data["motion"]) or "nothing"
@@ -367,7 +367,7 @@ def _put(
         data["times"][k] = text
         lines["times", k] = line
         return
-    section, node, name = (str(part) for part in column.place)
+    section, node, name = (str(part) for part in column.path)
     values = data[section].setdefault(node, {}).setdefault(name, [None] * count)
     if column.what in VECTORS:
         values[k] = values[k] or ["0 " + VECTORS[column.what].si] * len(AXES)

@@ -132,7 +132,7 @@ class TimeLawSpec(Spec):
     since: Moment | None = None
 
     @model_validator(mode="after")
-    def _one_way(self) -> "TimeLawSpec":
+    def _check_single_law(self) -> "TimeLawSpec":
         keys = {name for name in _TIMES if getattr(self, name) is not None}
         if (self.kind is not None) == bool(keys):
             raise Problem("not a time law", self.text, _LAWS)

@@ -12,7 +12,7 @@ from scenes.yaml.errors import InputError, Issue
 from scenes.yaml.named import FileKind
 from scenes.yaml.yaml_file import read_yaml
 
-Given = TypeVar("Given")
+Content = TypeVar("Content")
 
 SLIPS = 1
 """Number of unknown keys that a file may have and still be of a kind: a typing error does not make it another kind."""
@@ -69,7 +69,7 @@ def kinds_of(data: Any) -> tuple[FileKind, ...]:
     return tuple(kind for extra, kind in counts if extra == least <= SLIPS)
 
 
-def read_for(command: str, file: Path, resolve: Callable[[Path], Given]) -> Given:
+def read_for(command: str, file: Path, resolve: Callable[[Path], Content]) -> Content:
     """Return the result of ``resolve`` for the file of a command.
 
     Parameters
@@ -95,11 +95,11 @@ def read_for(command: str, file: Path, resolve: Callable[[Path], Given]) -> Give
             raise error from None
         if not kinds or len(kinds) > _MOST or any(kind.command == command for kind in kinds):
             raise
-        what, remedy = " or ".join(kind.what for kind in kinds), ", or ".join(_place(kind, file) for kind in kinds)
+        what, remedy = " or ".join(kind.what for kind in kinds), ", or ".join(_usage(kind, file) for kind in kinds)
         raise InputError(Issue(f"this is {what}, which {command} does not read; {remedy}", str(file))) from None
 
 
-def _place(kind: FileKind, file: Path) -> str:
+def _usage(kind: FileKind, file: Path) -> str:
     """Return the part of a message that says which command reads a file of a kind, or at which key its name belongs."""
     reads = f"python -m {kind.command} {file} does" if kind.command else ""
     named = f"its name belongs into {kind.place}" if kind.place else ""

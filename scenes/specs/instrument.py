@@ -274,7 +274,7 @@ class CentralPrismSpec(Spec):
 MaterialName = Annotated[str, Field(strict=True), name_in("material", MATERIALS, material)]
 Exposure = Annotated[float, Quantity(TIME, above_zero=True, largest="100 s")]
 LookAngle = Annotated[float, Quantity(ANGLE, largest="90 deg")]
-FieldPlace = Annotated[float, Quantity(ANGLE, largest="45 deg")]
+FieldAngle = Annotated[float, Quantity(ANGLE, largest="45 deg")]
 Photons = Annotated[Number, Field(gt=0.0, le=1e12)]
 MOST_FRAMES = 10_000
 Frames = Annotated[Whole, Field(ge=1, le=MOST_FRAMES)]
@@ -381,7 +381,7 @@ class ChannelSpec(Spec):
         Rhomboid; by default the monitor's.
     """
 
-    field: FieldPlace
+    field: FieldAngle
     pupil_offset: Vector2
     return_face: ReturnFaceSpec | None = None
     spread: Spread | None = None

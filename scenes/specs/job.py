@@ -106,7 +106,7 @@ class PerturbationSpec(PlainPerturbationSpec):
         return (*super().uses(), *(("deformation",) if self.deformation is not None else ()))
 
 
-def _some(images: tuple[str, ...]) -> tuple[str, ...]:
+def _with_spots(images: tuple[str, ...]) -> tuple[str, ...]:
     """Return the requested images without repetitions, the spots first."""
     if not images:
         raise Problem("nothing to render", "an empty list", "[spots]")
@@ -156,9 +156,9 @@ class RenderSpec(Spec):
         Seed of all random numbers of the job.
     """
 
-    images: Annotated[tuple[Annotated[str, OneOf(lambda: ("spots", *target_names()))], ...], AfterValidator(_some)] = (
-        "spots",
-    )
+    images: Annotated[
+        tuple[Annotated[str, OneOf(lambda: ("spots", *target_names()))], ...], AfterValidator(_with_spots)
+    ] = ("spots",)
     targets: TargetsSpec | None = None
     stray: Annotated[StraySpec | None, BeforeValidator(_switch)] = None
     quality: Flag = False

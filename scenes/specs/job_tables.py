@@ -93,7 +93,7 @@ class TableTemperatureSpec(TemperatureSpec):
         return super().warms or self.table is not None
 
     @model_validator(mode="after")
-    def _says_of_a_table(self) -> "TableTemperatureSpec":
+    def _check_table(self) -> "TableTemperatureSpec":
         wrong = next((key for key in HEAT_KEYS[1:] if self.table is None and getattr(self, key) is not None), None)
         if wrong is not None:
             raise Problem(f"{wrong} applies to a table, and there is none", None, "table: FILE", within=(wrong,))
@@ -246,7 +246,7 @@ class FinishSpec(Spec):
     reflectance: Share | None = None
 
     @model_validator(mode="after")
-    def _says_something_once(self) -> "FinishSpec":
+    def _check_content(self) -> "FinishSpec":
         if self.bsdf is None and self.coating is None and self.reflectance is None:
             raise Problem("a finish without any property", "no keys", "bsdf, coating or reflectance")
         if self.coating is not None and self.reflectance is not None:

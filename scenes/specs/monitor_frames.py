@@ -14,7 +14,7 @@ from optics.numerics.number_tree import FrozenMap
 from scenes.specs.course import Moment, ascending, moment
 from scenes.specs.detector import DetectorSpec, PixelPitch
 from scenes.specs.disturbances import JobDisturbances
-from scenes.specs.instrument import SIDES, Exposure, FieldPlace, LookAngle
+from scenes.specs.instrument import SIDES, Exposure, FieldAngle, LookAngle
 from scenes.specs.job import AnalysisSpec, JobSpec
 from scenes.specs.load import load_detector
 from scenes.specs.resolved import ExperimentSetup, ResolvedJob, resolve_job
@@ -86,7 +86,7 @@ class GeometrySpec(Spec):
     separation: PositiveLength
     pitch: PixelPitch
     look: LookAngle = 0.0
-    field: FieldPlace = 0.0
+    field: FieldAngle = 0.0
     principal_distance_across: PositiveLength | None = None
 
 
@@ -178,7 +178,7 @@ class MeasurementSpec(Spec):
         return self
 
     @model_validator(mode="after")
-    def _every_time(self) -> MeasurementSpec:
+    def _files_of_all_times(self) -> MeasurementSpec:
         if isinstance(self.frames, str):
             return self
         if not self.frames:
@@ -283,7 +283,7 @@ def _located(spec: MeasurementSpec, channels: tuple[str, ...], base: Path) -> Me
     """Return the measurement with absolute paths of all files."""
     update: dict[str, Any] = {}
     if isinstance(spec.frames, str):
-        frames, times = _found(spec, base / spec.frames, channels)
+        frames, times = _frame_files(spec, base / spec.frames, channels)
         update |= {"times": times} if times else {}
     else:
         frames = dict(spec.frames)
@@ -325,7 +325,7 @@ def _paths(spec: Spec, key: KeyPath, files: Iterable[str], base: Path) -> tuple[
     return tuple(str(spec.file_at(key, file, base, _IMAGES)) for file in files)
 
 
-def _found(
+def _frame_files(
     spec: MeasurementSpec, path: Path, channels: tuple[str, ...]
 ) -> tuple[dict[str, ChannelFramesSpec], tuple[float, ...]]:
     """Return channel -> frames listed in a folder or a table, and the times of a series, in seconds.

@@ -138,8 +138,8 @@ def key_below(kind: str, axis: str) -> tuple[str | int, ...]:
         ``x``, ``y`` or ``z``, a figure's term, or empty.
     """
     heat = {"temperature": ("temperature", "change"), "gradient": ("temperature", "gradient")}
-    place: tuple[str | int, ...] = heat.get(kind, (kind,))
-    return (*place, AXES.get(axis, axis)) if axis else place
+    path: tuple[str | int, ...] = heat.get(kind, (kind,))
+    return (*path, AXES.get(axis, axis)) if axis else path
 
 
 def put(keys: dict[str, Any], kind: str, axis: str, value: Any, nothing: Any) -> None:

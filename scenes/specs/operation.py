@@ -77,7 +77,7 @@ class RequirementSpec(Spec):
     probability: Annotated[Number, Field(ge=0.5, lt=1.0)] = 0.95
 
     @model_validator(mode="after")
-    def _is_one(self) -> RequirementSpec:
+    def _check_quantity(self) -> RequirementSpec:
         if len(self.quantity.split()) != 2:
             raise Problem(
                 "not a quantity",
@@ -86,7 +86,7 @@ class RequirementSpec(Spec):
                 within=("quantity",),
             )
         if self.key.rpartition("_")[2] not in ENDINGS:
-            allowed = f"a key that ends in its unit: {names_text(f'_{one}' for one in ENDINGS)}"
+            allowed = f"a key that ends in its unit: {names_text(f'_{ending}' for ending in ENDINGS)}"
             raise Problem("a quantity without a unit", shown(self.key), allowed, within=("quantity",))
         try:
             value = parse_quantity(self.limit, self._kind[0])

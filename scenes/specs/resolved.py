@@ -570,18 +570,18 @@ def resolve_camera(file: Path | str, name: str | None = None) -> CameraSetup:
         The file cannot be read or is not valid, holds no camera, or several of which ``name`` selects none.
     """
     text = str(file)
-    place: Path | str = text if not load.is_path(text) and not is_file(Path(text)) else Path(text)
+    reference: Path | str = text if not load.is_path(text) and not is_file(Path(text)) else Path(text)
     folder = load.CAMERAS if text in load.library_names(load.CAMERAS) else load.INSTRUMENTS
-    yaml = load.read_reference(folder, place, others=(load.CAMERAS,))
+    yaml = load.read_reference(folder, reference, others=(load.CAMERAS,))
     data = yaml.data if isinstance(yaml.data, dict) else {}
     if "mirrors" in data:
-        return _alone(load.load_camera(place), text, name)
+        return _alone(load.load_camera(reference), text, name)
     if "camera" in data and {"mounted", "perturb"} & set(data) and "test" not in data:
         return validate(CameraSetup, yaml)
     if "job" in data or ("instrument" in data and "mounted" not in data and "study" not in data):
         return _of_job(resolve(file), text, name)
     if load.is_instrument(data):
-        return _mounted(load.load_instrument(place), text, name)
+        return _mounted(load.load_instrument(reference), text, name)
     return _of_run(yaml, name)
 
 

@@ -146,8 +146,8 @@ def read_table(path: str | Path, columns: Sequence[Column], least_rows: int = 1)
     heads = [head.strip() for head in rows[0]]
     parts = [_numbers(file, lines[1:], rows[1:], heads, layout)]
     parts += [_numbers(file, lines, rows, heads, layout) for lines, rows in pieces]
-    numbers = np.concatenate([own for own, _ in parts])
-    values = {column.name: np.concatenate([own[column.name] for _, own in parts]) for column, _, _ in layout}
+    numbers = np.concatenate([part for part, _ in parts])
+    values = {column.name: np.concatenate([part[column.name] for _, part in parts]) for column, _, _ in layout}
     return Table(file, numbers, FrozenMap({column.name: heads[k] for column, k, _ in layout}), FrozenMap(values))
 
 

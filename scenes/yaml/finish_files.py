@@ -113,10 +113,10 @@ class _Lines:
         cells = self._keyed(key)
         known = {word.lower(): word for word in WORDS[key]}
         if len(cells) != 2 or cells[1].lower() not in known:
-            found = " ".join(cells[1:])
-            near = nearest(found, WORDS[key])
+            text = " ".join(cells[1:])
+            near = nearest(text, WORDS[key])
             issue = Issue(
-                "not a value of this line", self.file, self.line, (key,), shown(found), ", ".join(WORDS[key]), near
+                "not a value of this line", self.file, self.line, (key,), shown(text), ", ".join(WORDS[key]), near
             )
             raise InputError(issue)
         self.at += 1
@@ -157,8 +157,8 @@ class _Lines:
     def _keyed(self, key: str) -> list[str]:
         cells = self.next(key)
         if cells[0].lower() != key.lower():
-            found = " ".join(cells)[:60]
-            raise self.error("another line is expected here", key, found, f"a line that begins with {key}")
+            line = " ".join(cells)[:60]
+            raise self.error("another line is expected here", key, line, f"a line that begins with {key}")
         return cells
 
 
@@ -210,14 +210,14 @@ def read_bsdf(path: str | Path) -> MeasuredScatter:
         if [cell.lower() for cell in cells] != [word.lower()]:
             raise lines.error("another line is expected here", word, " ".join(cells)[:60], f"the line {word}")
         lines.at += 1
-    stated_tis, blocks = [], []
+    tis_of_file, blocks = [], []
     for _ in incidence:
         cells = lines.next("TIS")
         value = _number(cells[1]) if len(cells) == 2 and cells[0].lower() == "tis" else None
         if value is None or not 0.0 <= value <= 1.0:
             allowed = f"TIS and a share of 0 to 1 before the values of each of {len(incidence)} angles of incidence"
             raise lines.error("not a TIS", "TIS", " ".join(cells)[:60], allowed)
-        stated_tis.append((lines.line, value))
+        tis_of_file.append((lines.line, value))
         lines.at += 1
         blocks.append([lines.numbers(len(radial), "ScatterRadial", 0.0, 1e15) for _ in azimuth])
     cells = lines.next("DataEnd")
@@ -233,13 +233,13 @@ def read_bsdf(path: str | Path) -> MeasuredScatter:
         table = ScatterTable(incidence, azimuth, radial, values)
     except ValueError as error:
         raise InputError(Issue(f"not a BSDF: {error}", file, line)) from None
-    _agrees(file, table, stated_tis)
-    return MeasuredScatter(table, tuple(value for _, value in stated_tis))
+    _agrees(file, table, tis_of_file)
+    return MeasuredScatter(table, tuple(value for _, value in tis_of_file))
 
 
-def _agrees(file: str, table: ScatterTable, stated_tis: Sequence[tuple[int, float]]) -> None:
+def _agrees(file: str, table: ScatterTable, tis_of_file: Sequence[tuple[int, float]]) -> None:
     """Raise `InputError` if the integral of a BSDF table differs from the total scatter that its file states."""
-    for (line, value), angle in zip(stated_tis, table.incidence, strict=True):
+    for (line, value), angle in zip(tis_of_file, table.incidence, strict=True):
         total = table.total(float(angle))
         if abs(total - value) > TIS_TOLERANCE * max(total, value):
             text = f"the table scatters {total:.4g} of the light at {np.degrees(angle):g} deg, not the stated TIS"

@@ -20,11 +20,11 @@ from scenes.yaml.errors import InputError, Issue, names_text, nearest, shown
 from scenes.yaml.input_file import digest_of, is_file, no_file, why_unreadable
 from scenes.yaml.units import LENGTH, TEMPERATURE, TEMPERATURE_DIFFERENCE, unit_ratio
 
-PLACES, MOVES = ("x", "y", "z"), ("dx", "dy", "dz")
+POSITION_COLUMNS, MOVES = ("x", "y", "z"), ("dx", "dy", "dz")
 FARTHEST = 100.0
 """Largest absolute coordinate of a node and largest displacement, in metres."""
 COLUMNS = (
-    *(Column(name, LENGTH, least=-FARTHEST, most=FARTHEST) for name in (*PLACES, *MOVES)),
+    *(Column(name, LENGTH, least=-FARTHEST, most=FARTHEST) for name in (*POSITION_COLUMNS, *MOVES)),
     Column("node", text=True, needed=False),
 )
 """Columns of a table of displacements; the node numbers are not used."""
@@ -111,7 +111,7 @@ def read_nodes(
         _within(str(path), moves, FARTHEST, "displacements", "up to 100 m")
         return DisplacedNodes(points, moves)
     table = _table(path, COLUMNS)
-    points, moves = table.stacked(*PLACES), table.stacked(*MOVES)
+    points, moves = table.stacked(*POSITION_COLUMNS), table.stacked(*MOVES)
     _one_load_case(table, points, moves, "displacement")
     return DisplacedNodes(points, moves)
 
@@ -160,7 +160,7 @@ def read_temperatures(
         text = "absolute temperatures and changes" if columns else "no temperatures"
         allowed = "either 'T [degC]' (or 'T [K]'), absolute, or 'dT [K]', changes from the instrument's temperature"
         raise InputError(Issue(text, str(path), int(table.lines[0]) - 1, allowed=allowed))
-    points, values = table.stacked(*PLACES), table[columns[0]]
+    points, values = table.stacked(*POSITION_COLUMNS), table[columns[0]]
     _one_load_case(table, points, values[:, None], "temperature")
     return WarmNodes(points, values, columns[0] == ABSOLUTE)
 

@@ -170,8 +170,8 @@ class Inline(str):
         full = (*source.prefix, *key)
         while full and source.lines and full not in source.lines:  # a short form has the line of a shorter key
             full = full[:-1]
-        place = (*full, *self.yaml.prefix)
-        return Inline(str(self), YamlFile(source.file, self.yaml.data, source.lines, place))
+        path = (*full, *self.yaml.prefix)
+        return Inline(str(self), YamlFile(source.file, self.yaml.data, source.lines, path))
 
 
 def _referred(value: Any, handler: ValidatorFunctionWrapHandler, within: KeyPath = ()) -> Any:
@@ -381,10 +381,10 @@ def require_one(
     Problem
         None or several of the keys have a value.
     """
-    given = [name for name in names if getattr(spec, name) is not None]
-    if len(given) != 1:
-        words = ("neither", "both") if len(names) == 2 else ("none of them", " and ".join(given))
-        raise Problem(problem, words[bool(given)], allowed, within=within)
+    present = [name for name in names if getattr(spec, name) is not None]
+    if len(present) != 1:
+        words = ("neither", "both") if len(names) == 2 else ("none of them", " and ".join(present))
+        raise Problem(problem, words[bool(present)], allowed, within=within)
 
 
 def not_empty(problem: str, allowed: str) -> AfterValidator:

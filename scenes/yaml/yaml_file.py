@@ -250,7 +250,7 @@ class _Builder:
             value = self._plain(event, line)
         else:
             value = {} if kind == "MappingStartEvent" else []
-        path = self._place(value, line)
+        path = self._key_path(value, line)
         if kind != "ScalarEvent":
             if len(self._open) == DEEPEST:
                 self._refuse("nested too deeply", line, f"at most {DEEPEST} levels")
@@ -288,7 +288,7 @@ class _Builder:
         self.lines[(*path, key)] = line
         self._key[-1] = key
 
-    def _place(self, value: Any, line: int) -> KeyPath:
+    def _key_path(self, value: Any, line: int) -> KeyPath:
         if not self._open:
             self.root = value
             self.lines[()] = line

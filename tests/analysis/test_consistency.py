@@ -44,7 +44,7 @@ def test_noise_moves_the_chi_square_by_what_is_said(stated) -> None:
     many = [consistency(shift + one, noise, stated) for one in draws]
     assert np.std([one.chi_square for one in many]) == pytest.approx(found.sigma_noise, rel=0.056)
     # the chance is curved, too: some per cent of 0.02 around it
-    assert np.std([one.chance for one in many]) == pytest.approx(found.chance_sigma_noise, rel=0.1)
+    assert np.std([one.p_value for one in many]) == pytest.approx(found.p_value_sigma_noise, rel=0.1)
 
 
 def test_judged_is_the_best_that_stands_in_the_results(stated) -> None:

@@ -133,7 +133,7 @@ def test_the_false_alarm_rate_is_a_bound_and_close(gaps: tuple[float, ...]) -> N
     passes = 150
     for seed in range(passes):
         found = periodogram(Pass(gaps=gaps, count=120).observed(seed), 0.5, 12.0)
-        chances.append(float(found.chance(found.power[found.best])))
+        chances.append(float(found.p_value(found.power[found.best])))
     for rate in (0.01, 0.05, 0.2):
         alarms = int(np.sum(np.array(chances) < rate))
         assert alarms <= stats.binom.ppf(1.0 - LIMIT, passes, rate), rate
@@ -214,7 +214,7 @@ def test_an_alias_of_a_faster_oscillation_is_recognised() -> None:
     given = Pass(((FAST, 0.5, 0.3),), GAPS, rows=0.125, scatter=4e-3).observed(8)
     blind = search(given, 0.5, 5.0, RATE).lines
     assert SLOW == pytest.approx(blind.frequency[0], abs=0.02)
-    assert blind.chance[0] < 1e-30
+    assert blind.p_value[0] < 1e-30
     found = search(given, 0.5, 5.0, RATE, beyond=60.0)
     assert found.beyond == 60.0
     assert found.lines.frequency == pytest.approx([FAST], abs=4.0 * found.lines.frequency_sigma[0])

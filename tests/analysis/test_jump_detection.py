@@ -40,7 +40,7 @@ def test_false_alarms_of_series_without_a_jump_are_within_the_stated_rate() -> N
     for seed in range(200):
         told, times, shifts = toy(seed, false_alarm=0.5)
         chances.append(
-            min((j.chance for j in smooth_series(told, times, shifts, FOUR, [0.0]).jumps or ()), default=1.0)
+            min((j.false_alarm for j in smooth_series(told, times, shifts, FOUR, [0.0]).jumps or ()), default=1.0)
         )
     for rate in (0.5, 0.05):
         assert np.sum(np.array(chances) <= rate) <= binom.isf(1e-3, 200, rate)
@@ -63,7 +63,7 @@ def test_the_log_ratio_is_that_of_least_squares() -> None:
     assert (one.body, one.after, one.until) == ("prism", 16.0, 17.0)
     assert one.log_ratio == pytest.approx(0.5 * (s @ inverse @ s - left @ inverse @ left), rel=1e-6)
     looks = 39 * 6  # four motions, two bodies
-    assert one.chance == pytest.approx(min(1.0, looks * chi2.sf(2.0 * one.log_ratio, 2)), rel=1e-6, abs=0.0)
+    assert one.false_alarm == pytest.approx(min(1.0, looks * chi2.sf(2.0 * one.log_ratio, 2)), rel=1e-6, abs=0.0)
     assert np.abs(np.array(one.sizes) - 3.0 * amounts) == pytest.approx(0.0, abs=5.0 * max(one.sigmas))
     assert max(one.sigmas) < 1.0
     assert list(one.rivals) == ["mirror"]

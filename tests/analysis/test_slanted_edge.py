@@ -139,14 +139,14 @@ def test_all_ways_round():
 def test_spread_functions():
     edge = slanted_edge_mtf(edge_image(5))
     truth = edge_spread(math.radians(5), 6 + math.ceil(64 / math.sqrt(2)), PAN)
-    near = np.abs(edge.place) < 20
-    assert_allclose(edge.esf[near], DARK + (BRIGHT - DARK) * truth(edge.place[near]), atol=5e-4 * (BRIGHT - DARK))
-    assert_allclose(edge.lsf[near], truth(edge.place[near], 1), atol=0.005)
+    near = np.abs(edge.distance) < 20
+    assert_allclose(edge.esf[near], DARK + (BRIGHT - DARK) * truth(edge.distance[near]), atol=5e-4 * (BRIGHT - DARK))
+    assert_allclose(edge.lsf[near], truth(edge.distance[near], 1), atol=0.005)
     # 16 to a pixel, alike on both sides, to the last pixel of the side that has fewer
-    assert np.diff(edge.place) == pytest.approx(1 / 16, abs=1e-12)
-    assert edge.place == pytest.approx(-edge.place[::-1], abs=1e-12)
-    reach = min(edge.pixel_place.max(), -edge.pixel_place.min())
-    assert 25 < edge.place[-1] <= reach < edge.place[-1] + 1 / 16
+    assert np.diff(edge.distance) == pytest.approx(1 / 16, abs=1e-12)
+    assert edge.distance == pytest.approx(-edge.distance[::-1], abs=1e-12)
+    reach = min(edge.pixel_distance.max(), -edge.pixel_distance.min())
+    assert 25 < edge.distance[-1] <= reach < edge.distance[-1] + 1 / 16
 
 
 def test_interpolation_and_mtf50():

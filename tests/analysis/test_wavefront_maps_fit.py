@@ -134,8 +134,8 @@ def test_maps_and_coefficients_turn_alike(reading):
     row, column = 26, 33
     x, y = reading.matrix @ (column - 20, row - 20)
     assert after.values[y + 20, x + 20] == reading.sign * before.values[row, column]
-    y, x = (np.argwhere(after.lit).T - 20.0) / 20.0
-    found, *_ = np.linalg.lstsq(circle_terms(TERMS, x, y), after.values[after.lit], rcond=None)
+    y, x = (np.argwhere(after.illuminated).T - 20.0) / 20.0
+    found, *_ = np.linalg.lstsq(circle_terms(TERMS, x, y), after.values[after.illuminated], rcond=None)
     np.testing.assert_allclose(found, reading.coefficients(coefficients, TERMS), rtol=0, atol=1e-12)
     np.testing.assert_array_equal(reading.inverse.apply(after).values, before.values)
     turning = reading.term_matrix(TERMS)
@@ -175,7 +175,7 @@ def test_the_reading_of_half_a_micron_of_coma_is_found(truth):
     # what the file holds: the reading is what turns it back
     measured = right.reshape(FIELDS, -1) @ truth.term_matrix(USED)
     found = orientation_evidence(measured, expected, covariance, USED)
-    assert found.found == truth
+    assert found.determined == truth
     assert found.allowed[0] == truth
     assert found.readings[0] == truth
     assert found.degrees == FIELDS * len(USED)
@@ -187,7 +187,7 @@ def test_readings_that_look_alike_are_named_together():
     expected = np.zeros((1, len(USED)))
     expected[0, USED.index(8)] = 0.5e-6
     found = orientation_evidence(expected, expected, (5e-9) ** 2 * np.eye(len(USED)), USED)
-    assert found.found is None
+    assert found.determined is None
     # an inverted coma along x is one that is mirrored in x
     assert {str(one) for one in found.indistinguishable} == {
         "as it is",
@@ -215,7 +215,7 @@ def test_no_reading_is_allowed_of_another_camera():
     other, _ = camera(5e-9, -0.9e-6, seed=4)
     found = orientation_evidence(other * 3.0, expected, covariance, USED)
     assert found.allowed == ()
-    assert found.found is None
+    assert found.determined is None
 
 
 def test_a_covariance_that_is_none():

@@ -47,7 +47,7 @@ def test_a_rigid_motion_and_a_growth_are_exact(aperture: Aperture, uneven: bool,
     # rounding of coordinates of 1 m is 1e-16; the least lever arm is a tenth of that
     np.testing.assert_allclose(face.rotate, times * TURN, rtol=0, atol=1e-12)
     np.testing.assert_allclose(face.shift, times * SHIFT, rtol=0, atol=1e-12)
-    assert face.growth == pytest.approx(growth, abs=1e-12)
+    assert face.expansion == pytest.approx(growth, abs=1e-12)
     assert face.rms(face.change) < 1e-14
     assert face.grid is None
     assert not face.printed_through
@@ -93,7 +93,7 @@ def test_order_of_the_nodes_and_nodes_elsewhere_do_not_matter() -> None:
         np.concatenate([back, points[order]]), np.concatenate([0.0 * back, moves[order]]), BOWL, DISK
     )
     assert other.others == len(back)
-    assert (other.rotate, other.shift, other.growth) == (face.rotate, face.shift, face.growth)
+    assert (other.rotate, other.shift, other.expansion) == (face.rotate, face.shift, face.expansion)
     assert other.figure == face.figure
     assert face.grid is not None
     assert other.grid is not None

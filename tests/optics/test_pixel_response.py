@@ -28,7 +28,7 @@ def oversampled(n: int, disk: float, shift: tuple[float, float], fine: int) -> n
 def test_against_brute_force(disk: float, shift: tuple[float, float]) -> None:
     n = 41
     response = PixelResponse.fit(PITCH, disk, cutoff=1.0 / (WAVELENGTH * F_NUMBER))
-    border = n + 2 * response.reach
+    border = n + 2 * response.half_width
     axis = (np.arange(border) - 0.5 * (border - 1)) * PITCH
     x, y = np.meshgrid(axis - shift[0] * PITCH, axis - shift[1] * PITCH)
     got = response.apply(airy(np.hypot(x, y), WAVELENGTH, F_NUMBER)[None])[0]

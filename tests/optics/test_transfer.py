@@ -293,7 +293,7 @@ def test_overlap_of_a_distorted_edge() -> None:
         assert got == pytest.approx(want, rel=1e-4 if abs(s) > 1.6 else 1e-5)
     # copies that are farther apart than the longest chord: no overlap, and numbers that a factor of zero takes out
     way = np.array([0.1, 1.5, 2.9, -2.0])
-    longest = edge.reach(way)[0] * np.exp(1j * way)
+    longest = edge.extent(way)[0] * np.exp(1j * way)
     for beyond in (1.0 + 1e-9, 1.05, 4.0):
         right, left, inside = edge.corners(beyond * longest)
         assert not inside.any()

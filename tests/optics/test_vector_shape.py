@@ -69,11 +69,11 @@ def test_thin_bar_is_sinc_times_sinc() -> None:
 def test_ellipse_against_quadrature() -> None:
     shape = Disk((1e-5, 5e-6), 3e-5, [[1.3, 0.4], [-0.2, 0.8]])
     nodes = quadrature.disk(30, 120)
-    x, y = shape.centre[:, None] + shape.radius * shape.stretch @ np.stack([nodes.x, nodes.y])
+    x, y = shape.centre[:, None] + shape.radius * shape.linear_map @ np.stack([nodes.x, nodes.y])
     fx, fy = RNG.uniform(-1e5, 1e5, (2, 50))
     fx[:2], fy[:2] = (0.0, 1e-9), 0.0
     wave = np.exp(-2j * np.pi * (fx[:, None] * x + fy[:, None] * y))
-    want = wave @ (nodes.weight * shape.radius**2 * np.linalg.det(shape.stretch))
+    want = wave @ (nodes.weight * shape.radius**2 * np.linalg.det(shape.linear_map))
     np.testing.assert_allclose(shape.spectrum(fx, fy), want, rtol=0, atol=1e-13 * shape.area)
     x0, x1, y0, y1 = shape.bounds
     assert (x0 < x.min()) & (x.max() < x1) & (y0 < y.min()) & (y.max() < y1)
@@ -102,7 +102,7 @@ def test_affine_map_of_disk_is_an_ellipse() -> None:
     mapped = disk.mapped(affine)
     assert isinstance(mapped, Disk)
     np.testing.assert_allclose(mapped.centre, affine(disk.centre[None])[0], rtol=0, atol=1e-17)
-    np.testing.assert_allclose(mapped.stretch, AFFINE @ disk.stretch, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(mapped.linear_map, AFFINE @ disk.linear_map, rtol=0, atol=1e-12)
 
 
 def test_quadratic_map_bends_edges_within_the_tolerance() -> None:

@@ -273,7 +273,7 @@ class Score:
 
 def _false(jump: Jump, moments: np.ndarray, reach: list[tuple[float, float]]) -> bool:
     """Where nothing jumped."""
-    may = np.any((moments >= jump.chances[0][0]) & (moments <= jump.chances[-1][0]))
+    may = np.any((moments >= jump.time_distribution[0][0]) & (moments <= jump.time_distribution[-1][0]))
     return not may and not any(early <= jump.after and jump.until <= late for early, late in reach)
 
 

@@ -265,7 +265,7 @@ def test_units_and_order_of_rows_and_columns_do_not_matter(tmp_path, nodes, gf7_
     assert one.rms(one.change) == pytest.approx(two.rms(two.change), abs=1e-14)
     assert one.grid is not None
     assert two.grid is not None
-    x, y = one.places[one.weight > 0.0].T
+    x, y = one.points[one.weight > 0.0].T
     np.testing.assert_allclose(one.grid.sag(x, y), two.grid.sag(x, y), rtol=0, atol=1e-13)
     assert np.max(np.abs(one.grid.sag(x, y))) > 1e-11
 

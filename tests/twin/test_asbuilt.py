@@ -30,7 +30,7 @@ from scenes.yaml.yaml_file import dump_yaml
 from tests.twin.study_bench import TEXTS, refusals
 from twin.asbuilt import asbuilt_run
 from twin.asbuilt.asbuilt_bench import AsBuiltBench
-from twin.asbuilt.asbuilt_run import ASBUILT, _prediction, _warnings, motions, require_agreement, run_asbuilt
+from twin.asbuilt.asbuilt_run import ASBUILT, _prediction, _warnings, motions, require_consistency, run_asbuilt
 from twin.asbuilt.next_step import advice, expected, optimal_move
 from twin.asbuilt.orientation_check import run_check
 from twin.camera.camera_optics import CameraOptics
@@ -269,7 +269,7 @@ def test_an_orientation_is_found_after_a_move(backend, tmp_path) -> None:
     ):
         found = run_check(AsBuiltSetup.read(written(tmp_path, {"wavefronts": measured}, **more)), backend)
         assert (found.code, one in found.evidence.indistinguishable) == (0, True)
-        assert (found.evidence.found == one) == (len(found.evidence.indistinguishable) == 1) == bool(more)
+        assert (found.evidence.determined == one) == (len(found.evidence.indistinguishable) == 1) == bool(more)
 
 
 def test_files_of_the_laboratory_are_read(backend, tmp_path) -> None:
@@ -410,14 +410,14 @@ def test_estimates_that_do_not_settle_or_contradict_themselves_are_refused(whole
     """Nine times the degrees of freedom is still an estimate; more names what agrees least."""
     names = [kind.name for kind in whole.kinds]
     each = [ConsistencyTest.of(name, 30.0 if name == "mtf" else 9.0, 10) for name in names]
-    require_agreement(whole, state(whole=ConsistencyTest.of("", 180.0, 20), measurements=each))
+    require_consistency(whole, state(whole=ConsistencyTest.of("", 180.0, 20), measurements=each))
     with pytest.raises(InputError, match="their residuals are 3 standard deviations on average") as caught:
-        require_agreement(whole, state(whole=ConsistencyTest.of("", 180.1, 20), measurements=each))
+        require_consistency(whole, state(whole=ConsistencyTest.of("", 180.1, 20), measurements=each))
     assert "measurements.mtf.mtf" in str(caught.value)
     with pytest.raises(
         InputError, match=r"not converged after 3 steps: one more changes the predicted readings by 0\.5"
     ):
-        require_agreement(whole, state(converged=False, settled=0.5))
+        require_consistency(whole, state(converged=False, settled=0.5))
 
 
 @pytest.mark.second

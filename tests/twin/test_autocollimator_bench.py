@@ -93,7 +93,7 @@ def test_the_images_noise_is_as_stated(reader: Reader, backend: Backend) -> None
     places, sigmas = [], []
     for seed in range(count):
         mean = reader.expose(windows, (7, seed), 3).mean(axis=2)
-        place, spots = reader.place(mean[:, 0], windows.corner[:, 0])
+        place, spots = reader.positions(mean[:, 0], windows.corner[:, 0])
         places.append(place)
         sigmas.append(np.einsum("bkk->bk", spots.temporal_covariance))
     residual = np.array(places) - np.mean(places, axis=0)

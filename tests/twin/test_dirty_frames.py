@@ -133,7 +133,7 @@ def test_too_little_of_a_spot_is_refused(bench, monkeypatch):
     template, detector, noise = bench
     drawn = draw(template, detector, (), 5)
     drawn.after[drawn.after > 0.03 * detector.max_dn] = detector.max_dn
-    monkeypatch.setattr(channel_measurement, "_MOST_GROWTH", 1.0)
+    monkeypatch.setattr(channel_measurement, "_MOST_SIGMA_INCREASE", 1.0)
     with one_blas_thread():
         work = measurement(drawn, template, noise)
         assert work.search() == []

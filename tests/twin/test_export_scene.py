@@ -226,7 +226,7 @@ def test_looks_that_miss_the_earth_and_ground_on_the_180th_meridian_are_refused(
         lines=4, camera=SimpleNamespace(pixels=4), ground=lambda at, *_: np.full((len(at), 3), np.nan)
     )
     with pytest.raises(ValueError, match="no line of sight meets the Earth"):
-        ground_accuracy._places(none, np.zeros(2), np.zeros(2), 0.0)
+        ground_accuracy._ground_positions(none, np.zeros(2), np.zeros(2), 0.0)
     with pytest.raises(ValueError, match="a line of sight misses the Earth"):
         line_scanner._error(none, None, 0.0, (0, 4))
     with pytest.raises(ValueError, match="a line of sight misses the Earth"):

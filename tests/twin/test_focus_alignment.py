@@ -35,7 +35,7 @@ from twin.laboratory.focus_bench import VERTEX_ERROR, BudgetLine, FocusBench, Re
 from twin.laboratory.focus_report import focus_report as report
 from twin.laboratory.focus_run import FocusRun, SimulatedFocus, align, align_files, line_rotation, mount_of, plan_shims
 from twin.sensors.line_ccd import band_wavelengths
-from twin.targets.target_images import ALONG, DIRECTIONS, TABLE_REACH, TRACK, EdgeImager
+from twin.targets.target_images import ALONG, DIRECTIONS, TABLE_EXTENT, TRACK, EdgeImager
 
 FILE = SCENES / LAB / "focus.yaml"
 ARCMIN = np.pi / 180 / 60
@@ -366,7 +366,7 @@ def places(tabled_bench: FocusBench) -> np.ndarray:
 )
 def test_tables(tabled_bench, defocus: float, tolerance: float) -> None:
     """Between the table's samples, near its end and beyond it, up to the cut-off and beyond."""
-    assert (abs(defocus) > TABLE_REACH) == (tolerance == OUTSIDE)
+    assert (abs(defocus) > TABLE_EXTENT) == (tolerance == OUTSIDE)
     for site in tabled_bench.sites:
         for imager in site.imagers.values():
             frequency = np.linspace(0.0, 1.05 * imager.optics.cutoff, 24)

@@ -64,7 +64,7 @@ def test_map_points_are_where_the_sensor_has_them(flown: Simulation, control: Ma
         # sigmas of matching are up to 1.6 too small, for light and changes are not in them
         assert 0.3 < found.chi_square / found.degrees_of_freedom < 2.56
         line = control.lines[name]
-        moved = np.linalg.norm((line.place - line.predicted)[line.accepted], axis=1)
+        moved = np.linalg.norm((line.position - line.predicted)[line.accepted], axis=1)
         assert moved.min() > 5.0
     share = control.check.mean()
     assert share == pytest.approx(0.25, abs=0.05)

@@ -26,7 +26,7 @@ from tests.twin.test_monitor_layouts import FIRST, SECOND
 from twin.design import monitor_design
 from twin.design.layout_bench import FULLEST, LayoutBench, LayoutFacts, _OutsideLimitsError
 from twin.design.layout_refinement import LayoutNumber, Slope, known_of, numbers_of, refined, slope_of
-from twin.design.layout_search import Candidate, End, Found, merit, optima, spread
+from twin.design.layout_search import Candidate, End, SearchResult, merit, optima, spread
 from twin.framework.procedure import BenchError
 from twin.monitor.information import Information
 
@@ -264,7 +264,7 @@ def test_ends_are_told_apart_by_two_percent(bench: LayoutBench) -> None:
         return End(name, layouts, (1.0,), (), 1, 1, 1, 1, {"a": 1})
 
     ends = (end("b", 1.019), end("a", 1.0), end("none", None), end("d", 1.5), end("c", 1.03))
-    found = Found(LayoutFacts((FIRST,)), (), ends, 0.0)
+    found = SearchResult(LayoutFacts((FIRST,)), (), ends, 0.0)
     assert [[one.name for one in group] for group in optima(found, bench)] == [["a", "b"], ["c"], ["d"]]
     assert found.refused == {"a": 5}
     assert (found.beams, found.feasible, found.compared, found.built) == (5, 5, 5, 5)

@@ -32,7 +32,7 @@ from scenes.yaml.errors import InputError
 from scenes.yaml.yaml_file import dump_yaml
 from tests.twin.study_bench import refusals
 from twin.design.__main__ import app
-from twin.design.layout_bench import BeamFacts, LayoutBench, combined, is_own, touching
+from twin.design.layout_bench import BeamFacts, LayoutBench, combined, is_individual, touching
 from twin.design.layout_search import journal_of
 from twin.design.monitor_design import LAYOUTS, MonitorDesignRun, run_monitor_design
 from twin.framework.run_folder import RunFolderError
@@ -130,7 +130,7 @@ def test_information_of_frames_adds_and_light_counts_as_beams_do(bench: LayoutBe
     # shot noise alone, but for what rounding to grey values adds
     assert spot_noise(with_light(path, 2.0, 4), even)[0] == pytest.approx(once / 2.0, rel=0.01)
     stated = bench.information(bench.start, FIRST)["mirrors.yaml"].disturbances
-    shared = np.array([not is_own(body) for body in stated.bodies])
+    shared = np.array([not is_individual(body) for body in stated.bodies])
     own = stated.scaled(shared.astype(float))
     one = Information(own, once, bench.rows, np.zeros(4))
     twice = replace(

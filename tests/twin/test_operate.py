@@ -34,8 +34,8 @@ from twin.operate.record.entries import (
     utc_text,
 )
 from twin.operate.record.history import History, content_of, initialise_record
+from twin.operate.record.ingest import Ingest
 from twin.operate.record.record_tables import tables
-from twin.operate.record.taking import Ingest
 from twin.operate.record.telemetry import time_of_name
 
 

@@ -181,7 +181,7 @@ def test_covariances_of_line_and_pixel_keep_their_sign_in_the_focal_plane() -> N
     still = np.zeros(3)
     for name in LINES:
         spread = np.array([[0.04, 0.03], [0.03, 0.09]])
-        plain = data.places(name, np.array([0.0, 5999.5, 11_999.0]))
+        plain = data.positions(name, np.array([0.0, 5999.5, 11_999.0]))
         assert plain == pytest.approx(SETUP.camera.pitch * np.array([[0.0, -5999.5], [0.0, 0.0], [0.0, 5999.5]]))
         line, pixel = 42_857.0, 6000.0
         row = ImagePoints.of([0], [line], [pixel], spread)

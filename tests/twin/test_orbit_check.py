@@ -82,7 +82,7 @@ def test_one_wrong_convention_is_found(files, what: str) -> None:
     assert found.verdict == "another"
     assert found.best.changes == ((question, right),)
     assert found.equally_likely == ()
-    stated = found.stated_fit
+    stated = found.specified_fit
     assert stated.fit is None or stated.cost - found.best.cost > 100.0 * DECIDED
 
 

@@ -140,7 +140,7 @@ def check_chi_square(courses: Courses) -> None:
     total, degrees = sum(one.chi_square for one in found), sum(one.degrees for one in found)
     low, high = chi2.ppf(0.5 * FALSE_ALARM, degrees), chi2.isf(0.5 * FALSE_ALARM, degrees)
     assert low < total < high, (total, degrees)
-    chances = [one.chance for one in found]
+    chances = [one.p_value for one in found]
     assert kstest(chances, "uniform").pvalue > FALSE_ALARM
 
 

@@ -214,13 +214,13 @@ def test_the_share_of_noise_is_the_chi_square_of_equal_sigmas() -> None:
     study = study_of(NOISY, "{kind: monte_carlo, runs: 6, seed: 1}", STATED)
     found = estimates.noise_share(response, study)
     assert found.share == pytest.approx(9.0 / np.var(response.values, ddof=1), rel=1e-12)
-    assert found.chance == pytest.approx(
+    assert found.p_value == pytest.approx(
         stats.chi2.cdf(np.sum((response.values - response.values.mean()) ** 2) / 9.0, 5)
     )
     one = np.array([3.0] + [1e-6] * 5)
     # one run has all of the noise: 5 / 6 of a degree of freedom
     found = estimates.noise_share(estimates.Response("y", "um", draws(6), one), study)
-    assert found.chance == pytest.approx(stats.chi2.cdf(5.0 / 6.0 / found.share, 5.0 / 6.0), rel=1e-6)
+    assert found.p_value == pytest.approx(stats.chi2.cdf(5.0 / 6.0 / found.share, 5.0 / 6.0), rel=1e-6)
 
 
 def holds(estimate, truth: float) -> bool:

@@ -33,7 +33,7 @@ from twin.sensors.line_ccd import LineCcd, band_wavelengths
 from twin.targets.target_images import (
     ALONG,
     DIRECTIONS,
-    PLACES,
+    POSITIONS,
     TRACK,
     WORST_CHANGE,
     BandPupils,
@@ -220,7 +220,7 @@ def test_bars(sharp, aberrated, direction):
 
 
 def bar_readings(
-    camera: TargetCamera, states: list[State], repeats: int, frames: int, places: tuple[str, ...] = tuple(PLACES)
+    camera: TargetCamera, states: list[State], repeats: int, frames: int, places: tuple[str, ...] = tuple(POSITIONS)
 ) -> np.ndarray:
     """(measured - true) / sigma of bars in both directions, (readings,); every time other columns' responses and other
     noise."""
@@ -316,7 +316,7 @@ def test_a_line_too_short_for_the_windows(before_gf7):
 
 
 FOCAL_PLANE = f"{ROOT}/focal_plane"
-PLACES = np.array([[0.0, 0.0], [0.1, 0.0], [-0.1, 0.01], [0.05, -0.01], [-0.03, 0.004]])
+POSITIONS = np.array([[0.0, 0.0], [0.1, 0.0], [-0.1, 0.01], [0.05, -0.01], [-0.03, 0.004]])
 """(along, across), metres."""
 LONG = 20.0
 
@@ -330,7 +330,7 @@ def path(backend) -> TargetPath:
 
 def test_there_and_back(path) -> None:
     """Both ways are traced to 1e-12 m on the stop; the image is that much nearer."""
-    np.testing.assert_allclose(path.places({}, path.directions(PLACES)), PLACES, rtol=0.0, atol=1e-12)
+    np.testing.assert_allclose(path.places({}, path.directions(POSITIONS)), POSITIONS, rtol=0.0, atol=1e-12)
 
 
 def test_sense_of_the_axes(path) -> None:
@@ -350,11 +350,11 @@ def test_sense_of_the_axes(path) -> None:
 
 
 @pytest.mark.second
-@pytest.mark.parametrize("number", range(len(PLACES)))
+@pytest.mark.parametrize("number", range(len(POSITIONS)))
 def test_local_map_between_its_points(path, number: int) -> None:
     """Chief rays of 40 random directions inside the map's reach, in a bent camera."""
     state = {f"{ROOT}/M3": Motion(rotate=(3e-5, -2e-5, 0.0), figure={7: 50e-9})}
-    direction = path.directions(PLACES)[number]
+    direction = path.directions(POSITIONS)[number]
     reach = 2e-3
     local = path.local_map(state, direction, reach)
     points = np.random.default_rng(number).uniform(-reach, reach, (40, 2))

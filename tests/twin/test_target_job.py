@@ -13,7 +13,7 @@ import twin.render as command
 from scenes.specs.load import LIBRARY
 from tests.twin.commands import invoke
 from tests.twin.study_bench import REFUSED
-from twin.targets.target_images import DIRECTIONS, PLACES
+from twin.targets.target_images import DIRECTIONS, POSITIONS
 
 run = partial(invoke, command.app)
 FRAMES, REGION = 4, 112
@@ -68,7 +68,7 @@ def test_measured_agrees_with_truth(mtf):
     assert camera["nyquist_per_mm"] == pytest.approx(1.0 / 14e-3, rel=1e-12)
     assert list(camera["places"]) == ["left", "centre", "right"]
     assert camera["places"]["left"]["along_mm"] > 100.0  # left is +Y', near the end of a line of 229 mm
-    for place in PLACES:
+    for place in POSITIONS:
         for direction in DIRECTIONS:
             for when in STATES:
                 found, true = (side["places"][place][direction][when] for side in (camera, truth))

@@ -148,7 +148,7 @@ def test_states_do_not_depend_on_how_many_are_drawn_at_once(monkeypatch):
 def test_sigmas_are_those_of_the_joint_normal_distribution():
     """Motions, shifts and noise as one normal distribution, conditioned on the shifts by dense matrices."""
     _, limits = bench("gf7_pair", TOGETHER)
-    stated, rows = limits.stated, limits.rows
+    stated, rows = limits.disturbances, limits.rows
     motions = stated.correlation
     assert np.count_nonzero(motions - np.eye(len(motions))) > 10
     seen, asked = stated.spots, rows @ stated.parameters
@@ -162,7 +162,7 @@ def test_sigmas_are_those_of_the_joint_normal_distribution():
         other = asked @ motions @ asked.T - asked @ motions @ seen.T @ np.linalg.solve(total, seen @ motions @ asked.T)
         (remedy,) = (one for one in limits.remedies if one.name == name)
         np.testing.assert_allclose(remedy.sigma, np.sqrt(np.diag(other)), rtol=1e-4)
-    np.testing.assert_allclose(limits.from_statement, np.diag(other) / np.diag(left), rtol=1e-4)
+    np.testing.assert_allclose(limits.from_prior, np.diag(other) / np.diag(left), rtol=1e-4)
     # a motion that is known is one of zero variance, whatever goes with it
     label, sigma = next(iter(limits.sigma_if_known.items()))
     own = np.array([one == label for one in stated.labels])

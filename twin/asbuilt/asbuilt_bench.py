@@ -79,12 +79,12 @@ class AsBuiltBench(Site):
         self.experiment = MonitorExperiment(setup.base, backend)
         self.camera = self._camera_name()
         self.line = line_points(self.experiment.instrument, self.camera)
-        stated = self.experiment.stated
-        if stated is None or not stated.components:
+        prior = self.experiment.stated
+        if prior is None or not prior.components:
             allowed = "a disturbances file with standard deviations greater than zero, such as `assembled`"
             raise self.test.error("the prior has no motions", ("prior",), found=self.test.prior, allowed=allowed)
-        self.stated: DisturbancePrior = stated
-        self.parameters = Parameters.of(self.test, stated, self.experiment.instrument, self.experiment.thermal)
+        self.prior: DisturbancePrior = prior
+        self.parameters = Parameters.of(self.test, prior, self.experiment.instrument, self.experiment.thermal)
         self._beams: dict[tuple[tuple[float, float], ...], VariedBeams] = {}
         self.kinds = self._kinds(self.test.measurements, "measurements")
         self.afters = tuple(measurement.after for _, _, measurement in self.test.measurements.named())
@@ -237,7 +237,7 @@ class AsBuiltBench(Site):
         if self.setup.drawn is not None:
             drawn = prior_of_spec(self.setup.drawn, self.experiment.instrument)
             drawn_index = {component.name: k for k, component in enumerate(drawn.components)}
-            names = [component.name for component in self.stated.components]
+            names = [component.name for component in self.prior.components]
             strange = sorted(set(drawn_index) - set(names))
             if strange:
                 raise self.test.error(

@@ -133,11 +133,11 @@ def _verdict(run: AsBuiltRun) -> str:
 
 def _known_words(run: AsBuiltRun) -> str:
     known = sum(combination.known for combination in run.known)
-    agreement = run.estimate.whole
-    fits = "agree" if agreement.passes() else "do not agree"
+    consistency = run.estimate.whole
+    fits = "agree" if consistency.passes() else "do not agree"
     return (
         f"The measurements determine {known} of {len(run.known)} combinations of motions and {fits} with the prior and "
-        f"their errors (chi-square {agreement.chi_square:.0f} for {agreement.degrees} degrees of freedom)"
+        f"their errors (chi-square {consistency.chi_square:.0f} for {consistency.degrees} degrees of freedom)"
     )
 
 

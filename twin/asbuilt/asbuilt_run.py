@@ -160,7 +160,7 @@ def run_asbuilt(
             text = f"the randomly drawn as-built instrument lets no light through: {error}"
             raise test.error(text, ("simulate",), allowed=allowed) from error
     state = bench.estimate(data)
-    require_agreement(bench, state)
+    require_consistency(bench, state)
     advance("state", 1, 4)
     draws = state.draw(_random(seed, _POSTERIOR), test.draws)
     prior = bench.parameters.prior
@@ -198,7 +198,7 @@ def _random(seed: int, number: int) -> np.random.Generator:
     return np.random.default_rng(stream(seed, number))
 
 
-def require_agreement(bench: AsBuiltBench, state: StateEstimate) -> None:
+def require_consistency(bench: AsBuiltBench, state: StateEstimate) -> None:
     """Raise InputError if an estimate has not converged, or if measurements contradict each other.
 
     The error is placed at the measurement that agrees least with all others.
@@ -266,10 +266,10 @@ def _along(bench: AsBuiltBench, cases: Sequence[tuple[np.ndarray, np.ndarray | N
 
 def _warnings(state: StateEstimate, now: np.ndarray) -> list[str]:
     out = []
-    for name, block, agreement in state.excluded:
+    for name, block, consistency in state.excluded:
         out.append(
-            f"{name}: {block} contradicts all other measurements (chi-square {agreement.chi_square:.0f} for "
-            f"{agreement.degrees} degrees of freedom) and is excluded"
+            f"{name}: {block} contradicts all other measurements (chi-square {consistency.chi_square:.0f} for "
+            f"{consistency.degrees} degrees of freedom) and is excluded"
         )
     if not state.whole.passes():
         factor = np.sqrt(state.variance_factor)
@@ -315,7 +315,7 @@ def _prediction_plain(prediction: MeritPrediction) -> dict[str, Any]:
     return out if np.isnan(prediction.true) else {**out, "true": shown_merit(prediction.true, merit)}
 
 
-def _agreement_plain(test: ConsistencyTest) -> dict[str, Any]:
+def _consistency_plain(test: ConsistencyTest) -> dict[str, Any]:
     return {"chi_square": test.chi_square, "degrees": test.degrees, "p_value": test.p_value}
 
 
@@ -326,7 +326,7 @@ def _measured_plain(run: AsBuiltRun) -> dict[str, Any]:
         out[test.name] = {
             "kind": kind.kind,
             "numbers": len(kind.labels),
-            **_agreement_plain(test),
+            **_consistency_plain(test),
             "agrees": test.passes(count),
             "excluded": [block for name, block, _ in run.estimate.excluded if name == test.name],
         }
@@ -404,7 +404,7 @@ ASBUILT: Record[AsBuiltRun] = Record(
     Quantity("camera", lambda run: run.bench.camera, "camera that is evaluated"),
     Quantity(
         "whole",
-        lambda run: {**_agreement_plain(run.estimate.whole), "agrees": run.estimate.whole.passes()},
+        lambda run: {**_consistency_plain(run.estimate.whole), "agrees": run.estimate.whole.passes()},
         "chi-square of all measurements together",
     ),
     Quantity("false_alarm", lambda run: FALSE_ALARM, "probability of a false contradiction"),
@@ -413,7 +413,7 @@ ASBUILT: Record[AsBuiltRun] = Record(
     Quantity("combinations", _known_plain, "in standard deviations of the prior, the best known first"),
     Quantity(
         "merits",
-        lambda run: {one.merit.name: _prediction_plain(one) for one in run.predictions},
+        lambda run: {prediction.merit.name: _prediction_plain(prediction) for prediction in run.predictions},
         "each in its unit, with quantiles in percent",
     ),
     Quantity("next_move", _advice_plain, "recommended move of the actuators", where_known=True),

@@ -403,14 +403,14 @@ class SpotReadings(MeasuredKind):
         channels = self.path.channels
         self.labels = tuple(f"{c.camera} {c.name} {axis}" for c in channels for axis in ("row", "column"))
         self.blocks = tuple(f"{c.camera} {c.name}" for c in channels for _ in range(2))
-        self.nominal = self._places([{}])[0]
+        self.nominal = self._positions([{}])[0]
 
-    def _places(self, states: Sequence[State]) -> np.ndarray:
+    def _positions(self, states: Sequence[State]) -> np.ndarray:
         return self.path.mean_spots(states).reshape(len(states), -1)
 
     def predict(self, view: View) -> np.ndarray:
         """Return the spot positions relative to the nominal ones, pixels: energy centroids, as means of traced rays."""
-        return self._places(view.states) - self.nominal
+        return self._positions(view.states) - self.nominal
 
     def covariance(self) -> np.ndarray:
         """Return the covariance of the spot coordinates: the same variance for all, without correlation."""
@@ -523,9 +523,9 @@ class PositionReadings(MeasuredKind):
         self.bodies = named_bodies(self)
         self.labels = tuple(f"{body} {axis}" for body in self.bodies for axis in "xyz")
         self.blocks = tuple(body for body in self.bodies for _ in range(3))
-        self.nominal = self._places([{}])[0]
+        self.nominal = self._positions([{}])[0]
 
-    def _places(self, states: Sequence[State]) -> np.ndarray:
+    def _positions(self, states: Sequence[State]) -> np.ndarray:
         placed = self.site.experiment.instrument.assembly.place(states)
         root = placed.index[self.bodies[0].split("/")[0]]
         offset = np.stack([placed.translation[:, placed.index[body]] for body in self.bodies], axis=1)
@@ -534,7 +534,7 @@ class PositionReadings(MeasuredKind):
 
     def predict(self, view: View) -> np.ndarray:
         """Return the displacements of the bodies' origins from the drawing in each state, metres."""
-        return np.asarray((self._places(view.states) - self.nominal).reshape(len(view.states), -1))
+        return np.asarray((self._positions(view.states) - self.nominal).reshape(len(view.states), -1))
 
     def covariance(self) -> np.ndarray:
         """Return the covariance of the 3 N coordinates of N bodies' displacements, (3 N, 3 N), in m^2.
@@ -548,8 +548,8 @@ class PositionReadings(MeasuredKind):
         if self.spec.frame != specs.FREE:
             return super().biases()
         shifts = np.tile(np.eye(3), (len(self.bodies), 1))
-        turns = np.stack([np.cross(axis, self.nominal).ravel() for axis in np.eye(3)], axis=-1)
-        columns = np.concatenate([shifts, turns], axis=1)
+        rotations = np.stack([np.cross(axis, self.nominal).ravel() for axis in np.eye(3)], axis=-1)
+        columns = np.concatenate([shifts, rotations], axis=1)
         return columns, np.full(6, np.inf), np.full(6, UNKNOWN_FRAME)
 
     def read(self) -> np.ndarray:
@@ -559,8 +559,8 @@ class PositionReadings(MeasuredKind):
 
 KINDS: Mapping[str, type[MeasuredKind]] = FrozenMap(
     {
-        one.kind: one
-        for one in (
+        kind.kind: kind
+        for kind in (
             WavefrontReadings,
             FocusReadings,
             MtfReadings,

@@ -19,7 +19,7 @@ from optics.numerics.backend import Backend
 from scenes.specs.asbuilt import AsBuiltSetup
 from twin.asbuilt.asbuilt_bench import AsBuiltBench
 from twin.asbuilt.measured_kinds import UNKNOWN_FOCUS, MeasuredKind, WavefrontReadings
-from twin.asbuilt.wavefront_files import read_coefficients, stated_orientation
+from twin.asbuilt.wavefront_files import read_coefficients, specified_orientation
 from twin.framework.artefact import Cell, Table
 from twin.framework.procedure import Advance, silent
 from twin.framework.record import Quantity, Record
@@ -41,7 +41,7 @@ class OrientationCheck:
         Test with the measurements.
     names : tuple of str
         Names of the measurements.
-    stated : Orientation
+    specified : Orientation
         Orientation specified in the file of the test.
     evidence : OrientationEvidence
         Chi-square and Bayesian evidence of every orientation.
@@ -49,7 +49,7 @@ class OrientationCheck:
 
     setup: AsBuiltSetup
     names: tuple[str, ...]
-    stated: Orientation
+    specified: Orientation
     evidence: OrientationEvidence
 
     @property
@@ -57,7 +57,7 @@ class OrientationCheck:
         """Exit code: 0 if the specified orientation is not excluded."""
         if not self.evidence.allowed:
             return NONE
-        return 0 if self.stated in self.evidence.indistinguishable else ANOTHER
+        return 0 if self.specified in self.evidence.indistinguishable else ANOTHER
 
 
 def run_check(
@@ -93,21 +93,21 @@ def run_check(
         )
     kinds, afters = [kind for kind, _ in wavefronts], [after for _, after in wavefronts]
     terms = tuple(kinds[0].spec.numbers)
-    stated = stated_orientation(kinds[0])
+    specified = specified_orientation(kinds[0])
     for kind in kinds[1:]:
-        if tuple(kind.spec.numbers) != terms or stated_orientation(kind) != stated:
+        if tuple(kind.spec.numbers) != terms or specified_orientation(kind) != specified:
             raise kind.wrong("other terms or another orientation than the first wavefronts", "terms", "the same")
     if setup.test.simulate is None:
         data = [read_coefficients(kind, Orientation()) for kind in kinds]
     else:
         rng = np.random.default_rng(setup.test.simulate.seed if seed is None else seed)
-        true = _lit(bench, bench.draw(rng, setup.test.simulate.law), kinds, afters)
+        true = _exact_readings(bench, bench.draw(rng, setup.test.simulate.law), kinds, afters)
         drawn = [kind.drawn(values, rng) for kind, values in zip(kinds, true, strict=True)]
         # as a file would have them that lies as it says
-        undone = stated.inverse
+        undone = specified.inverse
         data = [undone.coefficients(values.reshape(-1, len(terms)), terms) for values in drawn]
     prior = bench.parameters.prior
-    mean = np.concatenate(_lit(bench, prior.mean, kinds, afters))
+    mean = np.concatenate(_exact_readings(bench, prior.mean, kinds, afters))
     slope = bench.slope(prior.mean, kinds, afters) @ prior.root
     covariance = slope @ slope.T
     start = 0
@@ -122,10 +122,10 @@ def run_check(
     except UndeterminedError as error:
         raise test.error(str(error), ("measurements",)) from error
     advance("readings", 1, 1)
-    return OrientationCheck(setup, tuple(kind.name for kind in kinds), stated, evidence)
+    return OrientationCheck(setup, tuple(kind.name for kind in kinds), specified, evidence)
 
 
-def _lit(
+def _exact_readings(
     bench: AsBuiltBench, values: np.ndarray, kinds: Sequence[MeasuredKind], afters: Sequence[str | None]
 ) -> list[np.ndarray]:
     """Return the error-free readings of each measurement in a state; raise InputError if the light is lost.
@@ -152,7 +152,7 @@ def _readings(check: OrientationCheck) -> list[dict[str, Any]]:
         {
             **_plain(orientation),
             "chi_square": float(evidence.chi_square[k]),
-            "p_value": float(evidence.chance[k]),
+            "p_value": float(evidence.p_value[k]),
             "log_evidence": float(evidence.log_evidence[k]),
             "allowed": orientation in evidence.allowed,
             "indistinguishable": orientation in evidence.indistinguishable,
@@ -164,7 +164,7 @@ def _readings(check: OrientationCheck) -> list[dict[str, Any]]:
 ORIENTATION: Record[OrientationCheck] = Record(
     "orientation.json: orientation of measured wavefronts.",
     Quantity("measurements", lambda check: check.names, "measurements whose wavefronts share one orientation"),
-    Quantity("stated", lambda check: _plain(check.stated), "orientation in the file"),
+    Quantity("stated", lambda check: _plain(check.specified), "orientation in the file"),
     Quantity("degrees", lambda check: check.evidence.degrees, "degrees of freedom"),
     Quantity("readings", _readings, "all sixteen orientations, the best first"),
 )
@@ -179,10 +179,10 @@ def check_report(check: OrientationCheck) -> Report:
             orientation.name,
             "+1" if orientation.sign > 0 else "\N{MINUS SIGN}1",
             float(evidence.chi_square[k]),
-            float(evidence.chance[k]),
+            float(evidence.p_value[k]),
             "yes" if orientation in evidence.allowed else "no",
             "yes" if orientation in evidence.indistinguishable else "no",
-            "as specified" if orientation == check.stated else "",
+            "as specified" if orientation == check.specified else "",
         ]
         for k, orientation in enumerate(evidence.readings)
     ]
@@ -203,18 +203,18 @@ def check_report(check: OrientationCheck) -> Report:
 
 
 def _words(check: OrientationCheck) -> list[str]:
-    evidence, stated = check.evidence, check.stated
+    evidence, specified = check.evidence, check.specified
     best = evidence.readings[0]
     if check.code == NONE:
         return ["No orientation of the wavefronts agrees with the prior and the moves: check fields, units and moves"]
-    if evidence.found is not None:
-        same = "as specified" if best == stated else f"not {_text(stated)} as specified"
+    if evidence.determined is not None:
+        same = "as specified" if best == specified else f"not {_text(specified)} as specified"
         return [f"The orientation of the wavefronts is {_text(best)}, {same}"]
     others = ", ".join(_text(orientation) for orientation in evidence.indistinguishable[1:])
     head = f"The data do not discriminate between {_text(best)} and {others}"
-    if stated in evidence.indistinguishable:
-        return [head, f"The specified orientation, {_text(stated)}, is among them"]
-    return [head, f"The specified orientation, {_text(stated)}, is excluded"]
+    if specified in evidence.indistinguishable:
+        return [head, f"The specified orientation, {_text(specified)}, is among them"]
+    return [head, f"The specified orientation, {_text(specified)}, is excluded"]
 
 
 def _text(orientation: Orientation) -> str:

@@ -33,7 +33,7 @@ class Parameters:
 
     Attributes
     ----------
-    stated : DisturbancePrior
+    disturbances : DisturbancePrior
         Prior of the M components (motions and temperatures of bodies).
     words : tuple of str
         Description of each component with the shortest name of its body, (M,).
@@ -57,7 +57,7 @@ class Parameters:
         Standard deviations of these errors, SI units.
     """
 
-    stated: DisturbancePrior
+    disturbances: DisturbancePrior
     words: tuple[str, ...]
     numbers: tuple[VariedParameter, ...]
     actuators: tuple[VariedParameter, ...]
@@ -71,7 +71,7 @@ class Parameters:
 
     @classmethod
     def of(
-        cls, test: AsBuiltSpec, stated: DisturbancePrior, instrument: Instrument, thermal: ThermalModel
+        cls, test: AsBuiltSpec, prior: DisturbancePrior, instrument: Instrument, thermal: ThermalModel
     ) -> Parameters:
         """Return the parameters to be estimated in a test.
 
@@ -94,9 +94,9 @@ class Parameters:
                 sigmas.append(np.hypot(entry.move_error * wanted[j, k], entry.accuracy_si))
         gains = tuple(k for k, entry in enumerate(test.actuators.values()) if entry.response > 0.0)
         return cls(
-            stated,
-            tuple(f"{short_name(entry.body, instrument.nodes)} {entry.what}" for entry in stated.components),
-            component_parameters(stated.components, instrument, thermal),
+            prior,
+            tuple(f"{short_name(entry.body, instrument.nodes)} {entry.what}" for entry in prior.components),
+            component_parameters(prior.components, instrument, thermal),
             actuators,
             names,
             gains,
@@ -110,7 +110,7 @@ class Parameters:
     @property
     def components(self) -> tuple[Component, ...]:
         """Components of the prior: motions and temperatures of bodies."""
-        return self.stated.components
+        return self.disturbances.components
 
     @property
     def labels(self) -> tuple[str, ...]:
@@ -126,7 +126,7 @@ class Parameters:
         """Prior mean and covariance of all estimated parameters."""
         count, rest = len(self.components), np.concatenate([self.gain_sigmas, self.error_sigmas])
         covariance = np.zeros((count + len(rest), count + len(rest)))
-        covariance[:count, :count] = self.stated.covariance
+        covariance[:count, :count] = self.disturbances.covariance
         covariance[count:, count:] = np.diag(rest**2)
         return StatePrior.of(self.labels, covariance)
 

@@ -40,7 +40,7 @@ class WavefrontMeasurement(Protocol):
         """Return an InputError whose position is a key of the measurement in the file."""
 
 
-def stated_orientation(measurement: WavefrontMeasurement) -> Orientation:
+def specified_orientation(measurement: WavefrontMeasurement) -> Orientation:
     """Return the specified orientation of maps and coefficients; raise InputError if its name is unknown."""
     try:
         return Orientation.named(measurement.spec.orientation, measurement.spec.sign)
@@ -65,7 +65,7 @@ def read_coefficients(measurement: WavefrontMeasurement, orientation: Orientatio
     InputError
         A file holds no wavefront, or has other fields or terms than specified, or too small an illuminated area.
     """
-    recorded = stated_orientation(measurement) if orientation is None else orientation
+    recorded = specified_orientation(measurement) if orientation is None else orientation
     spec, terms = measurement.spec, tuple(measurement.spec.numbers)
 
     def turned(table: np.ndarray) -> np.ndarray:

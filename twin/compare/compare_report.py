@@ -56,7 +56,7 @@ def compare_report(comparison: Comparison) -> Report:
 
 def _row(name: str, diff: Differences) -> list[Cell]:
     """Return a run's row in the summary table: its name and the numbers of inputs, results and images that differ."""
-    far = max((abs(one.in_sigma) for one in diff.numbers if one.in_sigma is not None), default=None)
+    far = max((abs(number.in_sigma) for number in diff.numbers if number.in_sigma is not None), default=None)
     return [name, len(diff.inputs), len(diff.numbers), len(diff.arrays), diff.compared, far]
 
 
@@ -86,7 +86,7 @@ def _artefacts(reference: Run, run: Run, diff: Differences, names: tuple[str, st
     """
     out: list[Artefact] = []
     if diff.inputs:
-        rows: list[list[Cell]] = [[_text(value) for value in one.values()] for one in diff.inputs]
+        rows: list[list[Cell]] = [[_text(value) for value in entry.values()] for entry in diff.inputs]
         out.append(Table(f"inputs-{k}", "Inputs", "Keys of config.yaml.", ("key", *names), rows))
     figure = _changes(diff, names, k)
     if figure is not None:
@@ -94,7 +94,7 @@ def _artefacts(reference: Run, run: Run, diff: Differences, names: tuple[str, st
     if diff.numbers:
         rows = [
             [n.file, n.key, _value(n.reference), _value(n.other), n.difference, n.sigma, n.sigma_of, n.in_sigma]
-            for n in sorted(diff.numbers, key=lambda one: one.file != "truth.json")
+            for n in sorted(diff.numbers, key=lambda entry: entry.file != "truth.json")
             if not is_sigma(n.key)
         ]
         columns = ("file", "key", *names, "difference", "sigma", "sigma from", "in sigma")
@@ -130,18 +130,18 @@ def _shape(array: ArrayDifference) -> str:
 
 def _changes(diff: Differences, names: tuple[str, str], k: int) -> SvgFigure | None:
     """Return a bar chart of the most significant changes of results, in sigmas; None if no number has a sigma."""
-    with_sigma = [one for one in diff.numbers if one.in_sigma is not None]
-    chosen = sorted(with_sigma, key=lambda one: -abs(one.in_sigma or 0.0))[:MOST_BARS]
+    with_sigma = [number for number in diff.numbers if number.in_sigma is not None]
+    chosen = sorted(with_sigma, key=lambda number: -abs(number.in_sigma or 0.0))[:MOST_BARS]
     if not chosen:
         return None
     with look(f"changes-{k}"):
         figure = new_figure(0.9 + 0.19 * len(chosen))
         axes = figure.subplots()
-        places = np.arange(len(chosen))[::-1]
-        axes.barh(places, [one.in_sigma or 0.0 for one in chosen], color=BLUE, height=0.6)
+        heights = np.arange(len(chosen))[::-1]
+        axes.barh(heights, [number.in_sigma or 0.0 for number in chosen], color=BLUE, height=0.6)
         axes.axvline(0.0, color=GREY, lw=0.7)
         axes.set_xscale("symlog", linthresh=10.0)
-        axes.set_yticks(places, [one.key for one in chosen])
+        axes.set_yticks(heights, [number.key for number in chosen])
         axes.set_xlabel("change in sigma, logarithmic beyond 10")
         axes.margins(y=0.02)
         plain_axes(axes)
@@ -161,7 +161,7 @@ def _pictures(reference: Run, run: Run, diff: Differences, names: tuple[str, str
             continue
         if len(out) == _MOST_IMAGES:
             break
-        files = [difference.content_of(one.folder / array.file, array.file) for one in (reference, run)]
+        files = [difference.content_of(side.folder / array.file, array.file) for side in (reference, run)]
         for label, first, second in _views(*(file.arrays[array.name].astype(np.float64) for file in files)):
             if len(out) == _MOST_IMAGES:
                 break
@@ -182,8 +182,8 @@ def _views(first: np.ndarray, second: np.ndarray) -> list[tuple[str, np.ndarray,
     if first.ndim <= 3:
         axes = tuple(range(first.ndim - 2))
         return [("", first.mean(axis=axes), second.mean(axis=axes))]
-    places = [p for p in np.ndindex(*first.shape[:-2]) if not np.array_equal(first[p], second[p])]
-    return [(str(list(p)), first[p], second[p]) for p in places]
+    indices = [p for p in np.ndindex(*first.shape[:-2]) if not np.array_equal(first[p], second[p])]
+    return [(str(list(p)), first[p], second[p]) for p in indices]
 
 
 def _picture(first: np.ndarray, second: np.ndarray, names: tuple[str, str], title: str) -> bytes:
@@ -308,7 +308,7 @@ def differences(reference: Run, other: Run, rtol: float, sigmas: float | None) -
         arrays += [array for array in diff.arrays if not _same_array(array, rtol)]
         if name in results:
             count += diff.common_numbers
-            numbers += [one for one in diff.numbers if not _same_number(one, rtol, sigmas)]
+            numbers += [number for number in diff.numbers if not _same_number(number, rtol, sigmas)]
     return Differences(tuple(inputs), tuple(numbers), tuple(arrays), count)
 
 
@@ -316,32 +316,32 @@ def _same_input(here: Leaf, there: Leaf) -> bool:
     """Return whether two inputs are equal, also if their units differ, as 3 um and 0.003 mm."""
     if here == there and type(here) is type(there):
         return True
-    one, two = split_quantity(here), split_quantity(there)
-    if one is None or two is None:
+    quantity, other_quantity = split_quantity(here), split_quantity(there)
+    if quantity is None or other_quantity is None:
         return difference.is_number(here) and difference.is_number(there) and here == there
     try:
-        return math.isclose(one[0] * unit_ratio(one[1], two[1]), two[0], rel_tol=1e-15)
+        return math.isclose(quantity[0] * unit_ratio(quantity[1], other_quantity[1]), other_quantity[0], rel_tol=1e-15)
     except ValueError:
         return False
 
 
-def _same_number(one: NumberDifference, rtol: float, sigmas: float | None) -> bool:
+def _same_number(number: NumberDifference, rtol: float, sigmas: float | None) -> bool:
     """Return whether two results are equal within a relative tolerance or within ``sigmas`` times their sigma.
 
     With ``sigmas``, standard deviations themselves always count as equal.
     """
-    if sigmas is not None and is_sigma(one.key):
+    if sigmas is not None and is_sigma(number.key):
         return True
-    if one.difference is None:  # if both are None, one file lacks the key
-        return one.reference == one.other and one.reference is not None
-    if math.isclose(float(one.reference or 0), float(one.other or 0), rel_tol=rtol):
+    if number.difference is None:  # if both are None, one file lacks the key
+        return number.reference == number.other and number.reference is not None
+    if math.isclose(float(number.reference or 0), float(number.other or 0), rel_tol=rtol):
         return True
-    return sigmas is not None and one.sigma is not None and abs(one.difference) <= sigmas * one.sigma
+    return sigmas is not None and number.sigma is not None and abs(number.difference) <= sigmas * number.sigma
 
 
-def _same_array(one: ArrayDifference, rtol: float) -> bool:
+def _same_array(array: ArrayDifference, rtol: float) -> bool:
     """Return whether two arrays differ by at most ``rtol`` times the largest absolute value of the reference."""
-    return one.finite and (one.largest or 0.0) <= rtol * (one.peak or 0.0)
+    return array.finite and (array.largest or 0.0) <= rtol * (array.peak or 0.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -368,7 +368,7 @@ class Comparison:
     @property
     def same(self) -> bool:
         """True if no result of any run differs from the reference's."""
-        return all(one.same for one in self.diffs)
+        return all(diff.same for diff in self.diffs)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -401,7 +401,7 @@ def numbers(comparison: Comparison) -> Mapping[str, Any]:
                 "same": diff.same,
                 "compared": diff.compared,
                 "inputs": diff.inputs,
-                "numbers": [_plain(one, "scale", "difference", "in_sigma") for one in diff.numbers],
+                "numbers": [_plain(entry, "scale", "difference", "in_sigma") for entry in diff.numbers],
                 "arrays": [_plain(array, "where reference other depth") for array in diff.arrays],
             }
         )
@@ -415,13 +415,13 @@ def numbers(comparison: Comparison) -> Mapping[str, Any]:
     }
 
 
-def _plain(one: NumberDifference | ArrayDifference, without: str, *derived: str) -> dict[str, Any]:
+def _plain(entry: NumberDifference | ArrayDifference, without: str, *derived: str) -> dict[str, Any]:
     """Return the fields of a difference, except ``without``, and its properties ``derived``, as plain data for JSON.
 
     Numbers that are not finite become None.
     """
-    values = {key: value for key, value in vars(one).items() if key not in without.split()}
-    more = {key: getattr(one, key) for key in derived}
+    values = {key: value for key, value in vars(entry).items() if key not in without.split()}
+    more = {key: getattr(entry, key) for key in derived}
     return values | {key: value if value is not None and abs(value) < math.inf else None for key, value in more.items()}
 
 
@@ -442,7 +442,7 @@ def verdict(comparison: Comparison) -> list[str]:
             f"run {name} differs from {comparison.names[0]} in {' and '.join(what)} of {diff.compared} results "
             f"({inputs} changed)"
         )
-        far = max(diff.numbers, key=lambda one: abs(one.in_sigma or 0.0), default=None)
+        far = max(diff.numbers, key=lambda number: abs(number.in_sigma or 0.0), default=None)
         if far is not None and far.in_sigma is not None:
             kind = "from image noise" if far.sigma_of == NOISE else "as stated"
             parts.append(f"the most significant change is {far.key}, {far.in_sigma:+.3g} sigma {kind}")

@@ -230,14 +230,19 @@ def content_difference(name: str, reference: Content, other: Content) -> FileDif
     other : Content
         Content of the second.
     """
-    one, two = reference.numbers, other.numbers
-    scales = _scales(one, two)
+    reference_numbers, other_numbers = reference.numbers, other.numbers
+    scales = _scales(reference_numbers, other_numbers)
     numbers = [
         NumberDifference(
-            name, key, one.get(key), two.get(key), *sigma_of(one, two, key), scales.get(_quantity_kind(key), 0.0)
+            name,
+            key,
+            reference_numbers.get(key),
+            other_numbers.get(key),
+            *sigma_of(reference_numbers, other_numbers, key),
+            scales.get(_quantity_kind(key), 0.0),
         )
-        for key in dict.fromkeys((*one, *two))
-        if not (key in one and key in two and _same(one[key], two[key]))
+        for key in dict.fromkeys((*reference_numbers, *other_numbers))
+        if not (key in reference_numbers and key in other_numbers and _same(reference_numbers[key], other_numbers[key]))
     ]
     pairs = {key: (reference.arrays.get(key), other.arrays.get(key)) for key in (*reference.arrays, *other.arrays)}
     arrays = [off for key, pair in pairs.items() if (off := array_difference(name, key, *pair)) is not None]
@@ -247,7 +252,7 @@ def content_difference(name: str, reference: Content, other: Content) -> FileDif
         for key in dict.fromkeys((*here, *there))
         if here.get(key) != there.get(key)
     ]
-    common = (len(one.keys() & two.keys()), len(reference.arrays.keys() & other.arrays.keys()))
+    common = (len(reference_numbers.keys() & other_numbers.keys()), len(reference.arrays.keys() & other.arrays.keys()))
     return FileDifference(name, tuple(numbers), tuple(arrays), tuple(statements), *common, reference.drawn)
 
 
@@ -269,35 +274,37 @@ def array_difference(file: str, name: str, here: np.ndarray | None, there: np.nd
         first, second = (None if array is None else array.shape for array in (here, there))
         return ArrayDifference(file, name, first, second)
     numeric = all(np.issubdtype(array.dtype, np.number) for array in (here, there))
-    one, two = (array.astype(np.float64 if numeric else str) for array in (here, there))
-    unlike = (one != two) & ~(np.isnan(one) & np.isnan(two)) if numeric else one != two
+    values, other_values = (array.astype(np.float64 if numeric else str) for array in (here, there))
+    unlike = (
+        (values != other_values) & ~(np.isnan(values) & np.isnan(other_values)) if numeric else values != other_values
+    )
     if not unlike.any():
         return None
     share = float(unlike.mean())
     if not numeric:
         where = tuple(int(k) for k in np.argwhere(unlike)[0])
-        here_text, there_text = str(one[where]), str(two[where])
+        here_text, there_text = str(values[where]), str(other_values[where])
         return ArrayDifference(
             file, name, here.shape, there.shape, share=share, where=where, reference=here_text, other=there_text
         )
-    finite = np.isfinite(one) & np.isfinite(two)
-    delta = np.zeros_like(one)
+    finite = np.isfinite(values) & np.isfinite(other_values)
+    delta = np.zeros_like(values)
     with np.errstate(over="ignore"):  # differences of extreme numbers overflow
-        np.subtract(two, one, out=delta, where=finite)
+        np.subtract(other_values, values, out=delta, where=finite)
     largest = float(np.max(np.abs(delta), initial=0.0))
     scale = largest if 1e150 < largest < np.inf else 1.0  # avoids overflow of the squares
     rms = scale * float(np.sqrt(np.mean((delta / scale) ** 2)))
-    peak = float(np.max(np.abs(one), where=np.isfinite(one), initial=0.0))
+    peak = float(np.max(np.abs(values), where=np.isfinite(values), initial=0.0))
     worst = np.where(unlike & ~finite, np.inf, np.abs(delta))
     where = tuple(int(k) for k in np.unravel_index(int(np.argmax(worst)), worst.shape))
     depth = here.dtype.itemsize if here.dtype.kind == "u" else 0
-    far = (one[where].item(), two[where].item())
+    far = (values[where].item(), other_values[where].item())
     return ArrayDifference(file, name, here.shape, there.shape, largest, rms, peak, share, where, *far, depth)
 
 
-def _same_bytes(one: Path, two: Path) -> bool:
+def _same_bytes(path: Path, other: Path) -> bool:
     try:
-        return one.read_bytes() == two.read_bytes()
+        return path.read_bytes() == other.read_bytes()
     except OSError as error:
         raise InputError(Issue(f"cannot be read: {error.strerror}", str(error.filename))) from None
 
@@ -355,11 +362,11 @@ def _quantity_kind(key: str) -> str:
     """
     if key.startswith("row "):
         return key.partition(", ")[2]
-    names = _PLACE.sub("", key).split(".")
+    names = _INDEX.sub("", key).split(".")
     return next((name for name in reversed(names) if name.isidentifier()), key)
 
 
-_PLACE = re.compile(r"\[(?:\[[^\]]*\]|[^\[\]])*\]")
+_INDEX = re.compile(r"\[(?:\[[^\]]*\]|[^\[\]])*\]")
 """Pattern of an index in a key after a list's name: an entry's number in brackets, or the name that identifies it."""
 
 

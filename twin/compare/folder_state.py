@@ -13,7 +13,7 @@ from pathlib import Path
 
 from scenes.yaml.errors import InputError, Issue
 from twin.framework import run_folder
-from twin.framework.owned_files import MANIFEST, PARTIAL, digest, every_file
+from twin.framework.owned_files import MANIFEST, PARTIAL, digest, files_below
 from twin.framework.provenance import Provenance
 from twin.framework.run_folder import Manifest
 
@@ -87,18 +87,18 @@ def folder_state(folder: Path) -> FolderState:
         wrong.append(MANIFEST)
     known = {MANIFEST, *manifest.sha256}
     missing = {name for name in wrong if not os.path.lexists(folder / name)}
-    additional = tuple(name for name in every_file(folder) if name not in known)
+    additional = tuple(name for name in files_below(folder) if name not in known)
     return replace(
         state, changed=tuple(sorted({*wrong} - missing)), missing=tuple(sorted(missing)), additional=additional
     )
 
 
-def _as_read(place: Path, known: str) -> str:
+def _as_read(path: Path, known: str) -> str:
     """Return ``gone`` or ``changed`` for an input file by its checksum ``known``; empty if it is as the run read it."""
-    if not place.is_file():
+    if not path.is_file():
         return "gone"
     try:
-        return "" if digest(place) == known else "changed"
+        return "" if digest(path) == known else "changed"
     except OSError:
         return "changed"
 
@@ -197,4 +197,4 @@ def _machine(where: Provenance) -> dict[str, str]:
 
 def _kernels(where: Provenance) -> dict[str, str]:
     """Return name of each linear-algebra library -> processor type for which the kernels that it used are made."""
-    return {f"{one.name} {one.version}": one.kernels for one in where.blas}
+    return {f"{library.name} {library.version}": library.kernels for library in where.blas}

@@ -184,58 +184,57 @@ def file_state_of(compared: FileDifference, elsewhere: bool = False) -> FileStat
     elsewhere : bool
         Whether the run was repeated on a different processor, which rounds otherwise.
     """
-    quantities = [*(_number(one, elsewhere) for one in compared.numbers)]
+    quantities = [*(_number(entry, elsewhere) for entry in compared.numbers)]
     quantities += [_array(array, compared.drawn, elsewhere) for array in compared.arrays]
     if not quantities:
         quantities = [
-            Quantity(statement.key, _short(statement.reference), _short(statement.other))
-            for statement in compared.statements
+            Quantity(claim.key, _short(claim.reference), _short(claim.other)) for claim in compared.statements
         ]
-    quantities.sort(key=lambda one: (one.rounding, -(math.inf if one.relative is None else one.relative)))
-    state = DIFFERENT if any(not one.rounding for one in quantities) else ROUNDED if quantities else SAME
+    quantities.sort(key=lambda entry: (entry.rounding, -(math.inf if entry.relative is None else entry.relative)))
+    state = DIFFERENT if any(not entry.rounding for entry in quantities) else ROUNDED if quantities else SAME
     return FileState(compared.file, state, tuple(quantities[:MOST_LISTED]), len(quantities))
 
 
-def _number(one: NumberDifference, elsewhere: bool) -> Quantity:
+def _number(number: NumberDifference, elsewhere: bool) -> Quantity:
     """Return the difference of a number or text in two files, with the decision whether it is rounding.
 
     ``elsewhere`` is True if the run was repeated on a different processor.
     """
-    off = None if one.difference is None else abs(one.difference)
+    off = None if number.difference is None else abs(number.difference)
     if off is None or not math.isfinite(off):
-        return Quantity(one.key, _short(one.reference), _short(one.other))
-    in_sigma = off / (one.sigma / math.sqrt(2.0)) if one.sigma else None  # sigma is that of the difference of two
-    size = max(abs(float(one.reference or 0)), abs(float(one.other or 0)), one.scale)
+        return Quantity(number.key, _short(number.reference), _short(number.other))
+    in_sigma = off / (number.sigma / math.sqrt(2.0)) if number.sigma else None  # sigma is that of the difference of two
+    size = max(abs(float(number.reference or 0)), abs(float(number.other or 0)), number.scale)
     relative = off / size if size else 0.0
-    limit = RELATIVE_OF_SIGMAS if difference.is_sigma(one.key) else RELATIVE_ELSEWHERE if elsewhere else RELATIVE
+    limit = RELATIVE_OF_SIGMAS if difference.is_sigma(number.key) else RELATIVE_ELSEWHERE if elsewhere else RELATIVE
     rounding = relative <= limit or (in_sigma is not None and in_sigma <= SIGMA_SHARE)
-    return Quantity(one.key, one.reference, one.other, relative, in_sigma, rounding)
+    return Quantity(number.key, number.reference, number.other, relative, in_sigma, rounding)
 
 
-def _array(one: ArrayDifference, drawn: bool, elsewhere: bool) -> Quantity:
+def _array(array: ArrayDifference, drawn: bool, elsewhere: bool) -> Quantity:
     """Return the largest difference of an array in two files, with the decision whether it is rounding.
 
     ``drawn`` is True for a picture, ``elsewhere`` if the run was repeated on a different processor.
     """
-    name = one.name or "pixels"
-    if one.share is None:
-        shapes = (one.shape, one.other_shape)
+    name = array.name or "pixels"
+    if array.share is None:
+        shapes = (array.shape, array.other_shape)
         old, new = ("none" if s is None else f"shape {' x '.join(map(str, s))}" for s in shapes)
         return Quantity(name, old, new)
-    key = f"{name}[{', '.join(map(str, one.where))}]" if one.where else name
-    if one.largest is None or one.peak is None:
-        return Quantity(key, _short(one.reference), _short(one.other))
-    worst = one.largest if one.finite else math.inf
-    if drawn and one.depth:
-        rounding = worst <= PICTURE_LEVELS * (257 if one.depth == 2 else 1)
-    elif elsewhere and one.depth:
-        rounding = worst <= GREY_LEVELS and one.share <= PIXEL_SHARE
+    key = f"{name}[{', '.join(map(str, array.where))}]" if array.where else name
+    if array.largest is None or array.peak is None:
+        return Quantity(key, _short(array.reference), _short(array.other))
+    worst = array.largest if array.finite else math.inf
+    if drawn and array.depth:
+        rounding = worst <= PICTURE_LEVELS * (257 if array.depth == 2 else 1)
+    elif elsewhere and array.depth:
+        rounding = worst <= GREY_LEVELS and array.share <= PIXEL_SHARE
     else:
         rounding = (
-            worst <= (RELATIVE_OF_GEOMETRY if drawn else RELATIVE_ELSEWHERE if elsewhere else RELATIVE) * one.peak
+            worst <= (RELATIVE_OF_GEOMETRY if drawn else RELATIVE_ELSEWHERE if elsewhere else RELATIVE) * array.peak
         )
-    relative = worst / one.peak if one.peak and one.finite else None
-    return Quantity(key, one.reference, one.other, relative, None, rounding)
+    relative = worst / array.peak if array.peak and array.finite else None
+    return Quantity(key, array.reference, array.other, relative, None, rounding)
 
 
 def _short(value: Any) -> Leaf:
@@ -295,14 +294,14 @@ def obstacle(state: FolderState) -> str:
 
 
 @recomputed()  # a repetition must not reuse results of the run that it checks
-def repeat(state: FolderState, place: Path, quiet: bool) -> Repetition:
+def repeat(state: FolderState, folder: Path, quiet: bool) -> Repetition:
     """Repeat a whole run, and compare every file.
 
     Parameters
     ----------
     state : FolderState
         State of its folder, for which `obstacle` is empty.
-    place : Path
+    folder : Path
         Folder of the repeated run, which must not exist.
     quiet : bool
         Do not print progress.
@@ -314,7 +313,7 @@ def repeat(state: FolderState, place: Path, quiet: bool) -> Repetition:
     """
     manifest, began = state.manifest, time.monotonic()
     arguments = [str(state.folder.resolve() / CONFIG) if word == CONFIG else word for word in manifest.again]
-    started_in = manifest.started_in or str(place.parent)
+    started_in = manifest.started_in or str(folder.parent)
     if not Path(started_in).is_dir():
         raise CannotRepeat(f"the folder in which it was started is missing: {started_in}")
     # -P: never import modules from the folder in which the run was started
@@ -325,7 +324,7 @@ def repeat(state: FolderState, place: Path, quiet: bool) -> Repetition:
         f"{provenance.BEFORE}{arguments[0]}",
         *arguments[1:],
         "--out",
-        str(place.absolute()),
+        str(folder.absolute()),
     ]
     command += ["--quiet"] if quiet and manifest.program != "twin.validate" else []
     root = provenance.ROOT.parent if provenance.BEFORE else provenance.ROOT
@@ -345,7 +344,7 @@ def repeat(state: FolderState, place: Path, quiet: bool) -> Repetition:
             process.send_signal(signal.SIGTERM)
             process.wait()
             raise
-    repetition = run_folder.read_manifest(place)
+    repetition = run_folder.read_manifest(folder)
     if repetition is None:
         text = " ".join((printed or "").split()[-60:])
         raise CannotRepeat(
@@ -353,7 +352,7 @@ def repeat(state: FolderState, place: Path, quiet: bool) -> Repetition:
         )
     where = elsewhere(manifest, repetition.provenance, repetition.versions)
     names = dict.fromkeys((*manifest.sha256, *repetition.sha256))
-    files = [file_state(name, state.folder / name, place / name, bool(where.processor)) for name in names]
+    files = [file_state(name, state.folder / name, folder / name, bool(where.processor)) for name in names]
     return Repetition(tuple(redrawn(files)), where, time.monotonic() - began)
 
 
@@ -487,8 +486,8 @@ class Verification:
         if repetition is None:
             return ["the run was not repeated"]
         compared = [file for file in repetition.files if file.state != EXCLUDED]
-        rounded = [one for one in compared if one.state in (ROUNDED, REDRAWN)]
-        others = [one.file for one in compared if one.state != SAME and one not in rounded]
+        rounded = [comparison for comparison in compared if comparison.state in (ROUNDED, REDRAWN)]
+        others = [comparison.file for comparison in compared if comparison.state != SAME and comparison not in rounded]
         text = {
             SAME: f"has the same numbers in all {len(compared)} files",
             ROUNDED: f"is the same within rounding; {len(rounded)} of {len(compared)} files differ, by at most "
@@ -549,12 +548,12 @@ class Verification:
         state, out = self.state, []
         out += [f"read by the run and changed since: {name}" for name in state.inputs_changed]
         out += [f"read by the run and missing now: {name}" for name in state.inputs_gone]
-        for one in () if self.repetition is None else self.repetition.files:
-            if one.state in (SAME, EXCLUDED):
+        for comparison in () if self.repetition is None else self.repetition.files:
+            if comparison.state in (SAME, EXCLUDED):
                 continue
-            count = f", {one.count} quantities" if one.count else ""
-            out.append(f"{one.file}: {one.state}{count}{f', {one.why}' if one.why else ''}")
-            for quantity in one.quantities[:MOST_PRINTED]:
+            count = f", {comparison.count} quantities" if comparison.count else ""
+            out.append(f"{comparison.file}: {comparison.state}{count}{f', {comparison.why}' if comparison.why else ''}")
+            for quantity in comparison.quantities[:MOST_PRINTED]:
                 size = "" if quantity.relative is None else f", {quantity.relative:.2g} of it"
                 sigma = "" if quantity.in_sigma is None else f", {quantity.in_sigma:.2g} sigma"
                 out.append(f"    {quantity.key}: {quantity.old!r} then, {quantity.new!r} now{size}{sigma}")
@@ -564,6 +563,6 @@ class Verification:
 def _largest(files: Sequence[FileState]) -> str:
     """Return a text with the largest differences of numbers, relative to their size and in sigmas."""
     numbers = [quantity for file in files if not file.drawn for quantity in file.quantities]
-    relative = max((one.relative or 0.0 for one in numbers), default=0.0)
-    in_sigma = max((one.in_sigma or 0.0 for one in numbers), default=0.0)
+    relative = max((number.relative or 0.0 for number in numbers), default=0.0)
+    in_sigma = max((number.in_sigma or 0.0 for number in numbers), default=0.0)
     return f"{relative:.2g} of their value" + (f" and {in_sigma:.2g} sigma" if in_sigma else "")

@@ -12,7 +12,7 @@ from optics.design.design_variables import Prescription
 from optics.design.merit_function import Evaluation, trace_beams
 from optics.design.optimiser import Attempt, Design, rms_error
 from scenes.models.camera_design import prescription_of
-from twin.design.design_run import DESIGN, DesignRun, agreement, verdict
+from twin.design.design_run import DESIGN, DesignRun, difference_text, verdict
 from twin.framework.artefact import CameraFile, SvgFigure, Table
 from twin.framework.report import Report, Section, answer
 from twin.framework.svg import BLUE, GREY, INK, ORANGE, look, new_figure, plain_axes, to_svg
@@ -25,7 +25,7 @@ def design_report(run: DesignRun) -> Report:
     worst = float(after.errors.max())
     head, more = answer(
         *verdict(run).split(". "),
-        agreement(run),
+        difference_text(run),
         f"The worst field of {setup.test.name} has a wavefront error of {worst:.4f} waves rms "
         f"({before.errors.max():.4f} in {setup.camera.name})",
         f"its extent along the axis is {1e3 * after.envelope:.1f} mm ({1e3 * before.envelope:.1f} mm): see "
@@ -156,10 +156,10 @@ def _layout(axes: Axes, design: Design, prescription: Prescription) -> None:
         axes.plot(points[:, middle, ray, 1], points[:, middle, ray, 0], color=colour, lw=0.8)
     for k, name in enumerate(prescription.names):
         y = np.linspace(points[k + 1, ..., 0].min(), points[k + 1, ..., 0].max(), 60)
-        stand = prescription.poses[name]
-        sag = prescription.surfaces[name].sag(0.0, y - stand.y)
-        axes.plot(stand.z + sag, y, color=INK, lw=2.2)
-        axes.annotate(name, (float(stand.z + sag[-1]), float(y[-1])), (4, 4), textcoords="offset points")
+        vertex = prescription.poses[name]
+        sag = prescription.surfaces[name].sag(0.0, y - vertex.y)
+        axes.plot(vertex.z + sag, y, color=INK, lw=2.2)
+        axes.annotate(name, (float(vertex.z + sag[-1]), float(y[-1])), (4, 4), textcoords="offset points")
     axes.set_aspect("equal")
     axes.set_xlabel("z [m]")
     plain_axes(axes)

@@ -193,10 +193,10 @@ START: Record[Attempt] = Record(
     "One start of the search and its result.",
     Quantity("drawn", lambda attempt: attempt.drawn, "true if it was drawn at random"),
     Quantity("steps", lambda attempt: attempt.steps, "steps in which the constraints were brought in"),
-    Quantity("wfe_rms_waves", _known(lambda found: rms_error(found.after)), "rms over the field"),
-    Quantity("wfe_worst_waves", _known(lambda found: found.after.errors.max()), "rms in the worst field"),
+    Quantity("wfe_rms_waves", _known(lambda optimised: rms_error(optimised.after)), "rms over the field"),
+    Quantity("wfe_worst_waves", _known(lambda optimised: optimised.after.errors.max()), "rms in the worst field"),
     Quantity("converged", lambda a: a.design is not None and a.design.converged, "true if the search converged"),
-    Quantity("jacobians", _known(lambda found: found.evaluations), "Jacobians that were traced"),
+    Quantity("jacobians", _known(lambda optimised: optimised.evaluations), "Jacobians that were traced"),
     Quantity("problem", lambda attempt: attempt.problem, "why the constraints cannot be held, empty where they can"),
 )
 
@@ -209,13 +209,15 @@ DESIGN: Record[DesignRun] = Record(
     "design.json: an optimised camera, before and after.",
     Quantity("camera", lambda run: run.setup.test.name, "name of the new camera"),
     Quantity("start", lambda run: run.setup.camera.name, "name of the camera that it was made from"),
-    Quantity("wfe_rms_waves", _pair(lambda one: one.errors), "of every field, rms, without piston and tilt"),
+    Quantity("wfe_rms_waves", _pair(lambda design: design.errors), "of every field, rms, without piston and tilt"),
     Quantity("fields_deg", lambda run: run.best.merit.beams.fields, "the fields, x and y"),
-    Quantity("principal_distance_m", _pair(lambda one: one.principal_distance), "principal distance"),
-    Quantity("envelope_m", _pair(lambda one: one.envelope), "extent along the axis"),
-    Quantity("anamorphism", _pair(lambda one: one.anamorphism), "focal length along the line over that across it"),
+    Quantity("principal_distance_m", _pair(lambda design: design.principal_distance), "principal distance"),
+    Quantity("envelope_m", _pair(lambda design: design.envelope), "extent along the axis"),
+    Quantity(
+        "anamorphism", _pair(lambda design: design.anamorphism), "focal length along the line over that across it"
+    ),
     Quantity("chief_ray_deg", _chief_rays, "angle of the chief ray from the normal of the focal plane, by field"),
-    Quantity("clearance_m", _pair(lambda one: one.clearances), "room between beams and edges, by passage"),
+    Quantity("clearance_m", _pair(lambda design: design.clearances), "room between beams and edges, by passage"),
     Quantity("improved", lambda run: run.best.improved, "whether the new camera is better"),
     Quantity("held_by", lambda run: run.best.active, "active constraints, the most costly first", record=HELD_BY),
     Quantity("jacobians", lambda run: run.best.evaluations, "Jacobians that were traced for the best"),
@@ -226,7 +228,7 @@ DESIGN: Record[DesignRun] = Record(
 )
 
 
-def agreement(run: DesignRun) -> str:
+def difference_text(run: DesignRun) -> str:
     """Return a sentence on whether other starts end at an equally good camera."""
     searched, count = run.searched, len(run.searched.attempts)
     if count == 1:

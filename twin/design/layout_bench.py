@@ -54,14 +54,14 @@ class Seen:
     ----------
     shared : (D, M) ndarray
         Spot shifts, px, due to independent motions, of unit variance, of the bodies that all beams share.
-    own : (D, D) ndarray
+    individual : (D, D) ndarray
         Covariance of the spot shifts, px^2, due to the motions of this beam's own bodies and to image noise.
     parameters : (4 K, M) ndarray
         Changes of the cameras' parameters, rad and m, due to the shared motions; the same for all beams.
     """
 
     shared: np.ndarray
-    own: np.ndarray
+    individual: np.ndarray
     parameters: np.ndarray
 
 
@@ -295,17 +295,17 @@ class LayoutBench:
             True to assume the same noise for spots of one camera with the same beam width; True for images in single
             precision.
         """
-        stated = self.setup.disturbances
+        priors = self.setup.disturbances
         results = information_of(
             instrument,
-            list(stated.values()),
+            list(priors.values()),
             self.detector(beam.area_ccd),
             self.backend,
             ground_of(instrument),
             alike,
             single,
         )
-        return dict(zip(stated, results, strict=True))
+        return dict(zip(priors, results, strict=True))
 
     def _check_limits(self, share: float, mass: float) -> None:
         limits = self.setup.test.limits
@@ -333,7 +333,7 @@ def _reason(error: Exception) -> str:
     return error.issues[0].problem if isinstance(error, InputError) else str(error)
 
 
-def is_own(body: str) -> bool:
+def is_individual(body: str) -> bool:
     """Return True if the path of a body shows that it belongs to one channel: a prism, board or facet."""
     last = body.rpartition("/")[2]
     return any(part.partition("_")[0] in SIDES for part in body.split("/")) or any(
@@ -342,14 +342,14 @@ def is_own(body: str) -> bool:
 
 
 def _seen(information: Information) -> Seen:
-    stated: Disturbances = information.disturbances
-    individual = np.array([is_own(body) for body in stated.bodies])
-    root = stated.root[np.ix_(~individual, ~individual)]
-    individual_shifts = stated.spots[:, individual] @ stated.root[np.ix_(individual, individual)]
+    disturbances: Disturbances = information.disturbances
+    individual = np.array([is_individual(body) for body in disturbances.bodies])
+    root = disturbances.root[np.ix_(~individual, ~individual)]
+    individual_shifts = disturbances.spots[:, individual] @ disturbances.root[np.ix_(individual, individual)]
     return Seen(
-        stated.spots[:, ~individual] @ root,
+        disturbances.spots[:, ~individual] @ root,
         individual_shifts @ individual_shifts.T + information.noise,
-        stated.parameters[:, ~individual] @ root,
+        disturbances.parameters[:, ~individual] @ root,
     )
 
 
@@ -378,26 +378,26 @@ def _facets(instrument: Instrument) -> np.ndarray:
     return np.array(out)
 
 
-def touching(one: BeamFacts, other: BeamFacts) -> bool:
+def touching(beam: BeamFacts, other: BeamFacts) -> bool:
     """Return True if two beams cannot be in the same layout.
 
     Their prisms overlap or block the other's light, or a facet extends over the edge of the other's.
 
     Parameters
     ----------
-    one, other : BeamFacts
+    beam, other : BeamFacts
         Beams that were evaluated alone.
     """
     # as scenes.models.monitor_chain.facet_positions: of two facets in one corner the more tilted one is farther out
-    offset = one.facets - other.facets
+    offset = beam.facets - other.facets
     lean = offset[:, :2]
     distance = np.sum(lean * offset[:, 2:], axis=1) / np.maximum(np.linalg.norm(lean, axis=1), 1e-12)
-    if np.any(distance < max(one.beam.width, other.beam.width)):  # the edge of two facets is half way between them
+    if np.any(distance < max(beam.beam.width, other.beam.width)):  # the edge of two facets is half way between them
         return True
-    for light, planes in ((one.light, other.planes), (other.light, one.planes)):
+    for light, planes in ((beam.light, other.planes), (other.light, beam.planes)):
         if any(blocked_rays(light, faces).any() for faces in planes):
             return True
-    for a in one.bodies:
+    for a in beam.bodies:
         for b in other.bodies:
             gap = np.maximum(a.min(axis=0), b.min(axis=0)) - np.minimum(a.max(axis=0), b.max(axis=0))
             if np.all(gap <= LEAST_GAP) and separation(a, b) < LEAST_GAP:
@@ -420,10 +420,10 @@ def combined(facts: Sequence[BeamFacts], name: str) -> np.ndarray:
     models = [entry.seen[name] for entry in facts]
     shared = np.concatenate([entry.shared for entry in models])
     spread = shared @ shared.T
-    size = len(models[0].own)
+    size = len(models[0].individual)
     for k, entry in enumerate(models):
         rows = slice(size * k, size * (k + 1))
-        spread[rows, rows] += entry.own
+        spread[rows, rows] += entry.individual
     parameters = models[0].parameters
     across = parameters @ shared.T
     return np.asarray(parameters @ parameters.T - across @ np.linalg.solve(spread, across.T))

@@ -127,7 +127,7 @@ def refined(
                 ]
                 layout = _with_room(bench, ask, part, wanted, idle, rng)
             if layout.refused:
-                layout = _one_by_one(bench, ask, part, current, slopes, change)
+                layout = _improved_singly(bench, ask, part, current, slopes, change)
             gained = _largest(current, bench) - _largest(layout, bench)
             if gained > _KEPT * promised:
                 box = min(2.0 * box, 0.5)
@@ -204,7 +204,7 @@ def _with_room(
     return min(feasible, key=lambda facts: _largest(facts, bench), default=LayoutFacts(beams, refused="no room"))
 
 
-def _one_by_one(
+def _improved_singly(
     bench: LayoutBench, ask: Ask, part: str, facts: LayoutFacts, slopes: Sequence[Slope], change: np.ndarray
 ) -> LayoutFacts:
     """Return a layout improved by the single parameter changes of a step, tried in turn, the most promising first."""

@@ -95,7 +95,7 @@ class End:
 
 
 @dataclass(frozen=True, eq=False)
-class Found:
+class SearchResult:
     """Results of a search from all its starts.
 
     Attributes
@@ -157,14 +157,14 @@ def merit(sigmas: Mapping[str, Mapping[str, float]], bench: LayoutBench) -> floa
     return max(ratios(sigmas, bench).values())
 
 
-def optima(found: Found, bench: LayoutBench) -> list[list[End]]:
+def optima(result: SearchResult, bench: LayoutBench) -> list[list[End]]:
     """Return the searches in groups that reached the same optimum, the best group first.
 
     The merits of a group lie within ``ALIKE`` of its best.
 
     Parameters
     ----------
-    found : Found
+    result : Found
         Results from all starts; those without a feasible layout are omitted.
     bench : LayoutBench
         Evaluator of the layouts of the design.
@@ -174,7 +174,7 @@ def optima(found: Found, bench: LayoutBench) -> list[list[End]]:
         return merit(end.layouts[0].sigmas, bench)
 
     groups: list[list[End]] = []
-    for end in sorted((end for end in found.ends if end.layouts), key=least):
+    for end in sorted((end for end in result.ends if end.layouts), key=least):
         if groups and least(end) <= (1.0 + ALIKE) * least(groups[-1][0]):
             groups[-1].append(end)
         else:
@@ -311,18 +311,18 @@ class Search:
         store = journal_of(journal, f"{seed}\n{bench.setup.to_yaml()}")
         self.workers = Workers(bench, workers, store, advance)
 
-    def run(self) -> Found:
+    def run(self) -> SearchResult:
         """Run the searches from the instrument and from random beams, and return their results."""
         begun, setup = time.monotonic(), self.bench.setup
         beams = start_beams(setup)
         start = self.bench.judged(beams, self.bench.start, limited=False)
         with self.workers as workers:
-            ends = [_OneSearch(self.bench, workers.ask, self._rng(0), "").run(beams)]
+            ends = [_SingleSearch(self.bench, workers.ask, self._rng(0), "").run(beams)]
             for number in range(1, setup.test.search.starts + 1):
                 name = f"start {number}"
-                ends.append(_OneSearch(self.bench, workers.ask, self._rng(number), name).run(()))
+                ends.append(_SingleSearch(self.bench, workers.ask, self._rng(number), name).run(()))
         layouts = sorted((f for end in ends for f in end.layouts), key=lambda layout: merit(layout.sigmas, self.bench))
-        return Found(start, tuple(layouts), tuple(ends), time.monotonic() - begun)
+        return SearchResult(start, tuple(layouts), tuple(ends), time.monotonic() - begun)
 
     def _rng(self, number: int) -> np.random.Generator:
         return np.random.default_rng(np.random.SeedSequence([self.seed, number]))
@@ -349,7 +349,7 @@ def spread(level: Sequence[Candidate], width: int) -> list[Candidate]:
     return [*best, *(rest[k * len(rest) // count] for k in range(count))]
 
 
-class _OneSearch:
+class _SingleSearch:
     """Search for layouts from one set of beams.
 
     Parameters
@@ -455,8 +455,8 @@ class _OneSearch:
             [candidate for candidate in level if candidate.beams not in self.built][:count]
             for level in reversed(self._ranked())
         ]
-        turns = [candidate for group in zip_longest(*by_size) for candidate in group if candidate is not None]
-        return turns[:count]
+        alternating = [candidate for group in zip_longest(*by_size) for candidate in group if candidate is not None]
+        return alternating[:count]
 
     def _ranked(self) -> list[list[Candidate]]:
         """Return layouts of one beam, of two, and so on, in each case the most promising first.
@@ -480,7 +480,7 @@ class _OneSearch:
             feasible = (
                 candidate
                 for candidate in promising
-                if candidate.beams in self.built or self._may_stand(candidate.beams)
+                if candidate.beams in self.built or self._is_possible(candidate.beams)
             )
             level = [*islice(feasible, width + len(self.built))]
             levels.append(level)
@@ -501,7 +501,7 @@ class _OneSearch:
             self.compared[beams] = worst
         return Candidate(beams, self.compared[beams])
 
-    def _may_stand(self, beams: Sequence[int]) -> bool:
+    def _is_possible(self, beams: Sequence[int]) -> bool:
         return self._within(beams) and self._fits(beams)
 
     def _alike(self, beams: Sequence[int]) -> bool:

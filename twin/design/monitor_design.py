@@ -19,7 +19,7 @@ from scenes.specs.instrument import InstrumentSpec, channel_of, prism_of
 from scenes.specs.job import JobSpec
 from scenes.specs.resolved import ResolvedJob
 from twin.design.layout_bench import LayoutBench, LayoutFacts
-from twin.design.layout_search import Found, Search, merit, optima
+from twin.design.layout_search import Search, SearchResult, merit, optima
 from twin.framework.procedure import Advance, BenchError, silent
 from twin.framework.record import Quantity, Record
 from twin.monitor.monitor_experiment import MonitorExperiment
@@ -75,7 +75,7 @@ class MonitorDesignRun:
 
     setup: monitor_layout.MonitorDesignSetup
     bench: LayoutBench
-    results: Found
+    results: SearchResult
     points: tuple[Point, ...]
 
     def worst(self, facts: LayoutFacts, goal: str) -> float:
@@ -316,25 +316,25 @@ class _Part:
 
 LAYOUT: Record[_Part] = Record(
     "Posterior standard deviations of a layout, and its costs.",
-    Quantity("beams", lambda one: one.of.beams, "beams at every end of a line", record=BEAM),
-    Quantity("merit", lambda one: one.run.merit(one.of), "largest ratio of a standard deviation to its goal"),
-    Quantity("sigma", lambda one: _sigmas(one.of.sigmas), "by disturbances and quantity"),
-    Quantity("sigma_unmeasured", lambda one: _sigmas(one.of.before), "without any measurement"),
-    Quantity("by_cause", lambda one: _causes(one.of.shares), "standard deviations by cause; their squares add up"),
-    Quantity("by_cause_unmeasured", lambda one: _causes(one.of.shares_before), "without any measurement"),
-    Quantity("pupil_share", lambda one: one.of.pupil_share, "share of the imaging pupil that the prisms block"),
-    Quantity("mass_kg", lambda one: one.of.mass, "of the prisms"),
-    Quantity("glass_path_mm", lambda one: one.of.glass_path, "longest path of a beam in glass, one way"),
-    Quantity("spot_px_sigma", lambda one: one.of.spot_sigma, "largest prior standard deviation of a spot position"),
+    Quantity("beams", lambda part: part.of.beams, "beams at every end of a line", record=BEAM),
+    Quantity("merit", lambda part: part.run.merit(part.of), "largest ratio of a standard deviation to its goal"),
+    Quantity("sigma", lambda part: _sigmas(part.of.sigmas), "by disturbances and quantity"),
+    Quantity("sigma_unmeasured", lambda part: _sigmas(part.of.before), "without any measurement"),
+    Quantity("by_cause", lambda part: _causes(part.of.shares), "standard deviations by cause; their squares add up"),
+    Quantity("by_cause_unmeasured", lambda part: _causes(part.of.shares_before), "without any measurement"),
+    Quantity("pupil_share", lambda part: part.of.pupil_share, "share of the imaging pupil that the prisms block"),
+    Quantity("mass_kg", lambda part: part.of.mass, "of the prisms"),
+    Quantity("glass_path_mm", lambda part: part.of.glass_path, "longest path of a beam in glass, one way"),
+    Quantity("spot_px_sigma", lambda part: part.of.spot_sigma, "largest prior standard deviation of a spot position"),
 )
-SEARCH: Record[Found] = Record(
+SEARCH: Record[SearchResult] = Record(
     "Extent of the search.",
-    Quantity("beams_tried", lambda found: found.beams, "beams that were evaluated alone"),
-    Quantity("beams_feasible", lambda found: found.feasible, "feasible ones of these"),
-    Quantity("layouts_compared", lambda found: found.compared, "combinations whose merit was computed"),
-    Quantity("layouts_built", lambda found: found.built, "those of these that were built as a whole"),
-    Quantity("layouts_feasible", lambda found: len(found.layouts), "feasible ones of these"),
-    Quantity("refused", lambda found: found.refused, "reasons why others are not feasible, with their numbers"),
+    Quantity("beams_tried", lambda search: search.beams, "beams that were evaluated alone"),
+    Quantity("beams_feasible", lambda search: search.feasible, "feasible ones of these"),
+    Quantity("layouts_compared", lambda search: search.compared, "combinations whose merit was computed"),
+    Quantity("layouts_built", lambda search: search.built, "those of these that were built as a whole"),
+    Quantity("layouts_feasible", lambda search: len(search.layouts), "feasible ones of these"),
+    Quantity("refused", lambda search: search.refused, "reasons why others are not feasible, with their numbers"),
 )
 
 

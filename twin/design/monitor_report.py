@@ -44,8 +44,8 @@ def monitor_design_report(run: MonitorDesignRun) -> Report:
         decimals_for(min(run.worst(f, g) for _, f in _named(run)) / UNITS[g][1], 3) for g in test.goal.wanted
     ]
     decimals = (None, None, *goal_decimals, 2, 1, 1, 2, 1)
-    stated = ", ".join(setup.disturbances)
-    caption = f"One standard deviation, the worst over cameras and disturbances ({stated})."
+    priors = ", ".join(setup.disturbances)
+    caption = f"One standard deviation, the worst over cameras and disturbances ({priors})."
     summary = Table("layouts", "The start and the layouts on the front", caption, heads, rows, decimals)
     best = run.points[0]
     with look("layouts"):
@@ -66,7 +66,7 @@ def monitor_design_report(run: MonitorDesignRun) -> Report:
             ),
         ),
     )
-    facts = (("start", start), ("disturbances", stated), ("best", best.name))
+    facts = (("start", start), ("disturbances", priors), ("best", best.name))
     lead = (f"The instrument of the best layout is artefacts/{best.name.lower()}.yaml.",)
     title = f"Layout of {test.name}"
     head, more = answer(*verdict(run))

@@ -37,7 +37,7 @@ Card = tuple[str, str | int | float, str]
 _SCALE, _TIE, _KEYS = 33550, 33922, 34735
 _GEODETIC_3D = 4979
 _CHECKED = "of the file as it was written"
-_PLACES = (
+_COORDINATE_KEYS = (
     "Row 0 is the first row stored (NAXIS2 = 1), column 0 the first pixel of",
     "a row; (0, 0) is the centre of the first pixel. No world coordinates.",
 )
@@ -53,7 +53,7 @@ class RecordedFrames:
         Grey values as recorded.
     pages : tuple[Mapping[str, Any], ...]
         Metadata of each page (``FrameFacts.page``).
-    place : tuple[float, float, float, float] or None
+    georeference : tuple[float, float, float, float] or None
         For a map, (longitude, latitude, per column, per row) of its first pixel's centre in degrees; else None.
     heights : bool
         Whether the values are heights in metres.
@@ -61,7 +61,7 @@ class RecordedFrames:
 
     frames: np.ndarray
     pages: tuple[Mapping[str, Any], ...]
-    place: tuple[float, float, float, float] | None = None
+    georeference: tuple[float, float, float, float] | None = None
     heights: bool = False
 
 
@@ -85,8 +85,8 @@ def read_frames(path: Path) -> RecordedFrames:
         return RecordedFrames(frames, pages)
     across, down, _ = tags[_SCALE]
     _, _, _, longitude, latitude, _ = tags[_TIE]
-    place = (longitude + 0.5 * across, latitude - 0.5 * down, across, -down)
-    return RecordedFrames(frames, pages, place, tags[_KEYS][-1] == _GEODETIC_3D)
+    georeference = (longitude + 0.5 * across, latitude - 0.5 * down, across, -down)
+    return RecordedFrames(frames, pages, georeference, tags[_KEYS][-1] == _GEODETIC_3D)
 
 
 def run_cards(program: str, seed: int) -> list[Card]:
@@ -136,7 +136,7 @@ def frames_fits(recorded: RecordedFrames, cards: Iterable[Card]) -> bytes:
     header: list[Card] = []
     if recorded.heights:
         header.append(("BUNIT", "m", "values are heights above the ellipsoid"))
-    elif recorded.place is None:
+    elif recorded.georeference is None:
         header.append(("BUNIT", "adu", "values are grey values (DN)"))
     header += [
         ("NFRAMES", len(recorded.frames), "frames in this file, along axis 3"),
@@ -153,8 +153,8 @@ def frames_fits(recorded: RecordedFrames, cards: Iterable[Card]) -> bytes:
         header.append(("YPIXSZ", first["pitch_um"], "[um] pixel pitch along a column"))
     if "exposure_s" in first:
         header.append(("EXPTIME", first["exposure_s"], "[s] exposure of each frame"))
-    if recorded.place is not None:
-        longitude, latitude, across, down = recorded.place
+    if recorded.georeference is not None:
+        longitude, latitude, across, down = recorded.georeference
         header += [
             ("LON0", longitude, "[deg] longitude of the first pixel's centre"),
             ("LAT0", latitude, "[deg] latitude of the first pixel's centre"),
@@ -235,7 +235,7 @@ def _put_cards(unit: Any, cards: Sequence[Card]) -> None:
     for keyword, value, about in cards:
         unit.header[keyword] = (value, about)
     if unit.data is not None:
-        for line in _PLACES:
+        for line in _COORDINATE_KEYS:
             unit.header.add_comment(line)
 
 
@@ -316,7 +316,7 @@ class Exported:
     def numbers(self) -> dict[str, Any]:
         """Return the contents of files.json: the files written, with their columns and sources."""
         tables = {
-            table.name: {one.name: {"unit": one.unit, "description": one.description} for one in table.columns}
+            table.name: {entry.name: {"unit": entry.unit, "description": entry.description} for entry in table.columns}
             for table in self.described
         }
         return {
@@ -324,7 +324,7 @@ class Exported:
             "of": self.manifest.kind,
             "frames": self.frames,
             "tables": self.tables,
-            "files": [vars(one) for one in self.files],
+            "files": [vars(entry) for entry in self.files],
             "columns": tables,
         }
 
@@ -389,7 +389,7 @@ def export(source: Path, manifest: Manifest, frames: str, tables: str, folder: R
 
 
 @contextmanager
-def _reading_errors(place: Path) -> Iterator[None]:
+def _reading_errors(path: Path) -> Iterator[None]:
     """Raise InputError for any failure to read a file of a run folder."""
     try:
         yield
@@ -398,7 +398,7 @@ def _reading_errors(place: Path) -> Iterator[None]:
     # Readers of corrupted files fail with arbitrary exceptions.
     except Exception as error:
         problem = f"cannot be read as a file of a run: {why_unreadable(error)}"
-        raise InputError(Issue(problem, str(place), allowed="the file as the run wrote it")) from None
+        raise InputError(Issue(problem, str(path), allowed="the file as the run wrote it")) from None
 
 
 def _put(folder: RunFolder, file: str, content: bytes, source: str, what: str, items: int) -> ExportedFile:

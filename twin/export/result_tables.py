@@ -262,7 +262,7 @@ def _column(name: str, values: Sequence[Any], named: Mapping[str, str] = FrozenM
     if stem in named:
         return DataColumn.of(stem, values, unit, named[stem])
     listed = (*parameters.CAMERA_PARAMETERS.values(), parameters.ANGLE, *parameters.GROUND)
-    known = {**DESCRIPTIONS, **{one.key: (one.file_unit, one.meaning) for one in listed}}
+    known = {**DESCRIPTIONS, **{quantity.key: (quantity.file_unit, quantity.meaning) for quantity in listed}}
     if stem in known and not unit:
         return DataColumn.of(stem, values, *known[stem])
     for ending, text in _SIGMAS.items():

@@ -375,11 +375,11 @@ class Table(Artefact):
 
     def shown(self) -> list[list[Cell]]:
         """Return the rows as the report shows them: numbers as text with the decimals of their columns."""
-        places = [*self.decimals, *[None] * (len(self.heads) - len(self.decimals))]
+        decimals_by_column = [*self.decimals, *[None] * (len(self.heads) - len(self.decimals))]
         return [
             [
-                self._text(cell, place) if isinstance(cell, float) else cell
-                for cell, place in zip(row, places, strict=True)
+                self._text(cell, decimals) if isinstance(cell, float) else cell
+                for cell, decimals in zip(row, decimals_by_column, strict=True)
             ]
             for row in self.rows
         ]
@@ -401,10 +401,10 @@ class Table(Artefact):
         columns = [[row[k] for row in self.rows] for k in range(len(self.heads))]
         return [all(isinstance(cell, str) and _is_word(cell) for cell in column) for column in columns]
 
-    def _text(self, value: float, place: int | None) -> str:
+    def _text(self, value: float, decimals: int | None) -> str:
         if isinstance(value, DecimalNumber):
             return fixed(value, value.decimals)
-        return significant(value, self.digits, floor=0.0) if place is None else fixed(value, place)
+        return significant(value, self.digits, floor=0.0) if decimals is None else fixed(value, decimals)
 
     def content(self) -> bytes:
         """Return the table as CSV with all digits."""

@@ -289,14 +289,16 @@ of life.
 
 
 @contextmanager
-def heartbeat(console: Console, says: Callable[[], str], silent: bool, seconds: float | None = None) -> Iterator[None]:
+def heartbeat(
+    console: Console, status: Callable[[], str], silent: bool, seconds: float | None = None
+) -> Iterator[None]:
     """Print a progress line at regular intervals inside the block, unless a terminal shows the progress.
 
     Parameters
     ----------
     console : Console
         Console for the lines; if it is a terminal, nothing is printed, since it shows the progress itself.
-    says : callable
+    status : callable
         Returns the text of a line.
     silent : bool
         True to print nothing.
@@ -310,7 +312,7 @@ def heartbeat(console: Console, says: Callable[[], str], silent: bool, seconds: 
 
     def beat() -> None:
         while not ended.wait(pause):
-            console.print(f"progress: {says()}", markup=False, highlight=False, soft_wrap=True)
+            console.print(f"progress: {status()}", markup=False, highlight=False, soft_wrap=True)
 
     thread = threading.Thread(target=beat, daemon=True)
     thread.start()

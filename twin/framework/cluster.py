@@ -147,7 +147,11 @@ class Workers:
             finished = [self.next_finished()]
             while not self._finished.empty():
                 finished.append(self._finished.get())
-            if done := [running.pop(one.key) for one in finished if one.key in running and one.status != "cancelled"]:
+            if done := [
+                running.pop(completed.key)
+                for completed in finished
+                if completed.key in running and completed.status != "cancelled"
+            ]:
                 yield done
 
 

@@ -78,14 +78,14 @@ def finished(session: Session, kind: str, report: Report, numbers: Mapping[str, 
     )
 
 
-Given = TypeVar("Given")
+Setup = TypeVar("Setup")
 
 
 def run_command(
     stem: str,
     options: cli.Options,
-    resolve: Callable[[], Given],
-    work: Callable[[Given, Session], Result],
+    resolve: Callable[[], Setup],
+    work: Callable[[Setup, Session], Result],
     storage: KeptWork | None = None,
 ) -> None:
     """Read the input, compute in a run folder and print the result.
@@ -154,20 +154,20 @@ def progress_shown(errors: Console, silent: bool) -> Iterator[Advance]:
     silent : bool
         True to show nothing.
     """
-    state, hidden = cli.WorkProgress(), silent or not errors.is_terminal
+    state, disabled = cli.WorkProgress(), silent or not errors.is_terminal
 
-    def say(text: str) -> None:
+    def print_line(text: str) -> None:
         if not silent:
             errors.print(text, markup=False, highlight=False, soft_wrap=True)
 
     with (
-        Progress(*cli.progress_columns(28), console=errors, disable=hidden, transient=True) as bar,
+        Progress(*cli.progress_columns(28), console=errors, disable=disabled, transient=True) as bar,
         cli.heartbeat(errors, state.__str__, silent),
     ):
-        yield _advance(bar, state, say)
+        yield _advance(bar, state, print_line)
 
 
-def _advance(bar: Progress, state: cli.WorkProgress, say: Callable[[str], None]) -> Advance:
+def _advance(bar: Progress, state: cli.WorkProgress, print_line: Callable[[str], None]) -> Advance:
     """Return a progress function (``Advance``) that shows every part of the work as a bar in the terminal."""
     parts: dict[str, TaskID] = {}
     long: set[str] = set()
@@ -179,7 +179,7 @@ def _advance(bar: Progress, state: cli.WorkProgress, say: Callable[[str], None])
         state.advance(part, done, total)
         if part not in long and state.long:
             long.add(part)
-            say(f"note: {part}: about {cli.time_text(state.left)} left")
+            print_line(f"note: {part}: about {cli.time_text(state.left)} left")
 
     return advance
 

@@ -93,8 +93,8 @@ def _application() -> typer.Typer:
         if asked:
             from importlib.metadata import version
 
-            place = Path(__file__).resolve().parents[2]
-            sys.stdout.write(f"camtwin {version('space-camera-twin')} from {place}\n")
+            folder = Path(__file__).resolve().parents[2]
+            sys.stdout.write(f"camtwin {version('space-camera-twin')} from {folder}\n")
             raise typer.Exit
 
     @app.callback()

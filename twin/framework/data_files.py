@@ -211,7 +211,7 @@ def _harmless(cell: Any) -> Any:
     return f"'{cell}" if isinstance(cell, str) and _FORMULA.match(cell) and not _NUMBER.fullmatch(cell) else cell
 
 
-SPOT_STRETCH = 30.0
+SPOT_STEEPNESS = 30.0
 """Steepness of the asinh grey scale (dimensionless) that shows faint diffraction rings beside a spot's core."""
 
 ENLARGE = 4
@@ -354,7 +354,7 @@ formats are added here.
 
 
 def frame_files(
-    name: str, frames: np.ndarray, facts: FrameFacts, stretch: float | None = SPOT_STRETCH
+    name: str, frames: np.ndarray, facts: FrameFacts, steepness: float | None = SPOT_STEEPNESS
 ) -> Iterator[tuple[str, bytes | memoryview]]:
     """Yield path and content of the files that a run folder stores of recorded frames: all formats, and a picture.
 
@@ -366,31 +366,31 @@ def frame_files(
         Recorded grey values of N frames of H rows and W columns.
     facts : FrameFacts
         Description of the frames.
-    stretch : float | None
+    steepness : float | None
         Steepness of the picture's grey scale, see ``preview``.
     """
     for ending, contents in FRAME_FORMATS.items():
         yield f"images/{name}.{ending}", contents(frames, facts)
-    yield f"images/{name}.png", preview_png(frames, stretch)
+    yield f"images/{name}.png", preview_png(frames, steepness)
 
 
-def preview(frames: np.ndarray, stretch: float | None = SPOT_STRETCH) -> np.ndarray:
+def preview(frames: np.ndarray, steepness: float | None = SPOT_STEEPNESS) -> np.ndarray:
     """Return a magnified 8-bit picture of the mean of N frames of H rows and W columns, (N, H, W).
 
-    ``stretch`` is the steepness of an asinh grey scale; None gives a linear one.
+    ``steepness`` is the steepness of an asinh grey scale; None gives a linear one.
     """
     mean = mean_of(frames) if in_file(frames) else frames.mean(axis=0)
-    low, high = (np.percentile(mean, 5) if stretch else mean.min()), mean.max()
+    low, high = (np.percentile(mean, 5) if steepness else mean.min()), mean.max()
     level = np.clip((mean - low) / max(high - low, 1.0), 0.0, 1.0)
-    if stretch:
-        level = np.arcsinh(stretch * level) / np.arcsinh(stretch)
+    if steepness:
+        level = np.arcsinh(steepness * level) / np.arcsinh(steepness)
     factor = ENLARGE if max(mean.shape) < LARGEST_ENLARGED else 1
     return np.kron(np.uint8(np.rint(255.0 * level)), np.ones((factor, factor), np.uint8))
 
 
-def preview_png(frames: np.ndarray, stretch: float | None = SPOT_STRETCH) -> bytes:
+def preview_png(frames: np.ndarray, steepness: float | None = SPOT_STEEPNESS) -> bytes:
     """Return a magnified 8-bit picture of the mean of frames (N, H, W), as the bytes of a PNG file."""
-    return bytes(cv2.imencode(".png", preview(frames, stretch))[1].tobytes())
+    return bytes(cv2.imencode(".png", preview(frames, steepness))[1].tobytes())
 
 
 FITS_UNITS: Mapping[str, str] = FrozenMap(

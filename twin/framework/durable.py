@@ -117,12 +117,12 @@ def write_all_safely(files: Iterable[tuple[Path, bytes]]) -> None:
     """
     pending = list(files)
     with ThreadPoolExecutor(AT_ONCE) as pool:
-        list(pool.map(_write_one, pending))
+        list(pool.map(_write_file, pending))
     for folder in {path.parent for path, _ in pending}:
         sync_folder(folder)
 
 
-def _write_one(file: tuple[Path, bytes]) -> None:
+def _write_file(file: tuple[Path, bytes]) -> None:
     """Write one file through to the disk under a temporary name and rename it."""
     path, content = file
     partial = path.with_name(f".{path.name}.{secrets.token_hex(4)}{PARTIAL}")
@@ -162,7 +162,7 @@ def exchange(first: Path, second: Path) -> bool:
     raise OSError(number, os.strerror(number), str(second))
 
 
-def put_in_place(new: Path, target: Path, aside: Path) -> None:
+def replace_folder(new: Path, target: Path, aside: Path) -> None:
     """Replace a folder by another and move the former aside; ``new`` must already be written through.
 
     A program that is killed meanwhile leaves the target either old or new. Only where folders cannot be exchanged

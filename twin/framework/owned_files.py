@@ -40,7 +40,7 @@ def first_names(names: Sequence[str], most: int = NAMED) -> str:
     return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")
 
 
-def every_file(folder: Path) -> list[str]:
+def files_below(folder: Path) -> list[str]:
     """Return the sorted paths, relative to a folder, of everything below it that is not a folder."""
     out = []
     for folder_path, folders, files in os.walk(folder):
@@ -68,7 +68,7 @@ def changed_or_added_files(folder: Path, listed: Mapping[str, str]) -> list[str]
     def ours(name: str) -> bool:
         return name == MANIFEST or (name in listed and is_as_written(folder / name, {listed[name]}))
 
-    return [name for name in every_file(folder) if not ours(name)]
+    return [name for name in files_below(folder) if not ours(name)]
 
 
 def is_as_written(path: Path, checksums: Collection[str]) -> bool:
@@ -92,7 +92,7 @@ def remove_files(folder: Path, kept: set[str]) -> None:
     kept : set of str
         Paths, relative to the folder, of files that stay.
     """
-    names = [name for name in every_file(folder) if name not in kept]
+    names = [name for name in files_below(folder) if name not in kept]
     for name in sorted(names, key=lambda name: (name == MANIFEST, name)):
         (folder / name).unlink(missing_ok=True)
     for subfolder, _, _ in os.walk(folder, topdown=False):
@@ -184,7 +184,7 @@ def sweep(folder: Path, replaced: Callable[[Path, Path], bool] = lambda former, 
     for name, token in sorted(names):
         paths = _beside(folder / name, token)
         with suppress(OSError):  # without permission to remove it, it stays
-            if any(place.lstat().st_uid != os.getuid() for place in paths.values() if os.path.lexists(place)):
+            if any(existing.lstat().st_uid != os.getuid() for existing in paths.values() if os.path.lexists(existing)):
                 continue
             if (lock := locked(paths[LOCK], certain=True)) is not None:
                 try:

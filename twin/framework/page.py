@@ -272,7 +272,7 @@ def write_test(
         folder.write_bytes(name, whole)
     for name, frames in report.images.items():
         for file, content in data_files.frame_files(
-            name, frames, report.image_facts.get(name, data_files.FrameFacts()), stretch=None
+            name, frames, report.image_facts.get(name, data_files.FrameFacts()), steepness=None
         ):
             folder.write_bytes(file, content)
     folder.write_text("report.html", render_report(kind, report, facts))

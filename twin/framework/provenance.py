@@ -103,12 +103,12 @@ def _program_files(endings: tuple[str, ...]) -> dict[str, str]:
 
     Packages of other distributions that extend tables are included; paths are relative to the parent of each package.
     """
-    found = {}
-    for place in (*(ROOT / package for package in SOURCES), *_extensions()):
-        for path in sorted(place.rglob("*")) if place.is_dir() else (place,):
+    checksums = {}
+    for source in (*(ROOT / package for package in SOURCES), *_extensions()):
+        for path in sorted(source.rglob("*")) if source.is_dir() else (source,):
             if path.suffix in endings and path.is_file():
-                found[path.relative_to(place.parent).as_posix()] = _checksum(path)
-    return found
+                checksums[path.relative_to(source.parent).as_posix()] = _checksum(path)
+    return checksums
 
 
 def _extensions() -> Iterator[Path]:
@@ -224,9 +224,12 @@ class Provenance(BaseModel):
     @classmethod
     def here(cls) -> Provenance:
         """Return the provenance of computations in this process."""
-        loaded = [one for one in threadpool_info() if one["user_api"] == "blas"]
-        told = [(one["internal_api"], str(one["version"]), str(one.get("architecture", "")), one) for one in loaded]
-        found = [Blas(name=a, version=b, kernels=c, threads=one["num_threads"]) for a, b, c, one in told]
+        loaded = [library for library in threadpool_info() if library["user_api"] == "blas"]
+        libraries = [
+            (library["internal_api"], str(library["version"]), str(library.get("architecture", "")), library)
+            for library in loaded
+        ]
+        blas = [Blas(name=a, version=b, kernels=c, threads=library["num_threads"]) for a, b, c, library in libraries]
         return cls(
             source=program_digest(),
             system=f"{platform.system()} {platform.release()}",
@@ -234,7 +237,7 @@ class Provenance(BaseModel):
             processor=_processor(),
             cores=cores(),
             simd=_simd(),
-            blas=sorted(found, key=lambda one: (one.name, one.version)),
+            blas=sorted(blas, key=lambda library: (library.name, library.version)),
             settings={name: os.environ[name] for name in SETTINGS if name in os.environ},
             packages=other_packages(),
         )
@@ -382,14 +385,14 @@ MOST_FILES = 10_000
 """Largest number of files recorded for a folder that is an input."""
 
 
-def _files(place: Path) -> Iterable[Path]:
+def _files(source: Path) -> Iterable[Path]:
     """Return the file at a path, or all files of the folder there."""
     try:
-        if place.is_file():
-            return (place,)
-        if place.is_dir():
-            found = (path for path in sorted(place.rglob("*")) if path.is_file())
-            return [path for path, _ in zip(found, range(MOST_FILES), strict=False)]
+        if source.is_file():
+            return (source,)
+        if source.is_dir():
+            files = (path for path in sorted(source.rglob("*")) if path.is_file())
+            return [path for path, _ in zip(files, range(MOST_FILES), strict=False)]
     except (OSError, ValueError):  # the text only looks like a path
         pass
     return ()

@@ -376,7 +376,7 @@ def plain_data(value: Any) -> Any:
     if isinstance(value, float | np.floating):
         return float(value)
     if is_dataclass(value) and not isinstance(value, type):
-        return {one.name: plain_data(getattr(value, one.name)) for one in fields(value)}
+        return {attribute.name: plain_data(getattr(value, attribute.name)) for attribute in fields(value)}
     if isinstance(value, Mapping):
         if other := [key for key in value if not isinstance(key, str)]:
             raise TypeError(f"a key must be a text: {other[0]!r}")

@@ -21,11 +21,11 @@ from scenes.specs.procedures import PROCEDURES
 _FIRST = 2
 """Version of the keys of a test that defines its reference frames itself (not in reference_frames.json)."""
 _READ = json.loads((files(__package__) / "reference_frames.json").read_text("utf-8"))
-_VERSIONS: Mapping[str, int] = FrozenMap({kind: said["version"] for kind, said in _READ["files"].items()})
+_VERSIONS: Mapping[str, int] = FrozenMap({kind: content["version"] for kind, content in _READ["files"].items()})
 FRAMES: Mapping[str, Mapping[str, str]] = FrozenMap(
     {
-        kind: {quantity: text.format_map(_READ["phrases"]) for quantity, text in said["frames"].items()}
-        for kind, said in _READ["files"].items()
+        kind: {quantity: text.format_map(_READ["phrases"]) for quantity, text in content["frames"].items()}
+        for kind, content in _READ["files"].items()
     }
 )
 """Description of the reference frame of each quantity, by kind of file and quantity."""

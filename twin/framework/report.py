@@ -48,12 +48,12 @@ MOST_SENTENCES = 2
 """Largest number of sentences in a verdict; further findings go into the lead."""
 
 
-def sentence(statement: str) -> str:
+def sentence(clause: str) -> str:
     """Return a statement as a sentence with a full stop, typographic minus signs and, where suitable, a capital.
 
     Only a first word of lower-case letters gets a capital; a path or a symbol stays as it is.
     """
-    text = typeset(statement.strip().rstrip("."))
+    text = typeset(clause.strip().rstrip("."))
     return f"{text[:1].upper() + text[1:] if re.match(r'[a-z]+[ ,:;]', text) else text}."
 
 
@@ -65,7 +65,7 @@ def answer(*statements: str) -> tuple[str, tuple[str, ...]]:
     statements : str
         Statements with or without full stop, the most important first; empty ones are omitted.
     """
-    sentences = [sentence(statement) for statement in statements if statement.strip()]
+    sentences = [sentence(clause) for clause in statements if clause.strip()]
     return " ".join(sentences[:MOST_SENTENCES]), tuple(sentences[MOST_SENTENCES:])
 
 

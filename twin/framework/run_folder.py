@@ -18,7 +18,7 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 
 from scenes.yaml.errors import InputError, Issue
 from twin.framework import owned_files
-from twin.framework.durable import PARTIAL_NAME, ending_later, make_folders, put_in_place, sync_folder, sync_tree
+from twin.framework.durable import PARTIAL_NAME, ending_later, make_folders, replace_folder, sync_folder, sync_tree
 from twin.framework.owned_files import MANIFEST
 from twin.framework.provenance import Checksum, Provenance, versions
 
@@ -169,7 +169,7 @@ class RunFolder:
         with ending_later():
             if self.force and self.target.exists():
                 old = self._unfinished.path(owned_files.OLD)
-                put_in_place(self.path, self.target, old)
+                replace_folder(self.path, self.target, old)
                 with suppress(OSError):  # the next run in this folder tries again
                     remove_run(old, self.target)
             else:
@@ -199,11 +199,11 @@ class RunFolder:
 
     def write_text(self, name: str, text: str) -> None:
         """Write a UTF-8 text file."""
-        self._place(name).write_text(text, encoding="utf-8")
+        self._path_of(name).write_text(text, encoding="utf-8")
 
     def write_bytes(self, name: str, content: bytes | memoryview) -> None:
         """Write a binary file; contents that are in a file themselves are copied in parts."""
-        path = self._place(name)
+        path = self._path_of(name)
         if not isinstance(content, memoryview):
             path.write_bytes(content)
             return
@@ -227,9 +227,9 @@ class RunFolder:
         writer : callable
             Function that is called with the path of the file to write.
         """
-        writer(self._place(name))
+        writer(self._path_of(name))
 
-    def _place(self, name: str) -> Path:
+    def _path_of(self, name: str) -> Path:
         """Return the path of a file in the temporary folder, after making the folders that contain it."""
         path = self.path / (_WAITING if name == MANIFEST else name)
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -237,7 +237,7 @@ class RunFolder:
 
     def checksums(self) -> dict[str, str]:
         """Return the SHA-256 of every file written so far, by its path relative to the folder."""
-        return {name: owned_files.digest(self.path / name) for name in owned_files.every_file(self.path)}
+        return {name: owned_files.digest(self.path / name) for name in owned_files.files_below(self.path)}
 
 
 def json_text(data: Any) -> str:
@@ -481,7 +481,7 @@ def remove_run(old: Path, new: Path) -> None:
         Folder in its place.
     """
     others = unlisted(old)
-    for name in owned_files.every_file(old) if others is None else others:
+    for name in owned_files.files_below(old) if others is None else others:
         path = new / name
         while os.path.lexists(path):
             path = path.with_name(f"{path.name}.kept")
@@ -551,7 +551,7 @@ class KeptWork:
         self._first = Path("runs") / stem if out is None else out
         self._chosen, self._ending, self._resume, self._force = out is not None, ending, resume, force
         self._command = command or "the same command"
-        self._place: Path | None = None
+        self._path: Path | None = None
         self._lock: int | None = None
 
     def __enter__(self) -> KeptWork:
@@ -560,7 +560,7 @@ class KeptWork:
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         """Unlock the folder; if an invalid input ended the command before anything was kept, remove it."""
         if self._lock is not None:
-            if kind is not None and self._place and owned_files.every_file(self._place) == [owned_files.KEPT_LOCK]:
+            if kind is not None and self._path and owned_files.files_below(self._path) == [owned_files.KEPT_LOCK]:
                 self.finish()
             os.close(self._lock)
 
@@ -583,12 +583,12 @@ class KeptWork:
                 if self._chosen:
                     text = f"{path} is in use by another command; wait until it has ended, or choose another --out"
                     raise RunFolderError(text)
-            if not (self._resume or self._force) and owned_files.every_file(path) != [owned_files.KEPT_LOCK]:
+            if not (self._resume or self._force) and owned_files.files_below(path) != [owned_files.KEPT_LOCK]:
                 raise RunFolderError(
                     f"{path} holds the finished part of an interrupted run; continue it with --resume, start again "
                     "with --force, or choose another --out"
                 )
-            self._place = path
+            self._path = path
             if not self._resume:
                 owned_files.remove_files(path, {owned_files.KEPT_LOCK})
         except OSError as error:
@@ -597,15 +597,15 @@ class KeptWork:
 
     def left(self) -> str:
         """Return the message on which intermediate results of an interrupted run are kept, and how to continue."""
-        if self._place is None or not self._place.exists():
+        if self._path is None or not self._path.exists():
             return "nothing was kept"
         return f"finished work is kept, continue with: {self._command} --resume"
 
     def finish(self) -> None:
         """Remove the intermediate results; the final ones are in the run folder."""
-        if self._place is not None:
-            others = {name for name in owned_files.every_file(self._place) if not _KEPT.fullmatch(name)}
-            owned_files.remove_files(self._place, others)
+        if self._path is not None:
+            others = {name for name in owned_files.files_below(self._path) if not _KEPT.fullmatch(name)}
+            owned_files.remove_files(self._path, others)
 
     def _refuse_others(self, path: Path) -> None:
         """Raise RunFolderError if the path is not a folder of intermediate results."""
@@ -613,7 +613,7 @@ class KeptWork:
             return
         if path.is_symlink() or not path.is_dir():
             raise RunFolderError(f"{path} is needed for the intermediate results of --resume; choose another --out")
-        names = owned_files.every_file(path)
+        names = owned_files.files_below(path)
         known = owned_files.KEPT_LOCK in names
         if others := [name for name in names if not (known and _KEPT.fullmatch(name))]:
             named = owned_files.first_names(others)

@@ -100,7 +100,7 @@ class SecondProcess:
         try:
             # in this order: when a task number can be read, its batch has been announced
             os.write(self._batches, _HEAD.pack(len(content), len(alone)) + alone)
-            os.write(self._turns[1], bytes(number for name, number in numbers.items() if name not in apart))
+            os.write(self._requests[1], bytes(number for name, number in numbers.items() if name not in apart))
         except BrokenPipeError:
             pass  # the second process has ended
 
@@ -109,7 +109,7 @@ class SecondProcess:
         names, results = list(self._tasks), {}
         if self._child:
             self._close_pipes()
-            for number in _turns(self._turns[0]):
+            for number in _received_numbers(self._requests[0]):
                 results[names[number]] = self._tasks[names[number]]()
             self._wait_for_end(PATIENCE)
             for number, result in _stored_results(self._from_child):
@@ -121,8 +121,8 @@ class SecondProcess:
         sys.stdout.flush()
         sys.stderr.flush()
         # the process that reads a byte has the task of that number; a pipe gives each byte to one reader
-        self._turns, batches = os.pipe(), os.pipe()
-        os.set_blocking(self._turns[0], False)  # of two processes that wait for a byte, one would wait for ever
+        self._requests, batches = os.pipe(), os.pipe()
+        os.set_blocking(self._requests[0], False)  # of two processes that wait for a byte, one would wait for ever
         self._to_child: IO[bytes] = tempfile.TemporaryFile()
         self._from_child: IO[bytes] = tempfile.TemporaryFile()
         self._sent = 0
@@ -130,7 +130,7 @@ class SecondProcess:
         if child == 0:
             try:
                 os.close(batches[1])
-                os.close(self._turns[1])
+                os.close(self._requests[1])
                 self._work(batches[0])
             finally:
                 os._exit(0)  # no buffer of the command is flushed twice
@@ -148,14 +148,14 @@ class SecondProcess:
         for stream in (0, 1, 2):
             os.dup2(nowhere, stream)
         # every copy of a lock file's descriptor holds the lock, so close all other descriptors
-        first, turns = 3, self._turns[0]
-        for kept in sorted((batches, turns, self._to_child.fileno(), self._from_child.fileno())):
+        first, requests = 3, self._requests[0]
+        for kept in sorted((batches, requests, self._to_child.fileno(), self._from_child.fileno())):
             os.closerange(first, kept)
             first = kept + 1
         os.closerange(first, os.sysconf("SC_OPEN_MAX"))
         self._prepare()
         tasks: dict[int, Callable[[], Any]] = {}
-        waiting, read = [batches, turns], 0
+        waiting, read = [batches, requests], 0
         while waiting:
             ready, _, _ = select.select(waiting, (), ())
             if batches in ready:
@@ -167,17 +167,17 @@ class SecondProcess:
                 alone = os.read(batches, count) if count else b""
                 tasks |= pickle.loads(os.pread(self._to_child.fileno(), length, read))
                 read += length
-                for own in alone:
-                    self._do(own, tasks)
+                for task in alone:
+                    self._do(task, tasks)
                 continue
             try:
-                turn = os.read(turns, 1)
+                request = os.read(requests, 1)
             except BlockingIOError:  # the first process has taken the task
                 continue
-            if not turn:
-                waiting.remove(turns)
+            if not request:
+                waiting.remove(requests)
                 continue
-            self._do(turn[0], tasks)
+            self._do(request[0], tasks)
 
     def _do(self, number: int, tasks: Mapping[int, Callable[[], Any]]) -> None:
         """Do a task in the second process and store its result."""
@@ -188,7 +188,7 @@ class SecondProcess:
         """Close the pipes, which tells the second process that no further tasks come."""
         if self._sending:
             self._sending = False
-            os.close(self._turns[1])
+            os.close(self._requests[1])
             os.close(self._batches)
             self._to_child.close()
 
@@ -203,10 +203,10 @@ class SecondProcess:
                 break
             time.sleep(0.002)
         self._child = 0
-        os.close(self._turns[0])
+        os.close(self._requests[0])
 
 
-def _turns(pipe: int) -> Iterator[int]:
+def _received_numbers(pipe: int) -> Iterator[int]:
     """Yield numbers of tasks from a pipe that both processes read, so that each task is done by one of them.
 
     It ends when no task is left.

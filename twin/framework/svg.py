@@ -96,13 +96,13 @@ def _arranged() -> type[Figure]:
 @contextmanager
 def _ticks_cached(figure: Figure) -> Iterator[None]:
     """Compute ticks and label positions only once for each size and view of the axes while the figure is drawn."""
-    every_axis: list[Any] = [axis for axes in figure.axes for axis in (axes.xaxis, axes.yaxis)]
-    for axis in every_axis:
+    x_and_y_axes: list[Any] = [axis for axes in figure.axes for axis in (axes.xaxis, axes.yaxis)]
+    for axis in x_and_y_axes:
         axis._update_ticks, axis._get_ticklabel_bboxes = _cached_functions(axis)
     try:
         yield
     finally:
-        for axis in every_axis:
+        for axis in x_and_y_axes:
             del axis._update_ticks, axis._get_ticklabel_bboxes
 
 

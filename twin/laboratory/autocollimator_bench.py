@@ -268,7 +268,7 @@ class AutocollimatorPath:
         self.window: int = collimator.window
         self.shape = (collimator.area_ccd.rows, collimator.area_ccd.columns)
         # largest distance of a pixel from a spot up to one pixel off the window's centre, kernel included
-        half_diagonal = (0.5 * self.window + 1.0 + self.response.reach / FINE) * np.sqrt(2.0) * self.pitch
+        half_diagonal = (0.5 * self.window + 1.0 + self.response.half_width / FINE) * np.sqrt(2.0) * self.pitch
         phase = 2.0 * np.pi * bench.numerical_aperture * half_diagonal / collimator.wavelength
         self.nodes = quadrature.disk_for(phase) if nodes is None else nodes
 
@@ -392,7 +392,7 @@ class AutocollimatorPath:
 
     def _pieces(self, states: Sequence[State]) -> Iterator[tuple[np.ndarray, np.ndarray]]:
         """Yield photons and window corners of the images for CHUNK states at a time, which limits memory."""
-        kernel_radius = self.response.reach
+        kernel_radius = self.response.half_width
         count = FINE * self.window + 2 * kernel_radius
         grid = Grid(-0.5 * (count - 1) * self.pitch / FINE, self.pitch / FINE, count)
         light = self.bench.spec.autocollimator.reticle.photons_per_frame * self.pitch**2
@@ -641,13 +641,13 @@ def run_autocollimator_test(
         A rotation moves a spot off its area CCD.
     """
     all_series = tuple(series_per_axis(setup.spec) if series is None else series)
-    say = progress or (lambda text: None)
+    report = progress or (lambda text: None)
     if reader is None:
-        say("calibrate the autocollimators")
+        report("calibrate the autocollimators")
         reader = Reader(setup, backend)
     results: dict[Series, SeriesResult] = {}
     for half_angle in dict.fromkeys(s.half_angle for s in all_series):
-        say(f"mirrors {2.0 * np.degrees(half_angle):.4g} deg apart")
+        report(f"mirrors {2.0 * np.degrees(half_angle):.4g} deg apart")
         group = [s for s in all_series if s.half_angle == half_angle]
         states = [state for s in group for state in states_of(setup.spec, s, None if ideal else seed)]
         windows = reader.path(half_angle).windows(states)
@@ -787,14 +787,16 @@ class Reader:
         rotations = np.stack([*np.meshgrid(angles, angles, indexing="ij"), np.zeros((len(angles),) * 2)], -1).reshape(
             -1, 3
         )
-        windows = self.path(p.narrow).windows([{axis_body("X"): Motion(rotate=_triple(turn))} for turn in rotations])
+        windows = self.path(p.narrow).windows(
+            [{axis_body("X"): Motion(rotate=_triple(rotation))} for rotation in rotations]
+        )
         photons, corner = windows.photons[0], windows.corner[0]
-        positions, _ = self.place(self.detector.expected_dn(photons, self.exposure), corner)
+        positions, _ = self.positions(self.detector.expected_dn(photons, self.exposure), corner)
         return autocollimator.ReadingMap.fit(
             positions, autocollimator.reading_of_normal(rotation_matrix(rotations) @ np.array([0.0, 0.0, -1.0]))
         )
 
-    def place(self, mean: np.ndarray, corner: np.ndarray) -> tuple[np.ndarray, SpotPositions]:
+    def positions(self, mean: np.ndarray, corner: np.ndarray) -> tuple[np.ndarray, SpotPositions]:
         """Measure the positions of the spots in B window images, in pixels of the whole CCD.
 
         Parameters
@@ -831,7 +833,7 @@ class Reader:
             mean = self.detector.expected_dn(windows.photons, self.exposure)
         else:
             mean = mean_frames(self.expose(windows, series.stream, seed))
-        positions, spots = self.place(mean.reshape(-1, *mean.shape[2:]), windows.corner.reshape(-1, 2))
+        positions, spots = self.positions(mean.reshape(-1, *mean.shape[2:]), windows.corner.reshape(-1, 2))
         shape = windows.corner.shape
         rotations = self.map(positions).reshape(shape)
         variance = np.einsum("bkk->bk", self.map.covariance(positions, spots.covariance)).reshape(shape)

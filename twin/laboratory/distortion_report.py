@@ -48,7 +48,7 @@ def distortion_report(run: DistortionRun) -> Report:
     return Report(
         title="Interior orientation and distortion",
         verdict=verdict,
-        lead=(*more, _typeset(run.compensated.fit.point.statement)),
+        lead=(*more, _typeset(run.compensated.fit.point.sentence)),
         facts=_facts(run, data),
         summary=_summary(run, data),
         sections=tuple(sections),
@@ -365,7 +365,7 @@ def _estimates(run: DistortionRun, data: Mapping[str, Any]) -> Section:
     covariance: list[tuple[Cell, ...]] = [(n, *row) for n, row in zip(terms, data["covariance_mm2"], strict=True)]
     return Section(
         "Estimators and observability",
-        (*text, _typeset(run.compensated.fit.point.statement)),
+        (*text, _typeset(run.compensated.fit.point.sentence)),
         (
             Table("distortion-estimates", title, caption, heads, rows, digits),
             Table("distortion-covariance", "Covariance of constant, f and p", note, ("", *terms), covariance),
@@ -375,11 +375,11 @@ def _estimates(run: DistortionRun, data: Mapping[str, Any]) -> Section:
 
 def _noise(run: DistortionRun, data: Mapping[str, Any]) -> Section:
     """Return the report section on the noise of the spots and on rejected spots."""
-    noise, stated = data["noise"], data["specified_exposure_um"]
+    noise, specified = data["noise"], data["specified_exposure_um"]
     text = [
         f"One spot scatters by {noise['exposure_um']:.3f} µm "
         + ("between the sets" if run.reading.shape[1] > 1 else "by its specified sigmas")
-        + (f", of which noise of its position is {stated:.3f} µm" if stated > 0.0 else "")
+        + (f", of which noise of its position is {specified:.3f} µm" if specified > 0.0 else "")
         + f". Beyond the specified noise, points scatter by {noise['white_compensated_um']:.3f} µm about a smooth curve"
         + ("." if run.compensation is None else f", {noise['white_raw_um']:.3f} µm with angles as read.")
     ]

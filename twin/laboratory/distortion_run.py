@@ -383,8 +383,10 @@ def measure_files(spec: MeasuredDistortionSpec, seed: int) -> DistortionRun:
         cal, *held = tables
         series = cal.series
         # whole turns between the calibration's readings and those of the test
-        turns = unwrapped(np.array([files.zero]), 0.5 * float(series.angle[0] + series.angle[-1]))[0] - files.zero
-        zero, readings = files.zero + turns, replace(readings, reading=readings.reading + turns)
+        whole_circles = (
+            unwrapped(np.array([files.zero]), 0.5 * float(series.angle[0] + series.angle[-1]))[0] - files.zero
+        )
+        zero, readings = files.zero + whole_circles, replace(readings, reading=readings.reading + whole_circles)
         _check_region(files, readings, series, zero)
         names, _ = usable_fits(files.turntable, cal, CLOSED_FORMS)
         choice = choose(series, seed, names, files.turntable.folds)
@@ -410,9 +412,9 @@ def _check_region(files: DistortionFiles, readings: SpotReadings, series: Calibr
         raise files.error("the turntable is not calibrated at this reading", ("zero",), found=shown, allowed=allowed)
     beyond = ~covered(series.angle, readings.reading) & (readings.lines > 0)
     if np.any(beyond):
-        place = np.argwhere(beyond)[0]
-        shown = f"{np.degrees(readings.reading[tuple(place)]):.9g} deg"
-        line = int(readings.lines[tuple(place)])
+        first = np.argwhere(beyond)[0]
+        shown = f"{np.degrees(readings.reading[tuple(first)]):.9g} deg"
+        line = int(readings.lines[tuple(first)])
         text = "the turntable is not calibrated at this reading"
         raise InputError(Issue(text, readings.file.file, line, (readings.head,), shown, allowed))
 
@@ -650,7 +652,7 @@ DISTORTION: Record[DistortionRun] = Record(
     Quantity("principal_point_observable", lambda r: bool(r.compensated.fit.point.observable), "sigma within 10 um"),
     Quantity(
         "principal_point_statement",
-        lambda r: r.compensated.fit.point.statement,
+        lambda r: r.compensated.fit.point.sentence,
         "statement about p and its observability",
     ),
     Quantity(

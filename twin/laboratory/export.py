@@ -114,13 +114,13 @@ def _focus_tables(
         x, y = (float(v) for v in site.place)
         for edge, shift in scan.shift.items():
             for k, at in enumerate(scan.target):
-                place = (site.band, x, y, edge, float(shift[k]))
+                position = (site.band, x, y, edge, float(shift[k]))
                 file = f"{stem}/{site.band}_field{field}_{edge}_{k + 1:02d}.tiff"
                 out[file] = bytes(tiff(recorder.frames(i, edge, float(at), scan.take + k), facts))
-                images.append((*place, file))
+                images.append((*position, file))
                 # images without a measured edge have no value
                 if np.isfinite(scan.sigma[edge][k]):
-                    values.append((*place, float(scan.mtf[edge][k]), float(scan.sigma[edge][k])))
+                    values.append((*position, float(scan.mtf[edge][k]), float(scan.sigma[edge][k])))
     return images, values
 
 

@@ -193,8 +193,8 @@ class FocusBench:
         test, bands = self.setup.test, self.setup.camera.bands
         keys = [(name, field) for name in bands for field in test.fields]
         half = {n: 0.5 * (b.pixels - 2.0 * test.edge.region) * b.pitch for n, b in bands.items()}
-        places = np.array([[field * half[name], bands[name].offset] for name, field in keys])
-        directions = self.path.directions(places)
+        positions = np.array([[field * half[name], bands[name].offset] for name, field in keys])
+        directions = self.path.directions(positions)
         hits = self.path.places(self.camera.as_built, directions)
         pupils = self.path.pupils(self.camera.as_built, directions, hits)
         sites = []
@@ -228,9 +228,9 @@ class FocusBench:
         out = []
         for name, ccd in self.ccds.items():
             site = min((s for s in self.sites if s.band == name), key=lambda s: abs(s.field))
-            place = site.place[None, ::-1]
+            position = site.place[None, ::-1]
             bare = TargetPath(self.camera.assembly, ROOT, ROOT, self.camera.model, self.path.backend)
-            pupil = bare.pupils({}, bare.directions(place), place)[0]
+            pupil = bare.pupils({}, bare.directions(position), position)[0]
             perfect = replace(pupil, eikonal_terms=np.zeros_like(pupil.eikonal_terms))
             for edge, imager in site.imagers.items():
                 f, normal = ccd.band.nyquist, imager.optics.normal
@@ -547,8 +547,8 @@ def _search(recorder: Recorder, number: int, zero: float, first: int = 0) -> flo
     site = recorder.bench.sites[number]
     # a wide peak needs only as many positions as place some of them on the peak
     step = max(plan.step, 2.0 * zero / _COARSE)
-    reach = plan.reach / site.nominal_per_shift[ALONG]
-    shift = np.linspace(-reach, reach, 2 * int(np.ceil(plan.reach / step)) + 1)
+    shift_range = plan.reach / site.nominal_per_shift[ALONG]
+    shift = np.linspace(-shift_range, shift_range, 2 * int(np.ceil(plan.reach / step)) + 1)
     measurements = [recorder.attempt(number, ALONG, float(s), k) for k, s in enumerate(shift, first)]
     if all(np.isinf(m[1]) for m in measurements):
         raise BenchError(

@@ -110,15 +110,15 @@ def _defocus(axes: Axes, run: FocusRun, number: int, state: FocusState) -> None:
     """Draw the defocus of the sites in one state (placement of the focal plane), band by band."""
     for k, band in enumerate(dict.fromkeys(run.bands)):
         of_band = np.array(run.bands) == band
-        colour, places = FIELD_COLOURS[k % len(FIELD_COLOURS)], run.places[of_band]
-        along, sigma = 1e3 * places[:, 1], UM * state.defocus_sigma[of_band]
+        colour, positions = FIELD_COLOURS[k % len(FIELD_COLOURS)], run.places[of_band]
+        along, sigma = 1e3 * positions[:, 1], UM * state.defocus_sigma[of_band]
         style: dict[str, Any] = {"fmt": "o", "ms": 3.5, "lw": 1.0, "color": colour, "label": band or "all sites"}
         axes.errorbar(along, UM * state.defocus[of_band], sigma, **style)
         if isinstance(state, SimulatedState):
             axes.plot(along, UM * state.true_defocus[of_band], "_", ms=11, color=colour, alpha=0.8)
         if number < len(run.shimmings):
-            for x in np.unique(places[:, 0]):
-                line = np.array([[x, y] for y in (np.min(places[:, 1]), np.max(places[:, 1]))])
+            for x in np.unique(positions[:, 0]):
+                line = np.array([[x, y] for y in (np.min(positions[:, 1]), np.max(positions[:, 1]))])
                 plane = run.shimmings[number].plane.plane(line)[0]
                 axes.plot(1e3 * line[:, 1], -UM * plane, color=colour, lw=0.8, alpha=0.7)
     if isinstance(state, SimulatedState):
@@ -415,8 +415,8 @@ def _shims(run: FocusRun) -> Section:
         title = "Shims" if len(run.shimmings) == 1 else f"Shims of round {number}"
         caption = (
             "Changes of thickness under each hole. The rotation in the mounting surface of "
-            f"{fixed(shimming.plan.turn / ARCMIN, 2)} arcmin is set by hand; without it the line would deviate from "
-            "its nominal "
+            f"{fixed(shimming.plan.rotation / ARCMIN, 2)} arcmin is set by hand; without it the line would deviate "
+            "from its nominal "
             f"level by {fixed(shimming.plan.level_coupling / ARCMIN, 2)} arcmin, as the mounting surface is not "
             "parallel "
             "to the focal plane."
@@ -448,7 +448,7 @@ def _plane(run: FocusRun) -> Section:
         caption += " Dashes: truth from the traced pupils."
     artefacts: tuple[Artefact, ...] = (
         SvgFigure("defocus", "Defocus of the CCDs", caption, defocus_svg(run)),
-        focus_run.PLACES.table("places", "Sites", "Before the last shims.", focus_run.PLACES.rows(last), keys),
+        focus_run.SITE.table("places", "Sites", "Before the last shims.", focus_run.SITE.rows(last), keys),
     )
     return Section("Plane", text, artefacts, folded=1)
 
@@ -457,10 +457,10 @@ def _curve_section(run: FocusRun) -> Section:
     """Return the section on the curves through focus of the last state to which a plane was fitted."""
     rows = [
         {**site, "direction": DIRECTION_NAMES[edge], **curve}
-        for site in focus_run.PLACES.rows(_last(run))
+        for site in focus_run.SITE.rows(_last(run))
         for edge, curve in site["curves"].items()
     ]
-    where = [focus_run.PLACES[key] for key in ("band", "x_mm", "y_mm")]
+    where = [focus_run.SITE[key] for key in ("band", "x_mm", "y_mm")]
     record = Record("A curve.", *where, focus_run.BUDGET["direction"], *focus_run.CURVE)
     drawn = "MTF with one sigma and the fitted curve, by band; black: the CCD."
     artefacts: list[Artefact] = [

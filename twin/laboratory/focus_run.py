@@ -188,8 +188,8 @@ class Shimming:
 
         They are in metres and radians. This error is the same in every alignment of a camera.
         """
-        reach = np.max(np.abs(self.plane.position), axis=0)
-        return np.array([self.vertex_error, *(self.vertex_trend / reach)])
+        half_extent = np.max(np.abs(self.plane.position), axis=0)
+        return np.array([self.vertex_error, *(self.vertex_trend / half_extent)])
 
     @property
     def covariance(self) -> np.ndarray:
@@ -362,14 +362,14 @@ def align_files(spec: MeasuredFocusSpec, seed: int = 0, advance: Advance = silen
         skew, noise = state.skew
         # skew of the curves beyond its noise is an error common to all sites
         shared = float(np.sqrt(spec.vertex_error**2 + max(skew**2 - noise**2, 0.0)))
-        shimming = plan_shimming(readings.places, state, mount_of(spec), present, (shared, spec.vertex_trend))
+        shimming = plan_shimming(readings.positions, state, mount_of(spec), present, (shared, spec.vertex_trend))
     except ObservabilityError as error:
         raise readings.table.error(0, "x", str(error).removeprefix("focal plane: ")) from error
     return FocusRun(
         test=spec,
         seed=seed,
         bands=readings.bands,
-        places=readings.places,
+        places=readings.positions,
         states=(state,),
         shimmings=(shimming,),
         readings=readings,
@@ -402,11 +402,11 @@ def align(bench: FocusBench, seed: int, advance: Advance = silent) -> SimulatedF
     patterns = _patterns(bench, seed)
     mount = mount_of(test)
     present = np.full(len(test.mount.holes), test.mount.thickness)
-    places = np.array([site.place for site in bench.sites])
+    positions = np.array([site.place for site in bench.sites])
     states = [_measure_placement(bench, placement, patterns, seed, None, 0, advance)]
     shimmings: list[Shimming] = []
     for number in range(test.rounds):
-        shimming = plan_shimming(places, states[-1], mount, present)
+        shimming = plan_shimming(positions, states[-1], mount, present)
         present = shimming.plan.thickness
         shimmings.append(shimming)
         setting = np.random.default_rng(stream(seed, _SETTING, number)).normal(0.0, test.level)
@@ -416,7 +416,7 @@ def align(bench: FocusBench, seed: int, advance: Advance = silent) -> SimulatedF
         test=test,
         seed=seed,
         bands=tuple(site.band for site in bench.sites),
-        places=places,
+        places=positions,
         states=tuple(states),
         shimmings=tuple(shimmings),
         bench=bench,
@@ -424,7 +424,7 @@ def align(bench: FocusBench, seed: int, advance: Advance = silent) -> SimulatedF
 
 
 def plan_shimming(
-    places: np.ndarray,
+    positions: np.ndarray,
     state: FocusState,
     mount: Mount,
     present: np.ndarray,
@@ -434,7 +434,7 @@ def plan_shimming(
 
     Parameters
     ----------
-    places : (N, 2) ndarray
+    positions : (N, 2) ndarray
         Positions X', Y' of the N sites, metres.
     state : FocusState
         Measured state; without a level of the line its rotation about Z' is not corrected.
@@ -453,7 +453,7 @@ def plan_shimming(
         The mount does not allow the motion.
     """
     # the plane is fitted to the distance of best focus downstream of the CCD
-    plane = fit_focal_plane(places, -state.defocus, state.defocus_sigma, estimate_extra=True)
+    plane = fit_focal_plane(positions, -state.defocus, state.defocus_sigma, estimate_extra=True)
     return Shimming(plane, plan_shims(plane.correction(state.level), mount, present), *vertex)
 
 
@@ -659,7 +659,9 @@ ROUND: Record[SimulatedState] = Record(
     ),
     Quantity("slides_mm", lambda s: _holes(_shims(s).plan.slide), "displacement in the mounting surface, by hole"),
     Quantity(
-        "rotation_by_hand_arcmin", lambda s: _shims(s).plan.turn, "rotation about the normal of the mounting surface"
+        "rotation_by_hand_arcmin",
+        lambda s: _shims(s).plan.rotation,
+        "rotation about the normal of the mounting surface",
     ),
     Quantity(
         "line_level_without_rotation_arcmin",
@@ -713,8 +715,8 @@ CURVE: Record[FocusVertex] = Record(
     Quantity("positions", lambda v: len(v.used), "points of the curve", "positions"),
     Quantity("positions_used", lambda v: np.sum(v.used), "points near the peak that the fit uses", "used"),
 )
-_PlacePlane: TypeAlias = tuple[FocusRun, FocusState, Shimming]
-PLACES: Record[_PlacePlane] = Record(
+_PlaneState: TypeAlias = tuple[FocusRun, FocusState, Shimming]
+SITE: Record[_PlaneState] = Record(
     "One site of the focal plane, before the shims are changed.",
     Quantity("band", lambda s: list(s[0].bands), "name of the band"),
     Quantity("x_mm", lambda s: s[0].places[:, 0], "X', in the flight direction", "x", 3),
@@ -770,7 +772,7 @@ ROW_FAULT: Record[RowFault] = Record(
 )
 
 
-def _first_plane(run: FocusRun) -> _PlacePlane:
+def _first_plane(run: FocusRun) -> _PlaneState:
     """Return the run, its first state, and the plane fitted to that state's best foci."""
     return run, run.states[0], run.shimmings[0]
 
@@ -792,7 +794,7 @@ MEASURED: Record[FocusRun] = Record(
     Quantity("shims", lambda r: _holes(SHIMS.rows(r.shimmings[0])), "hole -> shim"),
     Quantity(
         "rotation_by_hand_arcmin",
-        lambda r: r.shimmings[0].plan.turn,
+        lambda r: r.shimmings[0].plan.rotation,
         "rotation about the normal of the mounting surface",
     ),
     Quantity(
@@ -809,7 +811,7 @@ MEASURED: Record[FocusRun] = Record(
     Quantity("curves_chi_square", lambda r: r.chi_square[0], "chi-square of all curves through focus"),
     Quantity("curves_degrees_of_freedom", lambda r: r.chi_square[1], "degrees of freedom of all curves"),
     Quantity("curves_agree", lambda r: likely(*r.chi_square), "true if its p-value is 0.001 or more"),
-    Quantity("sites", lambda r: PLACES.rows(_first_plane(r)), "all sites"),
+    Quantity("sites", lambda r: SITE.rows(_first_plane(r)), "all sites"),
     Quantity(
         "images_without_edge",
         lambda r: r.readings and r.readings.no_edge,

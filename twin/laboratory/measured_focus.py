@@ -53,25 +53,25 @@ _REGION = ("row", "column", "height", "width")
 
 
 @dataclass(frozen=True, eq=False)
-class _Place:
+class _Site:
     """Site (position) on the focal plane with its rows of the table.
 
     Attributes
     ----------
     band : str
         Band of its CCD; empty if the table has no bands.
-    place : (2,) ndarray
+    position : (2,) ndarray
         Position (X', Y'), metres.
     rows : mapping
         Edge (direction of the MTF) -> indices of its rows of the table, sorted by shift.
     """
 
     band: str
-    place: Array
+    position: Array
     rows: Mapping[str, NDArray[np.intp]]
 
     def __str__(self) -> str:
-        x, y = 1e3 * self.place
+        x, y = 1e3 * self.position
         return f"{self.band + ' at ' if self.band else ''}x {x:.6g} mm, y {y:.6g} mm"
 
 
@@ -94,7 +94,7 @@ class FocusReadings:
         Table of the series.
     bands : tuple of str
         Bands of the sites; empty names if the table has no bands.
-    places : (N, 2) ndarray
+    positions : (N, 2) ndarray
         Positions (X', Y') of the sites, metres.
     scans : tuple of SiteScan
         Curves through focus of the sites.
@@ -110,7 +110,7 @@ class FocusReadings:
 
     table: Table
     bands: tuple[str, ...]
-    places: Array
+    positions: Array
     scans: tuple[SiteScan, ...]
     no_edge: tuple[RowFault, ...]
     uneven: tuple[RowFault, ...]
@@ -152,7 +152,7 @@ def read_focus(files: FocusFiles, advance: Advance = silent) -> FocusReadings:
     return FocusReadings(
         table,
         tuple(site.band for site in sites),
-        np.array([site.place for site in sites]),
+        np.array([site.position for site in sites]),
         tuple(_scan(table, site, shift, mtf, sigma, reasons) for site in sites),
         _faults(table, reasons),
         _faults(table, warnings),
@@ -190,7 +190,7 @@ def _per_shift(table: Table, files: FocusFiles) -> Array | float:
     return files.per_shift
 
 
-def _sites(table: Table) -> tuple[_Place, ...]:
+def _sites(table: Table) -> tuple[_Site, ...]:
     """Return the sites, sorted by band and position, each with its rows."""
     band = table["band"] if "band" in table else np.full(len(table), "", dtype=object)
     edge = table["edge"] if "edge" in table else np.full(len(table), ALONG, dtype=object)
@@ -215,7 +215,7 @@ def _sites(table: Table) -> tuple[_Place, ...]:
     for k in range(len(keys)):
         rows = order[starts[k] : starts[k + 1]]
         rows_by_edge = {direction: rows[edge[rows] == direction] for direction in directions}
-        site = _Place(str(bands[int(keys[k][0])]), table.stacked("x", "y")[rows[0]], FrozenMap(rows_by_edge))
+        site = _Site(str(bands[int(keys[k][0])]), table.stacked("x", "y")[rows[0]], FrozenMap(rows_by_edge))
         empty = next((name for name, edge_rows in rows_by_edge.items() if not edge_rows.size), None)
         if empty is not None:
             text = f"{site} has no row of the edge {empty!r}, which other sites have"
@@ -226,7 +226,7 @@ def _sites(table: Table) -> tuple[_Place, ...]:
     return tuple(out)
 
 
-def _scan(table: Table, site: _Place, shift: Array, mtf: Array, sigma: Array, reasons: Mapping[int, str]) -> SiteScan:
+def _scan(table: Table, site: _Site, shift: Array, mtf: Array, sigma: Array, reasons: Mapping[int, str]) -> SiteScan:
     """Fit the peaks (vertices) of a site's MTF curves through focus."""
     vertex = {}
     for edge, rows in site.rows.items():

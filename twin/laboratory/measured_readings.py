@@ -289,7 +289,7 @@ def read_spots(files: DistortionFiles) -> SpotReadings:
         The table cannot be used; the message has file, line and column.
     """
     table = read_table(files.spots, SPOT_COLUMNS, len(CALIBRATED))
-    positions, sigma, fixed = _places(table, files)
+    positions, sigma, fixed = _spot_positions(table, files)
     numbered = "point" in table
     if "set" in table and not numbered:
         raise InputError(Issue("sets of points without numbers", files.spots, 1, allowed="a column 'point' as well"))
@@ -335,7 +335,7 @@ def read_spots(files: DistortionFiles) -> SpotReadings:
     return SpotReadings(filled["reading"][rank], spots, mask, across, lines, file, head, named)
 
 
-def _places(table: Table, files: DistortionFiles) -> tuple[Array, Array, Array]:
+def _spot_positions(table: Table, files: DistortionFiles) -> tuple[Array, Array, Array]:
     """Return the spots' positions along the line and their sigmas, (rows,) each, metres.
 
     The first sigma is of the error that is independent in every exposure, the second of one that is fixed.

@@ -50,13 +50,13 @@ def comparison_figure(run: TurntableRun) -> Figure:
     angle = np.degrees(series.angle)
     off = series.from_mean / ARCSEC
     spread = np.linspace(-0.12, 0.12, series.repeats) * np.degrees(series.step)
-    places = angle[:, None] + spread
+    positions = angle[:, None] + spread
     keep = series.keep
     figure = svg.new_figure(5.2)
     top, bottom = figure.subplots(2, 1, sharex=True, height_ratios=(1.5, 1.0))
-    top.plot(places[keep], off[keep], ".", color=svg.BLUE, ms=3.5, label=f"accepted, {np.sum(keep)}")
+    top.plot(positions[keep], off[keep], ".", color=svg.BLUE, ms=3.5, label=f"accepted, {np.sum(keep)}")
     rejected = series.excluded_comparisons
-    top.plot(places[rejected], off[rejected], "x", color=svg.VERMILION, ms=5.5, label=f"rejected, {series.rejected}")
+    top.plot(positions[rejected], off[rejected], "x", color=svg.VERMILION, ms=5.5, label=f"rejected, {series.rejected}")
     top.set(title="Comparisons minus the mean of those accepted at their angle", ylabel="arcsec")
     top.margins(y=0.18)
     top.legend(loc="upper right", ncols=2)

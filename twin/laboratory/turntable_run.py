@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from analysis.arrays import Array
-from analysis.statistics import chance_beyond
+from analysis.statistics import p_value_of
 from analysis.turntable.dividing_error import (
     FITS,
     AngleFit,
@@ -362,25 +362,25 @@ def run_turntable(
     InputError
         A table cannot be used, or there are fewer angles than a fit and its cross-validation need.
     """
-    say = progress or (lambda text: None)
+    report = progress or (lambda text: None)
     model: TurntableModel | None = None
     tables: tuple[Comparisons, ...] = ()
     held_out: CalibrationSeries | None = None
     too_few: tuple[str, ...] = ()
     if isinstance(spec, MeasuredTurntableSpec):
-        say("read the comparisons")
+        report("read the comparisons")
         tables, folds = read_turntable(spec.measured), spec.measured.folds
         names, too_few = usable_fits(spec.measured, tables[0], names)
         series, held_out = tables[0].series, tables[1].series if len(tables) > 1 else None
     else:
         folds = spec.calibration.folds
         _check_count(spec, names)
-        say("compare the table with the reference")
+        report("compare the table with the reference")
         model = TurntableModel(spec, seed)
         series, held_out = model.calibrate(), model.held_out()
     # the network's matrices are small
     with one_blas_thread():
-        choice = choose(series, seed, names, folds, say)
+        choice = choose(series, seed, names, folds, report)
         compensation = compensate(series, choice, held_out)
     return TurntableRun(spec, seed, series, held_out, choice, compensation, model, tables, too_few)
 
@@ -451,7 +451,7 @@ def likely(chi_square: float, degrees: int) -> bool | None:
     degrees : int
         Degrees of freedom.
     """
-    return bool(chance_beyond(chi_square, degrees) >= DOUBTFUL) if degrees else None
+    return bool(p_value_of(chi_square, degrees) >= DOUBTFUL) if degrees else None
 
 
 DATA_FILE: Record[DataFile] = Record(

@@ -113,8 +113,8 @@ def crosstalk_section(run: RenderRun) -> Section:
 def _crosstalk(run: RenderRun, camera: int) -> Table:
     name, table = list(run.crosstalk.items())[camera]
     columns = [_columns(run, table, p) for p in range(len(parameters.CAMERA_PARAMETERS))]
-    own = [row for row in run.reading.table.rows if row.estimator == run.judged and row.camera == name]
-    floors = [max(SAME, UNOBSERVED * row.noise) for row in own]  # SAME where the estimator has no value
+    rows_of_camera = [row for row in run.reading.table.rows if row.estimator == run.judged and row.camera == name]
+    floors = [max(SAME, UNOBSERVED * row.noise) for row in rows_of_camera]  # SAME where the estimator has no value
     bodies = [motion.body for motion in table.motions]
     rows: list[list[Cell]] = []
     bands: dict[int, str] = {}
@@ -133,9 +133,13 @@ def _crosstalk(run: RenderRun, camera: int) -> Table:
                     )
             rows.append(row)
     caption = Markup('All digits: the table of <a href="#motions">motions and spots</a>.')
-    heads = ["Motion", "per", *(head for own in columns for head in ("true", *(label for label, _ in own)))]
+    heads = [
+        "Motion",
+        "per",
+        *(head for rows_of_camera in columns for head in ("true", *(label for label, _ in rows_of_camera))),
+    ]
     spans = zip(parameters.CAMERA_PARAMETERS.values(), columns, strict=True)
-    over = [("", 2), *((p.label, 1 + len(own)) for p, own in spans)]
+    over = [("", 2), *((p.label, 1 + len(rows_of_camera)) for p, rows_of_camera in spans)]
     title = f"Camera {name}"
     return Table(f"crosstalk-{camera}", title, caption, heads, rows, over=over, bands=bands, within=IN_PAGE)
 

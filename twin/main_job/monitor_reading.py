@@ -186,9 +186,11 @@ class MonitorReading:
         prior, noise = self.disturbances, self.recovery.shift_covariance[0]
         if prior is None or not np.any(noise):
             return ()
-        parts = split(np.stack([one.row for one in self._quantities]), prior, noise, prior.best_gain(noise))
+        parts = split(np.stack([quantity.row for quantity in self._quantities]), prior, noise, prior.best_gain(noise))
         unmeasured = (parts.sigma_before > 0.0) & (parts.sigma > UNMEASURED * parts.sigma_before)
-        return tuple(short_text(one) for one, repeated in zip(self._quantities, unmeasured, strict=True) if repeated)
+        return tuple(
+            short_text(quantity) for quantity, repeated in zip(self._quantities, unmeasured, strict=True) if repeated
+        )
 
     @cached_property
     def consistency(self) -> Consistency | None:
@@ -282,7 +284,7 @@ class MonitorReading:
                 "cameras": groups.pop("cameras"),
                 "spots": spots,
                 **groups,
-                "disturbances": self._stated(self.consistency),
+                "disturbances": self._consistency_plain(self.consistency),
             },
             **({"from_statement": share} if share else {}),
             **({"retraced": retraced} if retraced else {}),
@@ -302,7 +304,7 @@ class MonitorReading:
             "holds": bool(curvature.holds[0]),
         }
 
-    def _stated(self, test: Consistency | None) -> dict[str, Any]:
+    def _consistency_plain(self, test: Consistency | None) -> dict[str, Any]:
         """Return the prior's name and the test of the shifts against it, as plain data; None without prior or noise."""
         name = None if self.disturbances is None else self.disturbances.name
         numbers = {key: None if test is None else number(test) for key, number in _TEST_KEYS.items()}
@@ -414,8 +416,8 @@ _TEST_KEYS: Mapping[str, Callable[[Consistency], Any]] = {
     "degrees_of_freedom": lambda test: test.degrees,
     "limit": lambda test: _to_digits(test.limit),
     "false_alarm": lambda test: test.false_alarm,
-    "chance": lambda test: _to_digits(test.chance),
-    "chance_sigma_noise": lambda test: test.chance_sigma_noise,
+    "chance": lambda test: _to_digits(test.p_value),
+    "chance_sigma_noise": lambda test: test.p_value_sigma_noise,
     "agrees": lambda test: test.agrees,
 }
 """Key in files -> function that takes its number from the chi-square test against the prior."""

@@ -26,7 +26,7 @@ from twin.main_job.render_files import DEFORMATION, HEATED_BODY
 from twin.main_job.render_results import JobRun, RenderRun
 from twin.main_job.result_sections import IN_PAGE, figure
 from twin.main_job.verdict import sharpness_lost
-from twin.monitor.image_quality import AT_FIELDS, PLACES, CameraQuality, ImageQuality
+from twin.monitor.image_quality import AT_FIELDS, POSITIONS, CameraQuality, ImageQuality
 from twin.path_tracing.stray_light import FAMILY
 from twin.targets.target_images import DIRECTION_NAMES, DIRECTIONS
 from twin.targets.target_measurement import NYQUIST, BarReading, CameraTargets, EdgeReading, TargetRun
@@ -66,12 +66,12 @@ def quality_section(run: JobRun, drawn: Mapping[str, str]) -> Section | None:
             "quality",
             "",
             caption,
-            ("", *_WHEN * len(PLACES)),
+            ("", *_WHEN * len(POSITIONS)),
             rows,
-            over=(("", 1), *((place, len(_WHEN)) for place in PLACES)),
+            over=(("", 1), *((position, len(_WHEN)) for position in POSITIONS)),
             bands=bands,
             within=IN_PAGE,
-            full=_every_field(quality),
+            full=_table_of_all_fields(quality),
         )
     ]
     if quality.obstruction:
@@ -92,18 +92,18 @@ def _quality_rows(name: str, camera: CameraQuality, quality: ImageQuality) -> li
     for quantity in AT_FIELDS:
         values = quantity.shown_value(quantity.value(camera))
         row: list[Cell] = [quantity.shown_head]
-        for place, field in PLACES.items():
+        for position, field in POSITIONS.items():
             for s, when in enumerate(_WHEN):
                 value = float(values[s, quality.fields.index(field)])
                 text = fixed(value, quantity.decimals or 0, sign=quantity.key == "defocus_um")
-                row.append(Marked(text, "", "number", f"quality.{name}.{quantity.key}.{place}.{when}"))
+                row.append(Marked(text, "", "number", f"quality.{name}.{quantity.key}.{position}.{when}"))
         rows.append(row)
     return rows
 
 
-def _every_field(quality: ImageQuality) -> Table:
+def _table_of_all_fields(quality: ImageQuality) -> Table:
     """Return the table of image quality with all digits at every field, including those that the report leaves out."""
-    places = {quality.fields.index(field): place for place, field in PLACES.items()}
+    positions = {quality.fields.index(field): position for position, field in POSITIONS.items()}
     rows: list[list[Cell]] = []
     for name, camera in quality.cameras.items():
         values = [quantity.shown_value(quantity.value(camera)) for quantity in AT_FIELDS]
@@ -114,7 +114,7 @@ def _every_field(quality: ImageQuality) -> Table:
                         name,
                         when,
                         float(field),
-                        places.get(k, ""),
+                        positions.get(k, ""),
                         *(float(quantity_values[s, k]) for quantity_values in values),
                     ]
                 )
@@ -179,14 +179,14 @@ def _mtf_table(targets: TargetRun, kinds: list[str]) -> Table:
     for name, camera in targets.cameras.items():
         nyquist, pitch = plain(1e-3 * NYQUIST / camera.pitch, 4), plain(1e6 * camera.pitch)
         bands[len(rows)] = f"Camera {name}, band {camera.band}, Nyquist {nyquist} cycles/mm, {pitch} µm pixels"
-        for place, images in camera.places.items():
+        for position, images in camera.places.items():
             biases += [edge.nyquist_bias for shots in images.shots.values() for edge in shots.edges.values()]
             for direction in DIRECTIONS:
-                row: list[Cell] = [f"{place}, {DIRECTION_NAMES[direction]}"]
+                row: list[Cell] = [f"{position}, {DIRECTION_NAMES[direction]}"]
                 for kind in kinds:
                     for when, shots in images.shots.items():
                         reading = (shots.edges if kind == "edge" else shots.bars)[direction]
-                        row += _mtf_cells(f"mtf.{name}.{place}.{direction}.{when}.{kind}", reading)
+                        row += _mtf_cells(f"mtf.{name}.{position}.{direction}.{when}.{kind}", reading)
                 move = fixed(1e6 * float(images.shift[DIRECTIONS.index(direction)]), 2, sign=True)
                 rows.append([*row, Marked(f"{move} {DIRECTION_NAMES[direction]}", "", "number")])
         full += _mtf_rows(name, camera)
@@ -228,13 +228,13 @@ def _mtf_table(targets: TargetRun, kinds: list[str]) -> Table:
 def _mtf_rows(name: str, camera: CameraTargets) -> list[list[Cell]]:
     """Return table rows with the MTF measured in each of a camera's targets, with all digits."""
     rows: list[list[Cell]] = []
-    for place, targets in camera.places.items():
+    for position, targets in camera.places.items():
         for direction in DIRECTIONS:
             for when, shots in targets.shots.items():
                 for kind, reading in (("edge", shots.edges.get(direction)), ("bars", shots.bars.get(direction))):
                     if reading is not None:
                         value, sigma = reading.nyquist or (None, None)
-                        where: list[Cell] = [name, camera.band, place, DIRECTION_NAMES[direction], when, kind]
+                        where: list[Cell] = [name, camera.band, position, DIRECTION_NAMES[direction], when, kind]
                         true: list[Cell] = [reading.true_nyquist, *reading.at_nyquist, reading.true_axis]
                         rows.append([*where, value, sigma, *true])
     return rows
@@ -269,16 +269,16 @@ def stray_section(run: RenderRun) -> Section | None:
     surfaces: list[list[Cell]] = []
     full: list[dict[str, Any]] = []
     for i, channel in enumerate(run.experiment.path.channels):
-        families_found = [
+        detected = [
             family
             for family in after.traced.relative(channel.key)
             if family.family.detector == f"{channel.key}/area_ccd"
         ]
         by_kind = [
-            sum(family.share for family in families_found if family.family.kind == kind) for kind in ("ghost", "stray")
+            sum(family.share for family in detected if family.family.kind == kind) for kind in ("ghost", "stray")
         ]
         amounts.append([channel.key, float(shares[i]), *by_kind, float(after.photons[i].max())])
-        records = [FAMILY(family) for family in families_found]
+        records = [FAMILY(family) for family in detected]
         full += [{**family, "surfaces": " ".join(family["surfaces"])} for family in records]
         for family in records[:_STRONGEST]:
             size = (

@@ -24,9 +24,9 @@ from twin.main_job.render_job import render_job
 from twin.main_job.render_results import JobRun, RenderRun
 from twin.main_job.systematics import assumed
 from twin.main_job.verdict import judge, recovered_numbers
-from twin.monitor.image_quality import AT_FIELDS, PLACES, QUALITY
+from twin.monitor.image_quality import AT_FIELDS, POSITIONS, QUALITY
 from twin.targets.target_images import DIRECTIONS
-from twin.targets.target_images import PLACES as TARGET_PLACES
+from twin.targets.target_images import POSITIONS as TARGET_PLACES
 from twin.targets.target_measurement import TargetRun
 
 _DASH = "\N{EM DASH}"
@@ -119,15 +119,15 @@ def _mtf_table(targets: TargetRun) -> Table | None:
     for name, camera in targets.cameras.items():
         for direction in DIRECTIONS:
             pairs = [
-                (place.before.edges[direction], place.after.edges[direction])
-                for place in camera.places.values()
-                if direction in place.before.edges
+                (measured.before.edges[direction], measured.after.edges[direction])
+                for measured in camera.places.values()
+                if direction in measured.before.edges
             ]
             if not pairs:
                 return None
             cells = [
-                f"{' -> '.join('none' if one.nyquist is None else f'{one.nyquist[0]:.3f}' for one in pair)}\n"
-                f"[dim]{' -> '.join(f'{one.true_nyquist:.3f}' for one in pair)}[/]"
+                f"{' -> '.join('none' if edge.nyquist is None else f'{edge.nyquist[0]:.3f}' for edge in pair)}\n"
+                f"[dim]{' -> '.join(f'{edge.true_nyquist:.3f}' for edge in pair)}[/]"
                 for pair in pairs
             ]
             table.add_row(f"[bold]{escape(name)}[/] {escape(camera.band)}, {_ALONG[direction]}", *cells)
@@ -148,19 +148,21 @@ def _changes(run: JobRun) -> Table:
     for head in ("", "change"):
         table.add_column(head, justify="right" if head else "left", no_wrap=True)
     group = ""
-    for of, one, value in run.true_changes():
+    for of, parameter, value in run.true_changes():
         if of != group:
             group = of
             table.add_row(f"[bold]{escape(group)}[/]")
-        table.add_row(escape(one.label), fixed(value, one.decimals, sign=True))
+        table.add_row(escape(parameter.label), fixed(value, parameter.decimals, sign=True))
     if run.quality is None:
         return table
     for name, camera in run.quality.cameras.items():
         table.add_row(f"[bold]{escape(name)}[/], left / centre / right", "before -> after")
-        for told in (AT_FIELDS[key] for key in ("wfe_rms_waves", "mtf_along_line", "mtf_along_track")):
-            before, after = told.value(camera)
-            places = [run.quality.fields.index(field) for field in PLACES.values()]
-            table.add_row(escape(told.shown_head), " / ".join(f"{before[k]:.4f} -> {after[k]:.4f}" for k in places))
+        for quantity in (AT_FIELDS[key] for key in ("wfe_rms_waves", "mtf_along_line", "mtf_along_track")):
+            before, after = quantity.value(camera)
+            field_indices = [run.quality.fields.index(field) for field in POSITIONS.values()]
+            table.add_row(
+                escape(quantity.shown_head), " / ".join(f"{before[k]:.4f} -> {after[k]:.4f}" for k in field_indices)
+            )
     return table
 
 

@@ -19,7 +19,7 @@ from scenes.specs.instrument import Channel
 from scenes.specs.job import JobSpec
 from scenes.specs.job_tables import FinishTableSpec
 from scenes.specs.resolved import ResolvedJob
-from twin.framework.data_files import FRAME_FORMATS, SPOT_STRETCH, FrameFacts, GridData, Gridded, frame_files, netcdf
+from twin.framework.data_files import FRAME_FORMATS, SPOT_STEEPNESS, FrameFacts, GridData, Gridded, frame_files, netcdf
 from twin.framework.record import Quantity, Record
 from twin.framework.reference_frames import described, frames_text
 from twin.framework.run_folder import RunFolder
@@ -113,7 +113,7 @@ def _write_targets(targets: TargetRun, folder: RunFolder) -> None:
     """Write MTF and frames of the targets; previews of pinhole images are stretched to show their faint rings."""
     _write_numbers(folder, "mtf", targets.to_dict())
     for stem, name, frames, facts in targets.images():
-        for file, content in frame_files(stem, frames, facts, SPOT_STRETCH if name == "pinhole" else None):
+        for file, content in frame_files(stem, frames, facts, SPOT_STEEPNESS if name == "pinhole" else None):
             folder.write_bytes(file, content)
 
 
@@ -219,7 +219,7 @@ DEFORMATION: Record[NodalDeformation] = Record(
     Quantity("spacing_mm", lambda face: face.spacing, "distance of neighbouring nodes"),
     Quantity("rotate_arcsec", lambda face: face.rotate, "rigid rotation about X, Y and Z"),
     Quantity("shift_um", lambda face: face.shift, "rigid shift along X, Y and Z"),
-    Quantity("growth_ppm", lambda face: face.growth, "relative change of size"),
+    Quantity("growth_ppm", lambda face: face.expansion, "relative change of size"),
     Quantity("change_rms_nm", lambda face: face.rms(face.change), "change of sag without rigid motion and scale"),
     Quantity("change_pv_nm", lambda face: face.range(face.change), "peak to valley of that change"),
     Quantity("figure_nm", lambda face: {f"Z{j}": a for j, a in face.figure.items()}, "Zernike terms of the change"),

@@ -97,7 +97,7 @@ def write_run(run: JobRun, session: Session, picture: bool = False, beside: Seco
             folder.write_bytes(file, drawn[name])
     write_artefacts((a for section in sections for a in section.artefacts), folder)
     problems = [*missing, _pictures(run, session) if picture else ""]
-    pictures = [place for name in _PICTURES if (place := folder.path / name).exists()]
+    pictures = [path for name in _PICTURES if (path := folder.path / name).exists()]
     folder.write_text("report.html", render_report(run, sections, drawn.get(SCENE), pictures, drawn))
     warnings = [*judge(run).warnings, *missing]
     entries = {"backend": session.backend.name, "seed": run.seed, "frames": run.frames, "warnings": warnings}
@@ -246,13 +246,13 @@ def _repeat_command(run: JobRun, backend: str, pictures: bool) -> tuple[str, ...
     return (PROGRAM, "config.yaml", *options, *(("--picture",) if pictures else ()))
 
 
-def _picture(place: Path) -> Markup:
+def _picture(path: Path) -> Markup:
     """Return a rendered picture for the page, compressed as JPEG to a fifth of its file's size."""
-    image = cv2.imread(str(place))
+    image = cv2.imread(str(path))
     _, encoded = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])
     address = "data:image/jpeg;base64," + base64.b64encode(encoded.tobytes()).decode("ascii")
     figure = '<figure><img src="{0}" alt="{1}"><figcaption>{2}: <code>{1}</code></figcaption></figure>'
-    return Markup(figure).format(address, place.name, _PICTURES[place.name])
+    return Markup(figure).format(address, path.name, _PICTURES[path.name])
 
 
 if TYPE_CHECKING:
@@ -352,12 +352,12 @@ def _of_monitor(run: RenderRun) -> dict[str, Callable[[], Any]]:
     return out
 
 
-def _drawing(function: str, *given: Any) -> Callable[[], Any]:
+def _drawing(function: str, *arguments: Any) -> Callable[[], Any]:
     """Return a function that calls ``module:name`` with the given arguments and imports the module only then.
 
     The import takes a second, and only the process that draws needs it.
     """
-    return partial(Named(function if "." in function else f"{__package__}.{function}"), *given)
+    return partial(Named(function if "." in function else f"{__package__}.{function}"), *arguments)
 
 
 def _attempt(name: str, draw: Callable[[], Any]) -> Any:

@@ -437,7 +437,7 @@ def _unmeasured(experiment: MonitorExperiment, before: np.ndarray, error: SpotEr
     """
     channels, resolved = experiment.path.channels, experiment.resolved
 
-    def told(error: SpotError) -> str:
+    def what(error: SpotError) -> str:
         reasons = "; ".join(f"{channels[i % len(channels)].key}: {why}" for i, why in error.reasons.items())
         return f"a spot cannot be measured ({reasons})"
 
@@ -445,8 +445,8 @@ def _unmeasured(experiment: MonitorExperiment, before: np.ndarray, error: SpotEr
         mean, centroid = mean_of(before), resolved.job.analysis.centroid
         recover_monitor(mean, mean[None], experiment.calibration, centroid, frames=before.shape[-3])
     except SpotError as first:
-        return _no_spots(experiment, "; ".join([told(first), *_blurred(experiment, focus)]))
-    return _too_large(resolved, told(error))
+        return _no_spots(experiment, "; ".join([what(first), *_blurred(experiment, focus)]))
+    return _too_large(resolved, what(error))
 
 
 def _blurred(experiment: MonitorExperiment, focus: SpotFocus) -> tuple[str, ...]:

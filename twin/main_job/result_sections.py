@@ -159,7 +159,7 @@ def _state_table(run: RenderRun, name: str, title: str) -> Table:
     rows: list[list[Cell]] = []
     bands: dict[int, str] = {}
     good = dict.fromkeys(run.estimators, 0)
-    stated = run.experiment.stated is not None
+    has_prior = run.experiment.stated is not None
     for rows_of_change in table.by_change():
         first, p = rows_of_change[0], rows_of_change[0].parameter
         heading = part_title(run, first)
@@ -174,7 +174,7 @@ def _state_table(run: RenderRun, name: str, title: str) -> Table:
             hint = f"σ of noise alone: {fixed(reading.noise, decimals_for(reading.noise))} {p.unit}"
             text = f"{reading.shown(reading.value)} ± {reading.shown(reading.sigma)}"
             row.append(residual_cell(text, ratio, f"{key}.{reading.estimator}", hint))
-        if stated:
+        if has_prior:
             noise = next(reading.noise for reading in rows_of_change if reading.estimator == run.judged)
             row.append(Marked(fixed(noise, decimals_for(noise)), "", "number", f"{key}.noise"))
         rows.append(row)
@@ -182,14 +182,14 @@ def _state_table(run: RenderRun, name: str, title: str) -> Table:
     within = ", ".join(f"{e.title} {good[name]} of {len(rows)}" for name, e in run.estimators.items())
     caption = (
         f"± is one standard deviation. {assumed(run.reading)}. "
-        + ("The noise part of other estimators is shown when pointing at a value. " if stated else "")
+        + ("The noise part of other estimators is shown when pointing at a value. " if has_prior else "")
         + f"Below each value (recovered − true) in σ, ● within {FAR:g} σ, ▲ beyond. Within {FAR:g} σ: {within}."
     )
     return Table(
         "recovered",
         title,
         caption,
-        [*heads, *([f"σ of noise, {run.estimators[run.judged].title}"] if stated else ())],
+        [*heads, *([f"σ of noise, {run.estimators[run.judged].title}"] if has_prior else ())],
         rows,
         bands=bands,
         within=IN_PAGE,
@@ -264,8 +264,8 @@ def glance_table(run: RenderRun) -> Table:
     return Table("glance-table", title, caption, heads, rows, bands=bands, within=IN_PAGE, full=full)
 
 
-def _range(values: np.ndarray, places: int) -> str:
-    low, high = (fixed(float(end), places) for end in (values.min(), values.max()))
+def _range(values: np.ndarray, decimals: int) -> str:
+    low, high = (fixed(float(end), decimals) for end in (values.min(), values.max()))
     low, high = low.strip(MINUS) if not low.strip(f"{MINUS}0.") else low, high
     return low if low == high else f"{low} … {high}"
 
@@ -278,8 +278,8 @@ def _worst(run: RenderRun, series: TimeSeries) -> str:
     candidates = [row for row in series.readings.of(run.judged) if row.parameter.key == "d_alpha_arcsec"]
     worst = max(candidates, key=lambda row: float(np.max(np.abs(row.error))))
     k = int(np.argmax(np.abs(worst.error)))
-    places = decimals_for(float(worst.sigma[k]))
-    error, true = (fixed(float(number[k]), places, sign=True) for number in (worst.error, worst.true))
+    decimals = decimals_for(float(worst.sigma[k]))
+    error, true = (fixed(float(number[k]), decimals, sign=True) for number in (worst.error, worst.true))
     return (
         f"The largest error of Δα by {run.estimators[run.judged].title} is {error} arcsec, camera {worst.camera} at "
         f"{moment(float(series.times[k]))}, where the true change is {true} arcsec."
@@ -309,7 +309,7 @@ def course_sections(run: RenderRun, drawn: Mapping[str, str], shown: Table) -> t
             f"{len(series.times)} times (marks, side by side), with bars of one σ where they are larger than the "
             f"marks. {assumed(run.reading)}. Where marks leave the line, the monitor misreads another motion as a "
             "change of the camera.",
-            full=_every_time(run),
+            full=_table_of_all_times(run),
         )
     ]
     if series.smoothed is not None:
@@ -341,7 +341,7 @@ def course_sections(run: RenderRun, drawn: Mapping[str, str], shown: Table) -> t
     )
 
 
-def _every_time(run: RenderRun) -> Table:
+def _table_of_all_times(run: RenderRun) -> Table:
     """Return the table of every estimated change at every time, with all digits."""
     assert run.series is not None
     rows: list[list[Cell]] = []
@@ -402,8 +402,8 @@ def spot_section(run: RenderRun, drawn: Mapping[str, str]) -> Section:
 
 
 def _with_sigma(value: float, sigma: float, sign: bool = False) -> str:
-    places = decimals_for(sigma)
-    return f"{fixed(value, places, sign)} ± {fixed(sigma, places)}"
+    decimals = decimals_for(sigma)
+    return f"{fixed(value, decimals, sign)} ± {fixed(sigma, decimals)}"
 
 
 def residual_section(run: RenderRun, drawn: Mapping[str, str]) -> Section:
@@ -417,27 +417,27 @@ def residual_section(run: RenderRun, drawn: Mapping[str, str]) -> Section:
     notes = []
     judged_rows = [r for r in run.reading.table.of(run.judged) if r.camera]
     for name in run.experiment.instrument.cameras:
-        found = systematics(run, name)
-        for k, r in enumerate(one for one in judged_rows if one.camera == name):
-            bias, places = float(found.bias[run.judged][k]), decimals_for(r.noise)
-            error, expected, left = (fixed(v, places, sign=True) for v in (r.error, bias, r.error - bias))
+        systematic = systematics(run, name)
+        for k, r in enumerate(reading for reading in judged_rows if reading.camera == name):
+            bias, decimals = float(systematic.bias[run.judged][k]), decimals_for(r.noise)
+            error, expected, left = (fixed(v, decimals, sign=True) for v in (r.error, bias, r.error - bias))
             texts = (error, residual_text(residual(r.error, r.sigma)), expected, left)
             cells = [Marked(text, "", "number") for text in texts]
             judged = residual_cell("", residual(r.error - bias, r.noise), "")
             rows.append([name, r.parameter.label, *cells, judged])
             row: list[Cell] = [name, r.parameter.symbol, r.parameter.unit, r.error, r.sigma, r.noise]
             full.append([*row, bias, r.error - bias])
-        outside, uncovered = joined(found.outside), joined(found.uncovered)
-        said = f"motions outside the family: {outside}." if outside else ""
-        said = "no motions outside the family." if not outside and not uncovered else said
+        outside, uncovered = joined(systematic.outside), joined(systematic.uncovered)
+        outside_text = f"motions outside the family: {outside}." if outside else ""
+        outside_text = "no motions outside the family." if not outside and not uncovered else outside_text
         if uncovered:
-            said += f" Perturbed but in no row of the table, so that the effect is unexplained: {uncovered}."
-        notes.append(f"{name}: {said.strip()}")
+            outside_text += f" Perturbed but in no row of the table, so that the effect is unexplained: {uncovered}."
+        notes.append(f"{name}: {outside_text.strip()}")
     heads = ["camera", "parameter", "unit", f"{title} - true", "sigma", "sigma noise", "expected from the crosstalk"]
-    stated = run.experiment.stated is not None
+    prior_note = run.experiment.stated is not None
     far = (
         "Far outside: larger motions than the prior expects, or other ones."
-        if stated
+        if prior_note
         else "Inside the band: noise. Far outside: the formula has a wrong factor, or a body moved that the "
         "estimators do not model."
     )
@@ -479,7 +479,7 @@ def facts(run: JobRun) -> tuple[tuple[str, str], ...]:
         return ("Assumptions", f"{without} {expansion_text}"), instrument_fact, *as_built_fact
     monitor, ccd, bits = spec.autocollimator, spec.autocollimator.area_ccd, resolved.area_detector.bit_depth
     fields = [float(np.degrees(channel.field)) for name in spec.cameras for channel in spec.channels_of(name).values()]
-    family = "; ".join(e.title for e in run.estimators.values() if not e.stated)
+    family = "; ".join(e.title for e in run.estimators.values() if not e.needs_prior)
     judged = run.estimators[run.judged].title
     about = (
         "These estimators assume shifts of the line CCD along X and Y, its rotation about Z and a scale of the whole "
@@ -547,9 +547,9 @@ def setup_section(run: JobRun) -> Section:
     heads += ["pitch [µm]", "line [mm]", *(["distance of the area CCDs [mm]"] if instrument.channels else [])]
     decimals = (None, None, 2, 4, 1, None, None, 1, 2)[: len(heads)]
     cameras = Table("cameras", "Cameras", "", heads, rows, decimals, within=IN_PAGE)
-    stated = () if run.experiment.stated is None else (_prior_table(run),)
-    title = "Cameras, and the prior on disturbances" if stated else "Cameras"
-    return Section(title, (), (*stated, cameras), closed=True)
+    prior_tables = () if run.experiment.stated is None else (_prior_table(run),)
+    title = "Cameras, and the prior on disturbances" if prior_tables else "Cameras"
+    return Section(title, (), (*prior_tables, cameras), closed=True)
 
 
 def _prior_table(run: JobRun) -> Table:

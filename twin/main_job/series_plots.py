@@ -156,8 +156,8 @@ def _changes_svg(
         figure = svg.new_figure(0.7 + height * rows)
         grid = figure.add_gridspec(rows, wide * len(cameras))
 
-        def put(place: Any, same: list[Reading], title: str, label: str, last: bool = True) -> None:
-            axes = figure.add_subplot(place)
+        def put(cell: Any, same: list[Reading], title: str, label: str, last: bool = True) -> None:
+            axes = figure.add_subplot(cell)
             panel(axes, same)
             axes.set_ylabel(label)
             if title:
@@ -207,5 +207,5 @@ def _frame(axes: Axes, series: TimeSeries, time: np.ndarray) -> None:
     axes.yaxis.set_major_formatter(_number_text)
 
 
-def _number_text(value: float, place: float) -> str:
+def _number_text(value: float, position: float) -> str:
     return f"{round(value, 9) + 0.0:g}".replace("-", MINUS)

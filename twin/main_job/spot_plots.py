@@ -24,7 +24,7 @@ from twin.main_job.systematics import assumed
 from twin.main_job.verdict import limited
 from twin.monitor.crosstalk import CameraCrosstalk
 
-STRETCH = 150.0
+PEAK_TO_LINEAR = 150.0
 """Ratio of the peak to the level up to which the asinh stretch of images is linear."""
 _LEGEND: dict[str, Any] = {"frameon": True, "facecolor": "black", "edgecolor": "none", "framealpha": 0.7}
 _LEAST_CORE = 7.0
@@ -36,11 +36,11 @@ def mean_images(run: RenderRun) -> tuple[np.ndarray, np.ndarray]:
     return mean_of(run.before), mean_of(run.after)
 
 
-def stretch(images: np.ndarray) -> Normalize:
+def asinh_scale(images: np.ndarray) -> Normalize:
     """Return the asinh stretch of grey values that several images have in common, from background to peak."""
     low, high = float(np.percentile(images, 5)), float(images.max())
     high = max(high, low + 1.0)
-    return AsinhNorm(linear_width=(high - low) / STRETCH, vmin=low, vmax=high)
+    return AsinhNorm(linear_width=(high - low) / PEAK_TO_LINEAR, vmin=low, vmax=high)
 
 
 def cross(axes: Axes, at: np.ndarray, colour: str, size: float, label: str | None = None) -> None:
@@ -77,7 +77,7 @@ def spots_svg(run: RenderRun, camera: str) -> str:
 def _draw(run: RenderRun, camera: str) -> Figure:
     channels = [i for i, c in enumerate(run.experiment.path.channels) if c.camera == camera]
     before, after = mean_images(run)
-    norm = stretch(np.stack([before[channels], after[channels]]))
+    norm = asinh_scale(np.stack([before[channels], after[channels]]))
     difference = after - before
     largest = max(float(np.abs(difference[channels]).max()), 1.0)
     figure = svg.new_figure(0.5 + 2.62 * len(channels), {"w_pad": 0.03, "h_pad": 0.03, "wspace": 0.01, "hspace": 0.02})
@@ -166,7 +166,9 @@ def residuals_svg(run: RenderRun) -> str:
     panels: dict[str, dict[str, dict[str, float | None]]] = {}
     for same in run.reading.table.by_change():
         panel = panels.setdefault(part_title(run, same[0]), {})
-        panel[same[0].parameter.symbol] = {one.estimator: residual(one.error, one.sigma) for one in same}
+        panel[same[0].parameter.symbol] = {
+            reading.estimator: residual(reading.error, reading.sigma) for reading in same
+        }
     with svg.look("residuals"):
         rows = [len(panel) for panel in panels.values()]
         figure = svg.new_figure(1.0 + 0.36 * sum(rows) + 0.32 * len(rows))
@@ -274,7 +276,7 @@ def glance_svg(run: RenderRun) -> str:
     with svg.look("glance"):
         channels = run.experiment.path.channels
         before, after = mean_images(run)
-        norm = stretch(before)
+        norm = asinh_scale(before)
         starts, ends = run.recovery.before[0], run.recovery.after[0]
         windows, half = _windows(run)
         across = min(max(len(channels), 1), 4)
@@ -303,7 +305,7 @@ def glance_svg(run: RenderRun) -> str:
 
 def _windows(run: RenderRun) -> tuple[list[tuple[float, float, float]], float]:
     """Return the window on the core of each channel, and the half-width that all pictures share, in pixels."""
-    radius = REACH * airy_radius(run) / 0.75
+    radius = MARGIN * airy_radius(run) / 0.75
     windows = [core_window(*ends, radius) for ends in zip(run.recovery.before[0], run.recovery.after[0], strict=True)]
     return windows, max((window[2] for window in windows), default=1.0)
 
@@ -326,7 +328,7 @@ NOTE, LONGEST_NOTE = 0.85, 150
 """Height of a line of notes below the table, in heights of a table row, and number of characters per line."""
 FIRST = 0.22
 """Right edge of the column of true values, as a fraction of the picture's width."""
-REACH = 2.2
+MARGIN = 2.2
 """Margin of the spot images around the two spot centres (before and after), in Airy radii."""
 
 
@@ -346,7 +348,7 @@ def _drawn_summary(run: RenderRun) -> Figure:
     figure = Figure(figsize=(WIDTH, sum(heights)), facecolor="white")
     top = heights[0] / sum(heights)
     before, after = mean_images(run)
-    norm = stretch(before)
+    norm = asinh_scale(before)
     positions = run.recovery.before[0], run.recovery.after[0]
     height = picture / sum(heights)
     windows, half = _windows(run)

@@ -86,7 +86,7 @@ def _parts(run: RenderRun, camera: str, amounts: dict[str, np.ndarray]) -> dict[
     k = names.index(camera)
     gain = rows_of(run.reading.cameras[camera]) @ run.gains[run.judged][4 * k : 4 * k + 4]
     # an estimator with a prior weighs all motions and reads none of them exactly
-    modelled = 0 if run.estimators[run.judged].stated else _FAMILY
+    modelled = 0 if run.estimators[run.judged].needs_prior else _FAMILY
     out: dict[tuple[str, str, int], tuple[str, np.ndarray]] = {}
     coordinates = {name: run.experiment.instrument.coordinates_of(name) for name in names}
     for name, table in run.crosstalk.items():
@@ -328,7 +328,7 @@ def _jump_sentences(together: SmoothedCourse) -> tuple[str, ...]:
 def _series_agrees(together: SmoothedCourse, times: np.ndarray) -> str:
     test = together.consistency
     what = f"Chi-square of all {len(times)} measurements is {test.chi_square:.4g}"
-    if test.chance > 1.0 - FALSE_ALARM:
+    if test.p_value > 1.0 - FALSE_ALARM:
         return (
             f"{what} for {test.degrees} degrees of freedom: the motions are smaller than the prior expects, and the "
             "sigmas are too large."

@@ -28,7 +28,7 @@ from twin.framework.svg import (
     signed_map,
     to_svg,
 )
-from twin.monitor.image_quality import PLACES, ImageQuality, PupilOutline
+from twin.monitor.image_quality import POSITIONS, ImageQuality, PupilOutline
 from twin.targets.target_images import DIRECTION_NAMES, DIRECTIONS
 from twin.targets.target_measurement import NYQUIST, BarReading, CameraTargets, EdgeReading
 
@@ -38,7 +38,7 @@ BAND = 2.0
 """Half-width of the uncertainty band about zero in the panels of MTF differences, in sigmas."""
 _LEAST_SPAN = 4.0
 """Smallest half-height of the panels of MTF differences, in units of 0.001."""
-EVERY = 2
+STRIDE = 2
 """Number of spatial frequencies from one marker of the measured MTF to the next."""
 _IMAGE_NAMES = {
     "knife_edge_along": "knife edge, along line,\nmiddle 40 px",
@@ -54,7 +54,7 @@ Other targets have their own names; uniform fields are not shown.
 """
 _CROPS = {"knife_edge_along": 40, "knife_edge_track": 40, "pinhole": 24}
 """Target -> side of the part of its image that is shown, in pixels; images without an entry are shown whole."""
-STRETCH = 100.0
+PEAK_TO_LINEAR = 100.0
 """Ratio of the peak to the level up to which the stretch of a pinhole's image is linear."""
 
 
@@ -66,7 +66,7 @@ def curves_svg(name: str, camera: CameraTargets) -> str:
         panels = figure.subplots(
             len(heights), len(camera.places), sharex=True, sharey="row", squeeze=False, height_ratios=heights
         )
-        for column, (place, targets) in enumerate(camera.places.items()):
+        for column, (position, targets) in enumerate(camera.places.items()):
             for row, direction in enumerate(DIRECTIONS):
                 axes, below = panels[2 * row : 2 * row + 2, column]
                 nyquist = 1e-3 * NYQUIST / camera.pitch
@@ -82,7 +82,7 @@ def curves_svg(name: str, camera: CameraTargets) -> str:
                     if direction in shots.bars:
                         _bars(axes, when, shots.bars[direction], camera.pitch)
                 axes.set(xlim=(0.0, 2.0 * nyquist), ylim=(0.0, 1.03))
-                axes.set_title(f"{place}, {DIRECTION_NAMES[direction]}", loc="left")
+                axes.set_title(f"{position}, {DIRECTION_NAMES[direction]}", loc="left")
                 if column == 0:
                     axes.set_ylabel("MTF with the pixel")
                     below.set_ylabel("error [10$^{-3}$]")
@@ -106,7 +106,7 @@ def _curve(axes: Axes, when: str, edge: EdgeReading) -> None:
     if measured is None:
         return
     axes.plot(
-        frequency[::EVERY], measured.mtf[::EVERY], MARKS[when], color=colour, ms=3.2, mec="white", mew=0.4,
+        frequency[::STRIDE], measured.mtf[::STRIDE], MARKS[when], color=colour, ms=3.2, mec="white", mew=0.4,
         label=f"measured, {when}",
     )  # fmt: skip
 
@@ -133,19 +133,19 @@ def _bars(axes: Axes, when: str, bars: BarReading, pitch: float) -> None:
 def _norm(target: str, image: np.ndarray) -> Normalize:
     low, high = float(image.min()), max(float(image.max()), float(image.min()) + 1.0)
     if target == "pinhole":
-        return AsinhNorm(linear_width=(high - low) / STRETCH, vmin=low, vmax=high)
+        return AsinhNorm(linear_width=(high - low) / PEAK_TO_LINEAR, vmin=low, vmax=high)
     return Normalize(low, high)
 
 
 def images_svg(name: str, camera: CameraTargets) -> str:
     """Draw mean images: a row for each target, columns for the positions in the field, each before and after."""
-    columns = [(place, when) for place in camera.places for when in COLOURS]
+    columns = [(position, when) for position in camera.places for when in COLOURS]
     names = [name for name in next(iter(camera.places.values())).before.frames if name in {*_IMAGE_NAMES, *TARGETS}]
     with look(f"targets-{name}"):
         figure = new_figure(0.45 + 1.68 * len(names), {"w_pad": 0.02, "h_pad": 0.02, "wspace": 0.01, "hspace": 0.01})
         grid = figure.subplots(len(names), len(columns), squeeze=False)
-        for column, (place, when) in enumerate(columns):
-            shots = camera.places[place].shots[when]
+        for column, (position, when) in enumerate(columns):
+            shots = camera.places[position].shots[when]
             for row, target in enumerate(names):
                 axes = grid[row, column]
                 mean = np.asarray(shots.frames[target].mean(axis=0))
@@ -155,7 +155,7 @@ def images_svg(name: str, camera: CameraTargets) -> str:
                 axes.set_xticks([])
                 axes.set_yticks([])
                 if row == 0:
-                    axes.set_title(f"{place}, {when}")
+                    axes.set_title(f"{position}, {when}")
                 if column == 0:
                     axes.set_ylabel(_IMAGE_NAMES.get(target, target.replace("_", " ")))
         return to_svg(figure)
@@ -169,15 +169,15 @@ def pupils_svg(quality: ImageQuality) -> str:
 
     Shadows of the nominal state are filled, those of the perturbed state outlined.
     """
-    where = {place: quality.fields.index(field) for place, field in PLACES.items()}
+    where = {position: quality.fields.index(field) for position, field in POSITIONS.items()}
     with look("pupils"):
         figure = new_figure(0.6 + 2.9 * len(quality.cameras))
         panels = figure.subplots(len(quality.cameras), len(where), squeeze=False, sharex=True, sharey=True)
         for row, (name, camera) in zip(panels, quality.cameras.items(), strict=True):
-            for axes, (place, k) in zip(row, where.items(), strict=True):
+            for axes, (position, k) in zip(row, where.items(), strict=True):
                 lost = camera.light_lost[0, k], camera.light_lost[-1, k]
                 text = " \N{RIGHTWARDS ARROW} ".join("?" if np.isnan(v) else f"{100.0 * v:.2f} %" for v in lost)
-                axes.set_title(f"{name}, {place}: {text}")
+                axes.set_title(f"{name}, {position}: {text}")
                 states = [pupils[k] for pupils in (camera.pupils[0], camera.pupils[-1]) if len(pupils) > k]
                 _draw(axes, states)
             row[0].set_ylabel("along the track, X\N{PRIME}")
@@ -221,7 +221,7 @@ def deformation_svg(faces: Mapping[str, NodalDeformation]) -> str:
 def _deformation(figure: Figure, axes: Any, path: str, face: NodalDeformation) -> None:
     """Draw the maps of one body's deformation; each node of its table colours its cell of the aperture."""
     inside = face.weight > 0.0
-    points = face.places[inside]
+    points = face.points[inside]
     low, high = points.min(axis=0), points.max(axis=0)
     step = float(np.max(high - low)) / _PIXELS
     x, y = (np.arange(a, b + step, step) for a, b in zip(low, high, strict=True))

@@ -173,17 +173,17 @@ def _nothing(run: RenderRun, rows: tuple[Reading, ...], wrong: list[Reading]) ->
     if not wrong:
         return f"Nothing was perturbed, and {_within(run, rows, 'zero')}", _undetectable(run, rows)
     worst = max(wrong, key=lambda r: abs(r.ratio))
-    chance = _chance(worst.ratio, len(rows))
-    why = "check the warnings and the spots" if chance < FALSE_ALARM else "this is consistent with chance"
+    probability = _exceedance(worst.ratio, len(rows))
+    why = "check the warnings and the spots" if probability < FALSE_ALARM else "this is consistent with chance"
     return (
         f"Nothing was perturbed, but {len(wrong)} of {len(rows)} readings of the {_title(run)} "
         f"{_are(wrong)} beyond {FAR:g} σ",
-        f"the worst is {worst.name}, {worst.read}; chance alone causes such a reading in {100.0 * chance:.2g} % of "
-        f"such runs: {why}",
+        f"the worst is {worst.name}, {worst.read}; chance alone causes such a reading in {100.0 * probability:.2g} % "
+        f"of such runs: {why}",
     )
 
 
-def _chance(ratio: float, count: int) -> float:
+def _exceedance(ratio: float, count: int) -> float:
     """Return the probability that the largest of ``count`` standard normal numbers exceeds ``ratio`` in magnitude."""
     return float(-np.expm1(count * np.log1p(-2.0 * ndtr(-abs(ratio)))))
 
@@ -277,7 +277,7 @@ def _score(rows: tuple[Reading, ...], wrong: list[Reading], suffix: str = "") ->
 
 def _misread_reason(run: RenderRun) -> str:
     """Return a sentence on why an estimator reports wrong changes for the motion of this run."""
-    if run.estimators[run.judged].stated:
+    if run.estimators[run.judged].needs_prior:
         return "larger than the prior expects"
     return f"outside the family of the {_title(run)}"
 
@@ -293,10 +293,10 @@ def _cause(run: RenderRun, worst: Reading, count: int) -> str:
     weights = combination(run.reading, worst.group, worst.parameter.key).reshape(-1, 4) / PER_SI
     used = [name for name, weight in zip(cameras, weights, strict=True) if np.any(weight)]
     bias = sum(float(w @ biases[name].bias[run.judged][:4]) for name, w in zip(cameras, weights, strict=True))
-    chance = _chance(worst.ratio, count)
-    if chance > FALSE_ALARM and abs(bias) < 0.5 * abs(worst.error):
+    probability = _exceedance(worst.ratio, count)
+    if probability > FALSE_ALARM and abs(bias) < 0.5 * abs(worst.error):
         advice = "take more frames" if _noise_only(run) else "take more measurements"
-        return f"chance alone causes such an error in {100.0 * chance:.2g} % of such runs: {advice} to decide"
+        return f"chance alone causes such an error in {100.0 * probability:.2g} % of such runs: {advice} to decide"
     parts: dict[str, float] = {}
     for name in used:
         for text, vector in biases[name].parts.items():
@@ -313,7 +313,7 @@ def _cause(run: RenderRun, worst: Reading, count: int) -> str:
             )
         return f"motions {_misread_reason(run)} cause it together ({_largest(parts)}): see Crosstalk"
     uncovered = joined([name for camera in used for name in biases[camera].uncovered])
-    if uncovered and run.estimators[run.judged].stated:
+    if uncovered and run.estimators[run.judged].needs_prior:
         return f"{uncovered} contribute, which the crosstalk table does not contain: see Residuals"
     if uncovered:
         return (
@@ -344,7 +344,7 @@ def _series_verdict(
     unit = worst.parameter.unit
     uncovered = joined([name for camera in run.crosstalk for name in systematics(run, camera).uncovered])
     cause = f"motions {_misread_reason(run)} contribute"
-    if uncovered and not run.estimators[run.judged].stated:
+    if uncovered and not run.estimators[run.judged].needs_prior:
         cause = f"the {_title(run)} does not model {uncovered}"
     size = "the noise is" if _noise_only(run) else "σ is"
     return (
@@ -441,7 +441,7 @@ def _beyond_prior(run: RenderRun, rows: tuple[Reading, ...], warned: tuple[str, 
 def _misreadings(run: RenderRun) -> tuple[str, ...]:
     """Return a warning for every estimate that is wrong by more than its change, and by more than chance allows."""
     changes: dict[tuple[str, str], list[Reading]] = {}
-    for reading in (one for estimator in run.estimators for one in readings(run, estimator)):
+    for reading in (candidate for estimator in run.estimators for candidate in readings(run, estimator)):
         changes.setdefault((reading.group, reading.parameter.key), []).append(reading)
     limit = alarm_limit(sum(map(len, changes.values())))
     out = []
@@ -454,9 +454,9 @@ def _misreadings(run: RenderRun) -> tuple[str, ...]:
         who: dict[str, list[str]] = {}
         for r in wrong:
             who.setdefault(f"{r.shown(r.value)} ± {r.shown(r.sigma)}", []).append(run.estimators[r.estimator].title)
-        said = ", ".join(f"{value} ({'; '.join(titles)})" for value, titles in who.items())
+        values_read = ", ".join(f"{value} ({'; '.join(titles)})" for value, titles in who.items())
         out.append(
             f"{first.name} [{first.parameter.unit}] is misread by more than the change itself: {how}it is "
-            f"{first.shown(first.true)}, read as {said}"
+            f"{first.shown(first.true)}, read as {values_read}"
         )
     return tuple(out)

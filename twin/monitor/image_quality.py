@@ -52,7 +52,7 @@ from scenes.specs.spectrum import SpectrumSpec
 from twin.framework.record import Quantity, Record
 from twin.sensors.line_ccd import band_factors
 
-CUT_MEAN_DEGREE = 14
+VIGNETTED_MEAN_DEGREE = 14
 """Degree of the polynomials that continue a wavefront into the part of the beam that edges of surfaces cut off."""
 
 
@@ -82,10 +82,10 @@ class PupilMean:
         points, weight = shadows.points, shadows.weights
         count = len(points)
         all_weights = np.concatenate([np.broadcast_to(nodes.weight, (count, nodes.count)), -weight], axis=1)
-        self._share = all_weights / np.maximum(np.sum(all_weights, axis=1, keepdims=True), _SOME)
+        self._share = all_weights / np.maximum(np.sum(all_weights, axis=1, keepdims=True), _LEAST_SHARE)
         shadow_tilts = zernike.basis(3, points.real.ravel(), points.imag.ravel()).reshape(*points.shape, 3)
         self._tilts = np.concatenate([np.broadcast_to(tilts, (count, *tilts.shape)), shadow_tilts], axis=1)
-        degree = DEGREE if free is None else CUT_MEAN_DEGREE
+        degree = DEGREE if free is None else VIGNETTED_MEAN_DEGREE
         self._to_terms = to_terms(nodes, degree)
         self._on_stop = products(nodes.x, nodes.y, degree)
         self._added = products(points.real, points.imag, degree)
@@ -114,14 +114,14 @@ class PupilMean:
         return np.asarray(values - np.squeeze(self._tilts @ level, -1))
 
 
-_SOME = 1e-3
+_LEAST_SHARE = 1e-3
 """Smallest illuminated area of a stop, in units of its radius squared, for which a mean is defined."""
 
 
 FIELDS = (1.0, 0.7, 0.0, -0.7, -1.0)
 """Field points along the line CCD, as fractions of half its length: +1 is its left end (+Y'), -1 its right end."""
 
-PLACES = {"left": 1.0, "centre": 0.0, "right": -1.0}
+POSITIONS = {"left": 1.0, "centre": 0.0, "right": -1.0}
 """Field points that result files name: name -> position, as a fraction of half the line's length."""
 
 WAVELENGTH = 650e-9
@@ -258,7 +258,9 @@ class ImageQuality:
 
     def state(self, number: int) -> dict[str, CameraState]:
         """Return camera -> its image quality in the state with index ``number``, for result files."""
-        positions = {position: self.fields.index(field) for position, field in PLACES.items() if field in self.fields}
+        positions = {
+            position: self.fields.index(field) for position, field in POSITIONS.items() if field in self.fields
+        }
         return {name: CameraState(camera, number, positions) for name, camera in self.cameras.items()}
 
 
@@ -268,14 +270,14 @@ class CameraState:
 
     camera: CameraQuality
     number: int
-    places: Mapping[str, int]
+    positions: Mapping[str, int]
 
     def named(self, values: np.ndarray) -> dict[str, float | None]:
         """Return name of the field point -> value in this state.
 
         ``values`` holds the values in S states at F field points, (S, F).
         """
-        return {position: _known(values[self.number, k]) for position, k in self.places.items()}
+        return {position: _known(values[self.number, k]) for position, k in self.positions.items()}
 
 
 def _known(value: float | np.floating[Any]) -> float | None:
@@ -309,7 +311,7 @@ Result files, reports and scripts all take the quantities from this list.
 """
 
 
-def _at_places(quantity: Quantity[CameraQuality]) -> Quantity[CameraState]:
+def _at_positions(quantity: Quantity[CameraQuality]) -> Quantity[CameraState]:
     """Return a quantity for one state at the named field points, made from that for all states and field points."""
     return Quantity(
         quantity.key,
@@ -325,7 +327,7 @@ _CAMERA: Record[CameraState] = Record(
     Quantity(
         "wfe_worst_waves", lambda of: _known(np.max(of.camera.wfe[of.number])), "wavefront error of the worst field"
     ),
-    *map(_at_places, list(AT_FIELDS)[2:]),
+    *map(_at_positions, list(AT_FIELDS)[2:]),
     Quantity(
         "obstructed_by",
         lambda of: {k: of.named(v) for k, v in of.camera.bodies.items()},
@@ -583,9 +585,9 @@ class _CameraBench:
         axis = self.instrument.camera_axes(name)[:, 1]
         guess = self.instrument.toward_optics(placed, name)[:, None]
         points = points_to_world(placed, self.body, self.points).real
-        places, sight = chief_rays(self.backend, to_stop, to_object, points, guess, axis)
+        points_of_line, sight = chief_rays(self.backend, to_stop, to_object, points, guess, axis)
         owner = np.repeat(np.arange(len(states)), len(self.points))
-        launch = (places + LAUNCH_DISTANCE * sight).reshape(-1, 3)
+        launch = (points_of_line + LAUNCH_DISTANCE * sight).reshape(-1, 3)
         heading = -sight.reshape(-1, 3)
 
         def launch_beams(colour: float) -> tuple[SystemBatch, ImagingRays]:
@@ -743,7 +745,7 @@ class _CameraBench:
                 )
                 for colour, share in zip(colours, shares, strict=True):
                     (directions,) = line_transfers(vignetted, [float(colour)], np.eye(2), self.nyquist, 2)
-                    total[k] += share * np.array([way.values[1] for way in directions])
+                    total[k] += share * np.array([transfer.values[1] for transfer in directions])
             except UnphysicalError:
                 known[k] = False
         return total, known

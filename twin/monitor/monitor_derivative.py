@@ -63,7 +63,7 @@ def ray_tangents(path: MonitorBeams, motions: Sequence[ElementaryMotion]) -> tup
         Derivatives for C channels x M motions (all motions of a channel together), in each CCD's frame, per radian,
         metre or unit; and those of the CCDs' sizes, (C*M,).
     """
-    states, steps = _of_one_structure(path, pivot_states(motions)), [motion.step for motion in motions]
+    states, steps = _of_equal_structure(path, pivot_states(motions)), [motion.step for motion in motions]
     placed = path.instrument.assembly.place(states, steps)
     source = np.concatenate([placed.translation[:, placed.index[c.reticle_body]].imag for c in path.channels])
     nominal, m = path.nominal, len(motions)
@@ -86,7 +86,7 @@ def ray_tangents(path: MonitorBeams, motions: Sequence[ElementaryMotion]) -> tup
     return propagate("monitor", np.einsum("bnk,bnkx->bnx", q_step, np.repeat(axes, m, axis=0))), sizes
 
 
-def _of_one_structure(path: MonitorBeams, states: list[State]) -> list[State]:
+def _of_equal_structure(path: MonitorBeams, states: list[State]) -> list[State]:
     """Return states that all have the same numerical structure, so that one compiled kernel serves all motions.
 
     The first state gets the highest figure term of every mirror, with amplitude 0.

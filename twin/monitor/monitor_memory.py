@@ -104,7 +104,7 @@ class MonitorSize:
     pictures: int = 0
 
     @classmethod
-    def stated(cls, resolved: ResolvedJob, frames: int, times: int = 0, pictures: int = 0) -> MonitorSize:
+    def of_job(cls, resolved: ResolvedJob, frames: int, times: int = 0, pictures: int = 0) -> MonitorSize:
         """Return the size that an instrument's files specify, before the instrument is built.
 
         Parameters

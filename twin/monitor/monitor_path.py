@@ -101,11 +101,11 @@ class MonitorPath(MonitorBeams):
             No quadrature is sufficient.
         """
         if self._nodes is None:
-            self._nodes = self.node_classes.nodes(self._own_class)
+            self._nodes = self.node_classes.nodes(self._image_class)
         return self._nodes
 
     @cached_property
-    def _own_class(self) -> int:
+    def _image_class(self) -> int:
         """Index of the class of pupil nodes (see ``NodeClasses``) that the unperturbed instrument needs."""
         coarse = self.coarse_trace([{}])
         far = np.broadcast_to((1.0 - 1e-9) * SPOT_RANGES[-1] * 0.5 * np.array(self.shape), coarse.centre.shape)
@@ -114,7 +114,7 @@ class MonitorPath(MonitorBeams):
 
     def class_beams(self, number: int) -> MonitorBeams:
         """Return the monitor's beams traced at the pupil nodes of the class with index ``number``."""
-        if not self._sized or number == self._own_class:
+        if not self._sized or number == self._image_class:
             return self
         if number not in self._class_beams:
             self._class_beams[number] = self._with(self.node_classes.nodes(number))
@@ -366,7 +366,7 @@ class MonitorPath(MonitorBeams):
             An image is inaccurate even with the most nodes, or its light does not equal that of its rays.
         """
         beams, response = self.class_beams(number), self._response_of(coarse)
-        y, x = (self.grid(axis, margin + response.reach) for axis in (0, 1))
+        y, x = (self.grid(axis, margin + response.half_width) for axis in (0, 1))
         rays = beams.rays(states, coarse)
         waves = image(beams.field_of(rays), x, y, single)
         wanted, last = np.full(len(states), number), len(self.node_classes.reached) - 1

@@ -304,13 +304,13 @@ def reading_table(
         for k, parameter in enumerate(which):
             for estimator, (values, sigmas, noises) in read.items():
                 value = values[:, k]
-                own = np.full_like(value, np.nan) if true is None else true[:, k]
+                true_value = np.full_like(value, np.nan) if true is None else true[:, k]
                 sigma, noise = sigmas[:, k], noises[:, k]
                 if (group, parameter.key) in fixed_changes and (
-                    estimator not in ESTIMATORS or ESTIMATORS[estimator].stated
+                    estimator not in ESTIMATORS or ESTIMATORS[estimator].needs_prior
                 ):
                     value = sigma = noise = np.full_like(value, np.nan)
-                rows.append(Reading(group, parameter, estimator, own, value, value - own, sigma, noise))
+                rows.append(Reading(group, parameter, estimator, true_value, value, value - true_value, sigma, noise))
 
     units = np.array([estimate.per_si for estimate in parameters.CAMERA_PARAMETERS.values()])
     for name, estimators in estimates.parameters.items():

@@ -184,7 +184,7 @@ _MOTIONS: Record[Sequence[Motion]] = Record(
 )
 
 
-def _agreement(course: TimeSeries) -> dict[str, Any] | None:
+def _consistency(course: TimeSeries) -> dict[str, Any] | None:
     """Return the test of all measurements of the time series against the prior, as plain data; None without a prior."""
     return None if course.smoothed is None else course.smoothed.to_dict()
 
@@ -204,7 +204,7 @@ COURSE: Record[TimeSeries] = Record(
     Quantity("intersection_angle", _angle, "the angle between two cameras", where_known=True),
     Quantity("ground", lambda course: course.group("ground"), "errors of points on the ground", where_known=True),
     Quantity("sigma_holds", lambda course: course.sigma_holds, "whether sigmas hold at each time"),
-    Quantity("disturbances", _agreement, "whether all measurements agree with the prior", where_known=True),
+    Quantity("disturbances", _consistency, "whether all measurements agree with the prior", where_known=True),
     Quantity("between", _between, "filtered and smoothed changes between the times", where_known=True),
 )
 
@@ -467,7 +467,7 @@ class SmoothedCourse:
             "degrees_of_freedom": test.degrees,
             "limit": test.limit,
             "false_alarm": FALSE_ALARM,
-            "chance": test.chance,
+            "chance": test.p_value,
             "agrees": test.agrees,
             "innovations": {"chi_square": self.innovations.tolist(), "degrees_of_freedom": self.each},
             **searched,

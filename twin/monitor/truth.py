@@ -92,7 +92,7 @@ class Truth:
             Geometry of the stereo pair over the ground.
         """
         lines = np.moveaxis(self.lines, 0, 1)
-        return geometry.found(lines[1:], lines[:1])
+        return geometry.fitted_to_ground(lines[1:], lines[:1])
 
 
 def half_fields(instrument: Instrument, distance: Mapping[str, float]) -> dict[str, float]:

@@ -50,7 +50,7 @@ from twin.operate.terminal import (
 
 if TYPE_CHECKING:
     from twin.operate.record.history import History
-    from twin.operate.record.taking import IngestResult
+    from twin.operate.record.ingest import IngestResult
 
 POLL = 10.0
 """Time between two checks of watched files for new readings, in seconds."""
@@ -177,15 +177,15 @@ def ingest(
         start = None if moment is None else utc_option("--time", moment)
         if page is not None:
             call.resolve_plan(None)
-        sources = Sources(files, start, _names_own_instrument(instrument, call.history), watch)
+        sources = Sources(files, start, _names_instrument_of_record(instrument, call.history), watch)
         totals, files_reported, first = Counter({"new": 0, "known": 0, "refused": 0, "refused_before": 0}), [], ""
         raised: list[str] = []
         stale = page is not None
         try:
             while True:
                 before = totals["new"]
-                for given in sources.poll(call.history):
-                    taken = call.history.ingest(given, late)
+                for content in sources.poll(call.history):
+                    taken = call.history.ingest(content, late)
                     totals.update(taken.counts)
                     first = first or (f"{taken.file}: {taken.refused[0][1]}" if taken.refused else "")
                     if listed:
@@ -233,10 +233,10 @@ def _new_alarms(call: Call, page: Path | None) -> list[str]:
         write_report(
             call, call.history, operation, end_of_day(None, monitor_span(call.history)[1]), [call.location], page
         )
-    return [f"alarm: {one.text}" for one in new]
+    return [f"alarm: {alarm.text}" for alarm in new]
 
 
-def _names_own_instrument(instrument: str | None, history: History) -> bool:
+def _names_instrument_of_record(instrument: str | None, history: History) -> bool:
     """Return whether --instrument names the record's instrument. Raise InputErrorText if it names another one."""
     from scenes.specs.resolved import resolve_with
     from twin.operate.record.entries import digest_of_job
@@ -295,7 +295,7 @@ def status(
     rows = call.history.alarms()
     opened = sum(row["acknowledged"] is None for row in rows)
     power = () if estimate_of_record is None else estimate_of_record[0].power()
-    detection_power = {one.body: one.plain for one in power}
+    detection_power = {body_power.body: body_power.plain for body_power in power}
     estimate = (
         None if estimate_of_record is None else {**estimate_of_record[1].to_dict(), "detectable_jumps": detection_power}
     )
@@ -341,12 +341,12 @@ def _show(data: dict[str, Any], console: Console) -> None:
     print_verdict(console, f"{name}: {entries} readings and events from {data['files']} files; {opened} refused")
     for text in data["warnings"]:
         print_line(console, f"warning: {text}")
-    rows = ([str(value) for value in one.values()] for one in data["streams"])
+    rows = ([str(value) for value in row.values()] for row in data["streams"])
     show_table(console, ("kind", "subject", "entries", "first [UTC]", "last [UTC]"), rows, (2,))
-    for one in data["refused"]:
-        at = "" if one["line"] is None else f":{one['line']}"
-        since = " (taken since)" if one["taken_since"] else ""
-        print_line(console, f"refused{since}: {one['file']}{at}: {one['reason']}")
+    for row in data["refused"]:
+        at = "" if row["line"] is None else f":{row['line']}"
+        since = " (taken since)" if row["taken_since"] else ""
+        print_line(console, f"refused{since}: {row['file']}{at}: {row['reason']}")
 
 
 @app.command()

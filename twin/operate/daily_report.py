@@ -162,10 +162,10 @@ def innovations_svg(overview: Overview) -> str:
     """Draw the chi-square of the newest innovations (readings minus predictions) with its critical value."""
     with svg.look("operate-innovations"):
         innovations = overview.filter_result.innovations
-        times = np.array([one[0] for one in innovations], np.int64)
-        chi = np.array([one[1] for one in innovations], np.float64)
-        degrees = np.array([one[2] for one in innovations], np.float64)
-        limit = np.array([limit_of(FALSE_ALARM, one) for one in degrees])
+        times = np.array([innovation[0] for innovation in innovations], np.int64)
+        chi = np.array([innovation[1] for innovation in innovations], np.float64)
+        degrees = np.array([innovation[2] for innovation in innovations], np.float64)
+        limit = np.array([limit_of(FALSE_ALARM, innovation) for innovation in degrees])
         figure = svg.new_figure(2.6)
         axes = figure.subplots()
         at, above = dates(times), chi > limit
@@ -283,8 +283,8 @@ def state_table(overview: Overview) -> Table:
         value, sigma, group = float(now.values[0, q]), float(now.sigmas[0, q]), group_name(quantity.group)
         if group not in bands.values():
             bands[q] = group
-        places = decimals_for(sigma)
-        row: list[Cell] = [quantity.parameter.label, DecimalNumber(value, places), DecimalNumber(sigma, places)]
+        decimals = decimals_for(sigma)
+        row: list[Cell] = [quantity.parameter.label, DecimalNumber(value, decimals), DecimalNumber(sigma, decimals)]
         row += _required_cells(overview, quantity)
         rows.append(row)
         full.append([group, *(str(cell) if isinstance(cell, Marked) else cell for cell in row)])
@@ -308,7 +308,7 @@ def _required_cells(overview: Overview, quantity: Quantity) -> list[Cell]:
     style = "text" if requirement.holds_now else "text wrong"
     return [
         f"±{requirement.limit:g}",
-        percent(requirement.chance_now).removesuffix(" %"),
+        percent(requirement.exceedance_now).removesuffix(" %"),
         percent(1.0 - requirement.probability).removesuffix(" %"),
         Marked("yes" if requirement.holds_now else "no", look=style, key=quantity.name),
         when if requirement.holds_now else "violated",
@@ -318,7 +318,7 @@ def _required_cells(overview: Overview, quantity: Quantity) -> list[Cell]:
 def _changed_section(overview: Overview, begin: int, end: int) -> Section:
     """Return the section on the changes of the day."""
     occurrences = [occurrence for occurrence in overview.changed(begin, end) if not occurrence.again]
-    lines = tuple(f"{minute_text(one.time)}: {one.text}" for one in occurrences)
+    lines = tuple(f"{minute_text(event.time)}: {event.text}" for event in occurrences)
     what = f"Between {minute_text(begin)} and {minute_text(end)} UTC.{'' if lines else ' Nothing happened.'}"
     shown = (Text("changed", "", "", lines[-MOST_SHOWN:], within=""),) if lines else ()
     return Section("What changed", (what,), shown, name="changed")
@@ -353,18 +353,18 @@ def _figure(name: str, title: str, svg: str) -> SvgFigure:
 
 def _motion_section(overview: Overview) -> Section | None:
     """Return the section of the most significant motions of bodies, all causes together; None without any."""
-    motions, stated = overview.operation.motions(overview.time), overview.operation.experiment.stated
-    moving = () if stated is None else [component for component in stated.components if component.kind not in HEAT]
+    motions, prior = overview.operation.motions(overview.time), overview.operation.experiment.stated
+    moving = () if prior is None else [component for component in prior.components if component.kind not in HEAT]
     rows: list[tuple[float, list[Cell]]] = []
-    for name, unit in {one.name: one.unit for one in moving}.items():
+    for name, unit in {moving_component.name: moving_component.unit for moving_component in moving}.items():
         selected = np.array([label == name for label in motions.labels], np.float64)
         mean, sigma = (
             float(selected @ motions.mean),
             math.sqrt(max(float(selected @ motions.covariance @ selected), 0.0)),
         )
-        places = decimals_for(sigma)
+        decimals = decimals_for(sigma)
         ratio = abs(mean) / sigma if sigma else 0.0
-        numbers = DecimalNumber(mean, places), DecimalNumber(sigma, places), DecimalNumber(ratio, 1)
+        numbers = DecimalNumber(mean, decimals), DecimalNumber(sigma, decimals), DecimalNumber(ratio, 1)
         rows.append((ratio, [f"{name} [{unit}]", *numbers]))
     if not rows:
         return None
@@ -439,9 +439,9 @@ def _jump_section(overview: Overview) -> Section | None:
     digits = ("after", "until", "detected", "body", "motion", "size", "sigma", "unit", *_JUMP_HEADS)
     rows: list[list[Cell]] = []
     full: list[list[Cell]] = []
-    for jump in sorted(result.jumps, key=lambda one: -one.until_us):
+    for jump in sorted(result.jumps, key=lambda item: -item.until_us):
         label, unit, size, sigma = best_known_motion(jump)
-        part, rivals = label.removeprefix(f"{jump.body} "), sorted(jump.rivals.items(), key=lambda one: -one[1])
+        part, rivals = label.removeprefix(f"{jump.body} "), sorted(jump.rivals.items(), key=lambda item: -item[1])
         others = ", ".join(f"{body} ({ratio:.1f})" for body, ratio in rivals[:3])
         row: list[Cell] = [Marked(minute_text(jump.until_us), f"after {minute_text(jump.after_us)}", "text")]
         row += [minute_text(jump.detected_us), jump.body]
@@ -481,13 +481,13 @@ def _sensor_section(overview: Overview) -> Section:
     """Return the section on the condition of the temperature sensors."""
     rows: list[list[Cell]] = [
         [
-            one.body,
-            Marked(one.state, look="text" if one.state == "ok" else "text wrong", key=f"sensor {one.body}"),
-            minute_text(one.since_us),
-            minute_text(one.last_us),
-            one.reason or _NOT,
+            sensor.body,
+            Marked(sensor.state, look="text" if sensor.state == "ok" else "text wrong", key=f"sensor {sensor.body}"),
+            minute_text(sensor.since_us),
+            minute_text(sensor.last_us),
+            sensor.reason or _NOT,
         ]
-        for one in sorted(overview.filter_result.sensors, key=lambda one: (one.state == "ok", one.body))
+        for sensor in sorted(overview.filter_result.sensors, key=lambda sensor: (sensor.state == "ok", sensor.body))
     ]
     heads = ("body", "state", "since", "last reading", "reason")
     if not rows:
@@ -502,11 +502,11 @@ def _alarm_section(overview: Overview) -> Section:
         return Section("Alarms", ("No alarm has been raised.",), name="alarms")
     waiting = {id(alarm) for alarm in overview.open_alarms()}
     rows: list[list[Cell]] = []
-    for one in sorted(overview.alarms, key=lambda one: (id(one) not in waiting, -int(one["time_us"]))):
-        known = one["acknowledged"]
+    for row in sorted(overview.alarms, key=lambda row: (id(row) not in waiting, -int(row["time_us"]))):
+        known = row["acknowledged"]
         who = "open" if known is None else _acknowledged_text(known)
-        state = Marked(who, look="text wrong" if known is None else "text", key=f"alarm {one['id']}")
-        rows.append([minute_text(int(one["time_us"])), str(one["kind"]).replace("_", " "), str(one["text"]), state])
+        state = Marked(who, look="text wrong" if known is None else "text", key=f"alarm {row['id']}")
+        rows.append([minute_text(int(row["time_us"])), str(row["kind"]).replace("_", " "), str(row["text"]), state])
     heads = ("time", "kind", "alarm", "acknowledged")
     words = f"{len(waiting)} of {len(overview.alarms)} alarms are open." if waiting else "All alarms are acknowledged."
     return Section("Alarms", (words,), (_newest("alarms", "", "Times are UTC.", heads, rows),), name="alarms")
@@ -522,7 +522,7 @@ def _excluded_section(history: History, overview: Overview) -> Section:
     """Return the section on excluded readings and refusals."""
     rows: list[list[Cell]] = [
         [minute_text(time), kind, subject, reason]
-        for time, kind, subject, reason in sorted(overview.filter_result.excluded, key=lambda one: -one[0])
+        for time, kind, subject, reason in sorted(overview.filter_result.excluded, key=lambda entry: -entry[0])
     ]
     refused = [refusal for refusal in history.refusals() if not refusal["taken_since"]]
     artefacts: list[Artefact] = []
@@ -531,8 +531,12 @@ def _excluded_section(history: History, overview: Overview) -> Section:
         artefacts.append(_newest("excluded", "Excluded readings", caption, ("time", "kind", "subject", "reason"), rows))
     if refused:
         refused_rows: list[list[Cell]] = [
-            [one["refused_utc"], f"{one['file']}{'' if one['line'] is None else ':' + str(one['line'])}", one["reason"]]
-            for one in refused[::-1]
+            [
+                entry["refused_utc"],
+                f"{entry['file']}{'' if entry['line'] is None else ':' + str(entry['line'])}",
+                entry["reason"],
+            ]
+            for entry in refused[::-1]
         ]
         caption = "Refused at the ingest of their files, and not in the record."
         artefacts.append(_newest("refused", "Refused", caption, ("refused [UTC]", "file", "reason"), refused_rows))
@@ -552,5 +556,5 @@ def _warnings(overview: Overview, end: int) -> tuple[str, ...]:
         out.append(f"{count}; the newest: {waiting[0]['text']}")
     bad = [sensor for sensor in overview.filter_result.sensors if sensor.state != "ok"]
     if bad:
-        out.append("faulty sensors: " + ", ".join(f"{one.body} ({one.state})" for one in bad))
+        out.append("faulty sensors: " + ", ".join(f"{faulty.body} ({faulty.state})" for faulty in bad))
     return tuple(out)

@@ -106,8 +106,8 @@ def alarms(
 
     def show(console: Console) -> None:
         print_verdict(console, f"{call.history.name}: {_open_text(opened)}, {len(rows)} in all")
-        for one in sorted(rows, key=lambda one: (one["acknowledged"] is not None, -one["time_us"])):
-            print_line(console, alarm_line(one))
+        for alarm in sorted(rows, key=lambda alarm: (alarm["acknowledged"] is not None, -alarm["time_us"])):
+            print_line(console, alarm_line(alarm))
 
     call.print_result({"open": opened, "alarms": rows}, show)
 
@@ -183,10 +183,10 @@ def products(
         raise InputErrorText("no time: give --time UTC, or --scene FILE, which has one")
     operation = call.filtered_operation(call.resolve_plan(plan))
     with input_errors():
-        one = make_products(operation, call.history, time, source, load_backend())
-    files, numbers = product_files(one)
+        made = make_products(operation, call.history, time, source, load_backend())
+    files, numbers = product_files(made)
     call.write_new(out, files, "products")
-    call.print_result(numbers, lambda console: print_line(console, summary(one)))
+    call.print_result(numbers, lambda console: print_line(console, summary(made)))
 
 
 @on_record
@@ -227,10 +227,10 @@ def report(
     operation, _, _ = call.estimate(plan)
     words = [call.location, *([] if plan is None else [str(plan)]), *([] if day is None else ["--day", day])]
     with History(call.location, end) as then:
-        own = then if end <= newest else call.history
-        if own is then:  # reuses the checkpoints of the whole record before the day's end
+        history = then if end <= newest else call.history
+        if history is then:  # reuses the checkpoints of the whole record before the day's end
             operation = call.filtered_operation(operation.plan, then)
-        made = write_report(call, own, operation, end, words, out)
+        made = write_report(call, history, operation, end, words, out)
     data = {"report": str(out), "verdict": made.verdict, "warnings": list(made.warnings)}
 
     def show(console: Console) -> None:
@@ -328,8 +328,10 @@ def show_estimate(result: FilterResult, rows: Sequence[Mapping[str, Any]], conso
     _show_course(result.now, console)
     show_requirements(result, console)
     if scores.components:
-        one, two = (100.0 * part / scores.components for part in (scores.within_one, scores.within_two))
-        text = f"{one:.1f} % within one sigma (68.3 % expected), {two:.1f} % within two (95.4 %)"
+        first_share, second_share = (
+            100.0 * part / scores.components for part in (scores.within_one, scores.within_two)
+        )
+        text = f"{first_share:.1f} % within one sigma (68.3 % expected), {second_share:.1f} % within two (95.4 %)"
         print_line(console, f"predictions of the readings: {text}; mean log score {scores.log_score:.2f}")
     for text in result.warnings:
         print_line(console, f"warning: {text}")
@@ -366,10 +368,12 @@ def _show_course(course: Course, console: Console) -> None:
     show_table(console, ("change of", *utc), rows, range(1, len(utc) + 1))
 
 
-def show_power(found: Sequence[DetectionPower], console: Console) -> None:
+def show_power(powers: Sequence[DetectionPower], console: Console) -> None:
     """Print a table of the smallest detectable jump of each body, in units of its prior standard deviation."""
-    heads = ("smallest detectable jump, in stated sigmas", *(key.replace("_", " ") for key in found[0].plain))
-    sizes = ([one.body, *("none" if size is None else f"{size:.2g}" for size in one.plain.values())] for one in found)
+    heads = ("smallest detectable jump, in stated sigmas", *(key.replace("_", " ") for key in powers[0].plain))
+    sizes = (
+        [power.body, *("none" if size is None else f"{size:.2g}" for size in power.plain.values())] for power in powers
+    )
     show_table(console, heads, sizes, ())
 
 
@@ -388,7 +392,7 @@ def show_requirements(result: FilterResult, console: Console) -> None:
             [
                 name_of(requirement.quantity, result.now.quantities),
                 f"{plain(requirement.limit)} {requirement.unit}",
-                percent(requirement.chance_now),
+                percent(requirement.exceedance_now),
                 percent(1.0 - requirement.probability),
                 "yes" if requirement.holds_now else "no",
                 utc_text(requirement.breaks_us)

@@ -111,26 +111,26 @@ class OmittedComponent:
     share: float | None = None
 
 
-def perturbation(found: EstimatedMotions, thermal: ThermalModel) -> dict[str, PerturbationSpec]:
+def perturbation(motions: EstimatedMotions, thermal: ThermalModel) -> dict[str, PerturbationSpec]:
     """Convert estimated motions to the section `perturb` of a job, without those of the kinds `UNSUPPORTED`.
 
     The result describes the same state as `scenes.models.disturbances.state_of` for the same amounts.
 
     Parameters
     ----------
-    found : EstimatedMotions
+    motions : EstimatedMotions
         Motions at one time.
     thermal : ThermalModel
         Thermal model of the instrument.
     """
-    said = [k for k, component in enumerate(found.components) if component.kind not in (*HEAT, *UNSUPPORTED)]
-    moves = state_of(found.mean[said], [found.components[k] for k in said], thermal)
+    reported = [k for k, component in enumerate(motions.components) if component.kind not in (*HEAT, *UNSUPPORTED)]
+    moves = state_of(motions.mean[reported], [motions.components[k] for k in reported], thermal)
     heat: dict[str, Temperature] = {}
-    for one, amount in zip(found.components, found.mean.tolist(), strict=True):
-        if one.kind in HEAT:
-            slope = (amount * (one.axis == 0), amount * (one.axis == 1), amount * (one.axis == 2))
-            field = Temperature(amount) if one.kind == "temperature" else Temperature(0.0, slope)
-            heat[one.body] = heat.get(one.body, Temperature()) + field
+    for moving, amount in zip(motions.components, motions.mean.tolist(), strict=True):
+        if moving.kind in HEAT:
+            slope = (amount * (moving.axis == 0), amount * (moving.axis == 1), amount * (moving.axis == 2))
+            field = Temperature(amount) if moving.kind == "temperature" else Temperature(0.0, slope)
+            heat[moving.body] = heat.get(moving.body, Temperature()) + field
     # the parts are checked already; validation would require quantities as text
     return {body: _perturbed(moves.get(body, Motion()), heat.get(body)) for body in dict.fromkeys((*moves, *heat))}
 
@@ -270,7 +270,7 @@ class Prior:
 
 
 def prior_files(
-    motions: EstimatedMotions, stated: Disturbances, instrument: Instrument, stem: str, reason: str, remark: str
+    motions: EstimatedMotions, disturbances: Disturbances, instrument: Instrument, stem: str, reason: str, remark: str
 ) -> Prior:
     """Write the covariance of the estimated motions as the section `joint` of a file of disturbances.
 
@@ -281,7 +281,7 @@ def prior_files(
     ----------
     motions : EstimatedMotions
         The M motions at one time.
-    stated : Disturbances
+    disturbances : Disturbances
         Effect of the same motions on spots and camera parameters.
     instrument : Instrument
         Instrument whose motions they are.
@@ -294,7 +294,7 @@ def prior_files(
     """
     components, table = merge_components(motions, instrument)
     covariance = table @ motions.covariance @ table.T
-    share = largest_shares(motions, stated)
+    share = largest_shares(motions, disturbances)
     weight = np.array([share[table[j] != 0.0].max(initial=0.0) for j in range(len(components))])
     kept = np.sort(np.argsort(-weight, kind="stable")[:MOST_JOINT])
     dropped = sorted(set(range(len(components))) - set(kept.tolist()))
@@ -317,18 +317,18 @@ def prior_files(
     return Prior(FrozenMap(joint_files(spec, stem, remark)), selected, table[kept], tuple(omitted))
 
 
-def largest_shares(motions: EstimatedMotions, stated: Disturbances) -> Array:
+def largest_shares(motions: EstimatedMotions, disturbances: Disturbances) -> Array:
     """Return the largest share of the variance of any spot or camera parameter due to each of M motions, (M,).
 
     Parameters
     ----------
     motions : EstimatedMotions
         The M motions at one time.
-    stated : Disturbances
+    disturbances : Disturbances
         Effects on spots and camera parameters of one standard deviation of each motion.
     """
-    size = np.array([component.unit_size for component in motions.components]) * stated.sigmas
-    rows = np.concatenate([stated.spots, stated.parameters]) / np.where(size > 0.0, size, np.inf)
+    size = np.array([component.unit_size for component in motions.components]) * disturbances.sigmas
+    rows = np.concatenate([disturbances.spots, disturbances.parameters]) / np.where(size > 0.0, size, np.inf)
     variance = rows**2 * motions.sigma**2
     total = variance.sum(axis=1, keepdims=True)
     return np.asarray(np.max(variance / np.where(total > 0.0, total, np.inf), axis=0, initial=0.0))

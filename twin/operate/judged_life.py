@@ -127,9 +127,9 @@ def judged(plan: OperationSetup, files: Path, truth: Mapping[str, Any], advance:
     advance : Advance
         Callback that receives the progress.
     """
-    with tempfile.TemporaryDirectory() as place:
-        initialise_record(place, plan.model, simulated=True)
-        with History(place) as history:
+    with tempfile.TemporaryDirectory() as folder:
+        initialise_record(folder, plan.model, simulated=True)
+        with History(folder) as history:
             steps = StepwiseIngest(history, files)
             times = steps.times
             horizon = plan.operation.horizon
@@ -160,7 +160,7 @@ def judged(plan: OperationSetup, files: Path, truth: Mapping[str, Any], advance:
     dates = np.array([time for time, *_ in filter_result.events], np.int64)
     interrupted = np.any((dates > times[:, None]) & (dates <= targets[:, None]), axis=1)
     filtered, forecast = (
-        Estimate(*(np.concatenate([getattr(one, part) for one in courses]) for part in ("values", "sigmas")))
+        Estimate(*(np.concatenate([getattr(course, part) for course in courses]) for part in ("values", "sigmas")))
         for courses in (now, later)
     )
     methods: dict[str, Estimate | Course] = {"ground": ground, "single": single}
@@ -200,11 +200,11 @@ class StepwiseIngest:
     def __init__(self, history: History, file: Path) -> None:
         self._history, self._taken = history, -(2**62)
         spec = read_telemetry(file, history)
-        self._given = [
+        self._contents = [
             read_table_file(table, path, history) for table in spec.readings for path in tables_of(spec, table)
         ]
-        every = {entry.time for given in self._given for entry in _entries(given) if entry.kind == "monitor"}
-        self.times = np.array(sorted(every), np.int64)
+        moments = {entry.time for content in self._contents for entry in _entries(content) if entry.kind == "monitor"}
+        self.times = np.array(sorted(moments), np.int64)
 
     def take(self, until: int) -> None:
         """Ingest the entries after the previous call up to a time.
@@ -214,15 +214,17 @@ class StepwiseIngest:
         until : int
             Time of the newest entry, in microseconds of TAI since 2000.
         """
-        for given in self._given:
-            own = [entry for entry in _entries(given) if self._taken < entry.time <= until]
-            if own:
-                self._history.ingest(FileContent(given.file, given.sha256, given.meaning, own, given.frames))
+        for content in self._contents:
+            entries = [entry for entry in _entries(content) if self._taken < entry.time <= until]
+            if entries:
+                self._history.ingest(
+                    FileContent(content.file, content.sha256, content.meaning, entries, content.frames)
+                )
         self._taken = until
 
 
-def _entries(given: FileContent) -> list[Entry]:
-    return [item for item in given.items if isinstance(item, Entry)]
+def _entries(content: FileContent) -> list[Entry]:
+    return [item for item in content.items if isinstance(item, Entry)]
 
 
 def true_changes(truth: Mapping[str, Any], quantities: Sequence[Quantity], times: NDArray[np.int64]) -> Array:
@@ -240,13 +242,13 @@ def true_changes(truth: Mapping[str, Any], quantities: Sequence[Quantity], times
         Times at which the truth is known, in microseconds of TAI since 2000.
     """
     at = {moment: k for k, moment in enumerate(truth["times_us"])}
-    own = [at[moment] for moment in times.tolist()]
+    rows = [at[moment] for moment in times.tolist()]
     columns = []
     for quantity in quantities:
         group = (
             truth[quantity.group] if quantity.group in (ANGLE_GROUP, GROUND_GROUP) else truth["cameras"][quantity.group]
         )
-        columns.append(np.array(group[quantity.key])[own])
+        columns.append(np.array(group[quantity.key])[rows])
     return np.stack(columns, axis=1)
 
 
@@ -256,8 +258,8 @@ def _single(readings: Sequence[Mapping[str, Any]], quantities: Sequence[Quantity
     for read in readings:
         groups = {**read["cameras"], **{name: read[name] for name in (ANGLE_GROUP, GROUND_GROUP) if name in read}}
         estimates = [groups[quantity.group]["posterior"] for quantity in quantities]
-        values.append([found[one.key] for found, one in zip(estimates, quantities, strict=True)])
-        sigmas.append([found[f"{one.key}_sigma"] for found, one in zip(estimates, quantities, strict=True)])
+        values.append([estimate[item.key] for estimate, item in zip(estimates, quantities, strict=True)])
+        sigmas.append([estimate[f"{item.key}_sigma"] for estimate, item in zip(estimates, quantities, strict=True)])
     return Estimate(np.array(values), np.array(sigmas))
 
 
@@ -285,7 +287,7 @@ def rms(error: Array) -> float:
 
 SHARES = {1.0: math.erf(math.sqrt(0.5)), 2.0: math.erf(math.sqrt(2.0))}
 """Multiple of sigma -> share of normally distributed errors within it."""
-CHANCE = 1e-3
+EXCEEDANCE = 1e-3
 """Probability that the share of independent normal errors within a multiple of sigma lies outside the limits in the
 report.
 """
@@ -314,14 +316,14 @@ def judged_numbers(life: JudgedLife) -> dict[str, Any]:
     """
     out_by_group: dict[str, dict[str, Any]] = {}
     for number, quantity in enumerate(life.quantities):
-        own = {
+        summary = {
             method: _error_summary(life.errors(method)[:, number], estimate.sigmas[:, number])
             for method, estimate in life.methods.items()
         }
         for name, which in ((FORECAST, ~life.interrupted), ("forecast_over_events", life.interrupted)):
             error = (life.forecast.values - life.outcomes)[which, number]
-            own[name] = _error_summary(error, life.forecast.sigmas[which, number])
-        out_by_group.setdefault(quantity.group, {})[quantity.key] = own
+            summary[name] = _error_summary(error, life.forecast.sigmas[which, number])
+        out_by_group.setdefault(quantity.group, {})[quantity.key] = summary
     filter_result = life.filter_result.to_dict()
     scores = life.filter_result.scores
     return {
@@ -337,7 +339,7 @@ def judged_numbers(life: JudgedLife) -> dict[str, Any]:
             "within_one_limits": list(likely_shares(scores.components, 1.0)),
             "within_two": scores.within_two / scores.components,
             "within_two_limits": list(likely_shares(scores.components, 2.0)),
-            "limits_exceedance_probability": CHANCE,
+            "limits_exceedance_probability": EXCEEDANCE,
         },
         "explained_by_temperatures": filter_result["explained"],
         "sensors": filter_result["sensors"],
@@ -365,7 +367,7 @@ def _rounded(values: Any) -> list[float | None]:
 def likely_shares(count: int, times: float) -> tuple[float, float]:
     """Return limits for the share of `count` independent normal errors that lie within a multiple of sigma.
 
-    The share lies outside them with the probability ``CHANCE``.
+    The share lies outside them with the probability ``EXCEEDANCE``.
 
     Parameters
     ----------
@@ -374,7 +376,7 @@ def likely_shares(count: int, times: float) -> tuple[float, float]:
     times : float
         Multiple of sigma.
     """
-    low, high = binom.ppf([0.5 * CHANCE, 1.0 - 0.5 * CHANCE], count, SHARES[times])
+    low, high = binom.ppf([0.5 * EXCEEDANCE, 1.0 - 0.5 * EXCEEDANCE], count, SHARES[times])
     return float(low) / count, float(high) / count
 
 
@@ -418,16 +420,16 @@ def _shown(life: JudgedLife) -> tuple[tuple[str, str], ...]:
     """Return group and key of the quantities in the figure."""
     names = [(quantity.group, quantity.key) for quantity in life.quantities]
     focal = next(name for name in names if name[1] == "d_f_um")
-    return (*(one for one in SHOWN if one in names), focal)
+    return (*(shown for shown in SHOWN if shown in names), focal)
 
 
 def _verdict_sentences(life: JudgedLife, numbers: dict[str, Any], shown: Sequence[tuple[str, str]]) -> list[str]:
     """Return the sentences at the top of the report: errors of the estimates, and coverage by their sigmas."""
     out_by_group = []
     for group, key in shown[-2:] if len(shown) > 1 else shown:
-        one, estimate = life.quantities[life.number(group, key)], numbers["quantities"][group][key]
+        quantity, estimate = life.quantities[life.number(group, key)], numbers["quantities"][group][key]
         values = " / ".join(_short(estimate[method]["rms"]) for method in METHODS)
-        out_by_group.append(f"{group} {one.parameter.symbol} {values} {one.parameter.unit}")
+        out_by_group.append(f"{group} {quantity.parameter.symbol} {values} {quantity.parameter.unit}")
     made = numbers["predictions"]
     low, high = made["within_one_limits"]
     out = [
@@ -441,8 +443,8 @@ def _verdict_sentences(life: JudgedLife, numbers: dict[str, Any], shown: Sequenc
     if explained is not None:
         symbol = life.quantities[life.number(group, key)].parameter.symbol
         out.append(f"temperatures explain {100 * explained:.0f} % of the scatter of {group} {symbol}")
-    bad = [one for one in numbers["sensors"] if one["state"] != "ok"]
-    out += [f"the sensor of {one['body']} is {one['state']}: {one['reason']}" for one in bad]
+    bad = [quantity for quantity in numbers["sensors"] if quantity["state"] != "ok"]
+    out += [f"the sensor of {quantity['body']} is {quantity['state']}: {quantity['reason']}" for quantity in bad]
     return out
 
 
@@ -486,14 +488,14 @@ def judged_svg(life: JudgedLife, quantities: Sequence[tuple[str, str]]) -> str:
         grid = figure.subplots(len(METHODS), len(quantities), sharex=True, squeeze=False)
         for column, name in enumerate(quantities):
             number = life.number(*name)
-            one = life.quantities[number]
-            own = "" if one.group in (ANGLE_GROUP, GROUND_GROUP) else f"{one.group} "
+            quantity = life.quantities[number]
+            group_text = "" if quantity.group in (ANGLE_GROUP, GROUND_GROUP) else f"{quantity.group} "
             for row, (method, title) in enumerate(METHODS.items()):
                 axes = grid[row, column]
                 _panel(axes, life, method, number)
-                size = f"RMS {rms(life.errors(method)[:, number]):.2g} {one.parameter.unit}"
+                size = f"RMS {rms(life.errors(method)[:, number]):.2g} {quantity.parameter.unit}"
                 axes.set_title(f"{title}: {size}", loc="left", fontsize=8.0)
-                axes.set_ylabel(f"error of {own}{one.parameter.label}")
+                axes.set_ylabel(f"error of {group_text}{quantity.parameter.label}")
                 if row > 2:  # same scale for the filtered and the smoothed estimate
                     axes.sharey(grid[row - 1, column])
             grid[-1, column].set_xlabel("years in operation")

@@ -82,15 +82,15 @@ def simulate(
         from optics.numerics.backend import load_backend
         from twin.operate.simulation_run import simulate_into, simulation
 
-        stated = {"--from": start, "--days": f"{days:.17g}", "--every": every, "--frames": str(frames)}
-        stated |= {"--coefficient-error": coefficient_error, "--sensor-sigma": sensor_sigma}
+        option_values = {"--from": start, "--days": f"{days:.17g}", "--every": every, "--frames": str(frames)}
+        option_values |= {"--coefficient-error": coefficient_error, "--sensor-sigma": sensor_sigma}
         several = {"--sensor": sensor or [], "--dead": dead or [], "--stuck": stuck or [], "--event": event or []}
-        what = simulation(stated, several, seed)
+        what = simulation(option_values, several, seed)
         with progress_shown(errors, options.silent) as advance:
             done = simulate_into(plan, record, out, truth, options.force, what, load_backend(options.backend), advance)
-        place = done["record"] or done["files"]
-        text = f"{done['readings']} readings of the monitor in {place}"
-        lost = "".join(f"\nwarning: {one}" for one in done["lost"])
+        destination = done["record"] or done["files"]
+        text = f"{done['readings']} readings of the monitor in {destination}"
+        lost = "".join(f"\nwarning: {warning}" for warning in done["lost"])
         print_result(
             errors, options, done, lambda console: print_line(console, f"{text}; truth: {done['truth']}{lost}")
         )

@@ -103,7 +103,7 @@ def posterior(
         raise Problem("times out of order", utc_text(int(times[late[0] + 1])), "each time later than the one before")
     known = {quantity.name: quantity for quantity in operation.quantities}
     cameras = dict.fromkeys(camera for camera, _ in operation.model.spots)
-    chosen = [name for name, one in known.items() if one.group in cameras] if names is None else list(names)
+    chosen = [name for name, item in known.items() if item.group in cameras] if names is None else list(names)
     for name in chosen:
         if name not in known:
             raise Problem("no such quantity", name, f"one of: {', '.join(known)}")
@@ -193,10 +193,10 @@ def _prior_of_record(
         operation.filter_readings()
         for line in lines:
             length = plan.model.cameras[mounted[line].camera].focal_length
-            stated = setup.camera.lines[line].principal_distance
-            if abs(length / stated - 1.0) > _NEAR:
+            specified = setup.camera.lines[line].principal_distance
+            if abs(length / specified - 1.0) > _NEAR:
                 text = f"the record is of {history.name}, whose {line} camera has another principal distance"
-                found = f"{1e3 * length:.5g} mm, not {1e3 * stated:.5g} mm"
+                found = f"{1e3 * length:.5g} mm, not {1e3 * specified:.5g} mm"
                 raise Problem(text, found, "the record of the instrument that took the images", within=("record",))
         times = {name: micros(epoch) for name, epoch in epochs.items()}
         order = sorted(set(times.values()))

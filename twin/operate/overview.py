@@ -258,8 +258,8 @@ class Overview:
     def of(cls, history: History, operation: Operation) -> Overview:
         """Return the overview of a record and its estimate after all readings."""
         known = operation.plan.operation.events
-        found = ((int(entry["time_us"]), str(entry["subject"])) for entry in history.entries("event"))
-        events = tuple((time, name, tuple(known.get(name, ()))) for time, name in found)
+        dated = ((int(entry["time_us"]), str(entry["subject"])) for entry in history.entries("event"))
+        events = tuple((time, name, tuple(known.get(name, ()))) for time, name in dated)
         return cls(operation, operation.filter_readings(), tuple(history.alarms()), events, monitor_span(history)[0])
 
     @property
@@ -322,7 +322,7 @@ class Overview:
     def changed(self, begin: int, end: int) -> list[Occurrence]:
         """Return the occurrences from `begin` (inclusive) to `end` (exclusive), in the order of time."""
         occurrences = [occurrence for occurrence in self.occurrences() if begin <= occurrence.time < end]
-        return sorted(occurrences, key=lambda one: one.time)
+        return sorted(occurrences, key=lambda event: event.time)
 
     def state_sentence(self) -> str:
         """Return the sentence on the requirements: whether they hold, and which is the most critical."""
@@ -330,11 +330,9 @@ class Overview:
         if not requirements:
             return "The plan states no requirement"
         broken = [requirement for requirement in requirements if not requirement.holds_now]
-        worst = max(requirements, key=lambda one: one.chance_now / (1.0 - one.probability))
-        which = (
-            f"{self._now(worst)}, limit {_limit(worst)} (exceeded with a probability of {percent(worst.chance_now)}; "
-        )
-        which += f"{percent(1.0 - worst.probability)} is allowed)"
+        worst = max(requirements, key=lambda status: status.exceedance_now / (1.0 - status.probability))
+        which = f"{self._now(worst)}, limit {_limit(worst)} (exceeded with a probability of "
+        which += f"{percent(worst.exceedance_now)}; {percent(1.0 - worst.probability)} is allowed)"
         if len(requirements) == 1:
             return f"The requirement {'does not hold' if broken else 'holds'}: {which}"
         if broken:
@@ -363,7 +361,7 @@ class Overview:
     def unmet(self) -> bool:
         """True if a requirement does not hold or is expected to be violated, or an alarm is open."""
         requirements = self.filter_result.requirements
-        coming = any(not one.holds_now or one.breaks_us is not None for one in requirements)
+        coming = any(not requirement.holds_now or requirement.breaks_us is not None for requirement in requirements)
         return coming or bool(self.open_alarms())
 
     def change_sentence(self, begin: int, end: int, when: str) -> str:
@@ -379,7 +377,7 @@ class Overview:
             Name of the span in the sentence.
         """
         occurrences = self.changed(begin, end)
-        counts = {kind: sum(one.kind == kind for one in occurrences) for kind in _COUNTED}
+        counts = {kind: sum(occurrence.kind == kind for occurrence in occurrences) for kind in _COUNTED}
         parts = [_count_text(n, *_COUNTED[kind]) for kind, n in counts.items() if n]
         if not parts:
             return f"Nothing happened {when}"
@@ -394,40 +392,42 @@ class Overview:
             if requirement.holds_now and requirement.breaks_us is not None
         ]
         return [
-            f"{_capital(self._name(one))} is expected to violate its requirement of {_limit(one)} on "
-            f"{day_text(one.breaks_us or 0)}, {_days_text((one.breaks_us or 0) - self.time)} after the newest reading"
-            for one in sorted(coming, key=lambda one: one.breaks_us or 0)
+            f"{_capital(self._name(status))} is expected to violate its requirement of {_limit(status)} on "
+            f"{day_text(status.breaks_us or 0)}, {_days_text((status.breaks_us or 0) - self.time)} after the "
+            "newest reading"
+            for status in sorted(coming, key=lambda status: status.breaks_us or 0)
         ]
 
     def score_sentence(self) -> str:
         """Return the sentence on the shares of readings within one and two sigmas of their predictions."""
-        one, two = self.coverages
-        if not one.count:
+        inner, outer = self.coverages
+        if not inner.count:
             return "No reading has been predicted yet"
-        held = one.holds and two.holds
+        held = inner.holds and outer.holds
         return (
-            f"{100.0 * one.share:.1f} % of the {one.count} components of {self.filter_result.scores.readings} readings "
-            f"lie within 1σ of their predictions and {100.0 * two.share:.1f} % within 2σ, "
+            f"{100.0 * inner.share:.1f} % of the {inner.count} components of "
+            f"{self.filter_result.scores.readings} readings lie within 1σ of their predictions "
+            f"and {100.0 * outer.share:.1f} % within 2σ, "
             f"{'consistent with' if held else 'different from'} the expected "
-            f"{100.0 * one.expected:.1f} and {100.0 * two.expected:.1f} %"
+            f"{100.0 * inner.expected:.1f} and {100.0 * outer.expected:.1f} %"
         )
 
     def open_alarms(self) -> list[Mapping[str, Any]]:
         """Return the open alarms, the newest first."""
         alarms = [alarm for alarm in self.alarms if alarm["acknowledged"] is None]
-        return sorted(alarms, key=lambda one: -int(one["time_us"]))
+        return sorted(alarms, key=lambda row: -int(row["time_us"]))
 
-    def _name(self, one: RequirementStatus) -> str:
-        return name_of(one.quantity, self.quantities)
+    def _name(self, requirement: RequirementStatus) -> str:
+        return name_of(requirement.quantity, self.quantities)
 
-    def _quantity(self, one: RequirementStatus) -> Quantity:
-        return next(quantity for quantity in self.quantities if quantity.name == one.quantity)
+    def _quantity(self, requirement: RequirementStatus) -> Quantity:
+        return next(quantity for quantity in self.quantities if quantity.name == requirement.quantity)
 
-    def _now(self, one: RequirementStatus) -> str:
-        quantity, now = self._quantity(one), self.filter_result.now
+    def _now(self, requirement: RequirementStatus) -> str:
+        quantity, now = self._quantity(requirement), self.filter_result.now
         q = self.quantities.index(quantity)
         value = with_sigma(float(now.values[0, q]), float(now.sigmas[0, q]), quantity.parameter.unit)
-        return f"{self._name(one)} is {value}"
+        return f"{self._name(requirement)} is {value}"
 
 
 _COUNTED: Mapping[str, tuple[str, str]] = FrozenMap(
@@ -441,8 +441,8 @@ _COUNTED: Mapping[str, tuple[str, str]] = FrozenMap(
 )
 
 
-def _count_text(count: int, one: str, many: str) -> str:
-    return one if count == 1 else many.format(count)
+def _count_text(count: int, singular: str, plural: str) -> str:
+    return singular if count == 1 else plural.format(count)
 
 
 def _days_text(span: int) -> str:
@@ -462,7 +462,7 @@ def _limit(requirement: RequirementStatus) -> str:
 
 def best_known_motion(jump: DetectedJump) -> tuple[str, str, float, float]:
     """Return name, unit, size and sigma of the motion of a jump with the largest ratio of size to sigma."""
-    return max(jump.sizes, key=lambda one: abs(one[2]) / one[3] if one[3] > 0.0 else 0.0)
+    return max(jump.sizes, key=lambda size: abs(size[2]) / size[3] if size[3] > 0.0 else 0.0)
 
 
 def line_change_text(overview: Overview, jump: DetectedJump) -> str:

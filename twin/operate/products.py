@@ -124,17 +124,19 @@ def validity(
     beside : Course | None
         Estimate just after the time, used instead of that at the time.
     """
-    low = max((one for one in (first, *limits) if one.time <= time), key=lambda one: one.time)
-    high = min((one for one in (last, *limits) if one.time > time), key=lambda one: one.time, default=last)
+    low = max((limit for limit in (first, *limits) if limit.time <= time), key=lambda limit: limit.time)
+    high = min((limit for limit in (last, *limits) if limit.time > time), key=lambda limit: limit.time, default=last)
     estimate = beside or estimates([time])
     ends = {-1: time - low.time, 1: high.time - time}
-    ends_found = _limits_of_validity(
+    limits_by_sign = _limits_of_validity(
         estimates, estimate, time, {sign: (0, _distances(0, span)) for sign, span in ends.items()}
     )
-    again = {sign: (good, _distances(good, bad, evenly=True)) for sign, (good, bad, _) in ends_found.items()}
-    ends_found |= _limits_of_validity(estimates, estimate, time, again)
+    again = {sign: (good, _distances(good, bad, evenly=True)) for sign, (good, bad, _) in limits_by_sign.items()}
+    limits_by_sign |= _limits_of_validity(estimates, estimate, time, again)
     since, until = (
-        ValidityLimit(time + sign * ends_found[sign][0], ends_found[sign][2]) if sign in ends_found else mark
+        ValidityLimit(time + sign * limits_by_sign[sign][0], limits_by_sign[sign][2])
+        if sign in limits_by_sign
+        else mark
         for sign, mark in ((-1, low), (1, high))
     )
     return Validity(since.time, until.time, since.reason, until.reason)
@@ -315,16 +317,16 @@ def make_products(
     limits = [ValidityLimit(time + sign * far, "the plan's horizon") for sign in (-1, 1)]
     held = validity(operation.smoothed, time, *ends, [*_validity_limits(result), *limits], beside)
     motions = operation.motions(time, acting=True)
-    disturbances = operation.model.series_filter.stated
-    found = EstimatedMotions.in_units(_components(operation), motions.mean, motions.covariance)
+    disturbances = operation.model.series_filter.prior
+    estimated = EstimatedMotions.in_units(_components(operation), motions.mean, motions.covariance)
     version = _version(operation, history)
-    changes = _changes(operation, course, found, _notes(time, held, result, version))
+    changes = _changes(operation, course, estimated, _notes(time, held, result, version))
     remark = f"{history.name} as estimated for {utc_text(time)}, version {version}"
     about = f"posterior of {result.readings} readings up to {utc_text(result.time)}, for {utc_text(time)}"
     plan, instrument = operation.plan.operation, operation.experiment.instrument
-    state, left = state_file(found, operation.experiment.thermal, plan.instrument, plan.disturbances, remark)
+    state, left = state_file(estimated, operation.experiment.thermal, plan.instrument, plan.disturbances, remark)
     prior = prior_files(
-        found, disturbances, instrument, PRIOR, about, f"{remark}\nUncertainty of the state in {STATE}.yaml"
+        estimated, disturbances, instrument, PRIOR, about, f"{remark}\nUncertainty of the state in {STATE}.yaml"
     )
     export = None if scene is None else _exported(scene, backend, changes)
     warnings = _warnings(result, time, at, export, left, prior)
@@ -333,10 +335,10 @@ def make_products(
 
 def _components(operation: Operation) -> list[Component]:
     """Return the specified components in the order of the model, which may have been traced in a different order."""
-    stated = operation.experiment.stated
-    assert stated is not None, "a plan states what moves"
-    by_key = {(component.cause, component.name): component for component in stated.components}
-    disturbances = operation.model.series_filter.stated
+    prior = operation.experiment.stated
+    assert prior is not None, "a plan states what moves"
+    by_key = {(component.cause, component.name): component for component in prior.components}
+    disturbances = operation.model.series_filter.prior
     return [by_key[key] for key in zip(disturbances.causes, disturbances.labels, strict=True)]
 
 
@@ -346,10 +348,10 @@ def _require_same_instrument(scene: ExportSource, history: History) -> None:
     allowed = f"a scene of {history.name} ({history.sha256[:12]}), which the record is of: camera: {history.name}"
     if not isinstance(plain.get("instrument"), Mapping):
         raise Problem("the scene is of a payload, not of the record's instrument", plain["camera"]["name"], allowed)
-    found = instrument_digest(plain["instrument"], plain["cameras"])
-    if found != history.sha256:
+    digest = instrument_digest(plain["instrument"], plain["cameras"])
+    if digest != history.sha256:
         name = plain["instrument"].get("name", "without a name")
-        raise Problem("the scene is of another instrument", f"{name} ({found[:12]})", allowed)
+        raise Problem("the scene is of another instrument", f"{name} ({digest[:12]})", allowed)
 
 
 def _ends(operation: Operation, history: History, result: FilterResult) -> tuple[ValidityLimit, ValidityLimit]:
@@ -401,17 +403,17 @@ def _changes(
     operation: Operation, course: Course, motions: EstimatedMotions, notes: tuple[str, ...]
 ) -> dict[str, EstimatedChange]:
     """Return the estimated change of each camera, without motions that differ in every image (white time law)."""
-    stated = operation.model.series_filter.stated
-    white = np.array([law.white for law in stated.laws])
-    size = np.array([component.unit_size for component in motions.components]) * stated.sigmas
-    rows = stated.parameters / np.where(size > 0.0, size, np.inf)  # (4 K, M) per SI unit of each motion
+    disturbances = operation.model.series_filter.prior
+    white = np.array([law.white for law in disturbances.laws])
+    size = np.array([component.unit_size for component in motions.components]) * disturbances.sigmas
+    rows = disturbances.parameters / np.where(size > 0.0, size, np.inf)  # (4 K, M) per SI unit of each motion
     other_rows, white_rows = rows * ~white, rows * white
     # p = p_other + p_white: remove the white part with its covariance to the others
     across = white_rows @ motions.covariance @ other_rows.T
     constant = course.covariance[0] - white_rows @ motions.covariance @ white_rows.T - across - across.T
     # ERR_RAND consists of the stated sizes of motions that are white in time
-    prior = stated.parameters * white
-    random = prior @ stated.correlation @ prior.T
+    prior = disturbances.parameters * white
+    random = prior @ disturbances.correlation @ prior.T
     values = course.changes[0] - white_rows @ motions.mean
     out = {}
     for k, name in enumerate(dict.fromkeys(camera for camera, _ in operation.model.spots)):
@@ -478,7 +480,7 @@ def _warnings(
     if omitted:
         out.append(f"{STATE}.yaml omits {len(omitted)} motions that a job cannot express")
     if prior.omitted:
-        most = max(one.share or 0.0 for one in prior.omitted)
+        most = max(term.share or 0.0 for term in prior.omitted)
         text = f"{PRIOR}.yaml omits the {len(prior.omitted)} least important components"
         out.append(f"{text}; none contributes more than {100.0 * most:.2g} % to the variance of a spot or a parameter")
     return tuple(out)

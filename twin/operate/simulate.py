@@ -140,7 +140,7 @@ class Life:
 
 
 def drawn_life(
-    stated: DisturbancePrior,
+    prior: DisturbancePrior,
     times: Moments,
     zero: int,
     seed: int,
@@ -154,7 +154,7 @@ def drawn_life(
 
     Parameters
     ----------
-    stated : DisturbancePrior
+    prior : DisturbancePrior
         The motions and their time laws.
     times : (T,) ndarray of int64
         Microseconds of TAI since 2000, ascending.
@@ -170,46 +170,46 @@ def drawn_life(
         Relative standard deviation of the ratio of the true to the computed optical effect of a body's temperature.
     """
     seconds = (times - zero) / MICRO
-    drawn = drawn_motions(stated, seconds, lambda number: np.random.default_rng(stream(seed, _MOTIONS, number)))
-    own, steps = causes_of(stated), list[Step]()
-    for number, (cause, where) in enumerate(own.items()):
-        steps += _jumps(stated, cause, where, times, np.random.default_rng(stream(seed, _JUMPS, number)))
+    drawn = drawn_motions(prior, seconds, lambda number: np.random.default_rng(stream(seed, _MOTIONS, number)))
+    motions_of_cause, steps = causes_of(prior), list[Step]()
+    for number, (cause, where) in enumerate(motions_of_cause.items()):
+        steps += _jumps(prior, cause, where, times, np.random.default_rng(stream(seed, _JUMPS, number)))
     event_dates = _drawn_dates(sorted(causes), times, seed) if dates is None else tuple(sorted(dates))
     for number, (moment, name) in enumerate(event_dates):
         for k, cause in enumerate(causes.get(name, ())):
             rng = np.random.default_rng(stream(seed, _EVENTS, number, k))
-            steps.append(Step(moment, cause, "", name, _step(stated, own.get(cause, []), rng)))
+            steps.append(Step(moment, cause, "", name, _step(prior, motions_of_cause.get(cause, []), rng)))
     rng = np.random.default_rng(stream(seed, _COEFFICIENTS))
-    warm = dict.fromkeys(c.body for c in stated.components if c.kind == "temperature")
+    warm = dict.fromkeys(c.body for c in prior.components if c.kind == "temperature")
     coefficients = dict(zip(warm, (coefficient_error * rng.standard_normal(len(warm))).tolist(), strict=True))
-    return Life(times, stated.components, drawn, tuple(sorted(steps, key=_when)), event_dates, coefficients)
+    return Life(times, prior.components, drawn, tuple(sorted(steps, key=_when)), event_dates, coefficients)
 
 
 def _jumps(
-    stated: DisturbancePrior, cause: str, motions: Sequence[int], times: Moments, rng: np.random.Generator
+    prior: DisturbancePrior, cause: str, motions: Sequence[int], times: Moments, rng: np.random.Generator
 ) -> Iterator[Step]:
     """Yield random steps of a cause whose time law has jumps at a mean interval.
 
     The motions of one body step together.
     """
-    mean_interval = stated.laws[motions[0]].jump
+    mean_interval = prior.laws[motions[0]].jump
     if mean_interval is None:
         return
     span = (int(times[-1]) - int(times[0])) / MICRO
-    for body in dict.fromkeys(stated.components[k].body for k in motions):
-        stepping = [k for k in motions if stated.components[k].body == body]
+    for body in dict.fromkeys(prior.components[k].body for k in motions):
+        stepping = [k for k in motions if prior.components[k].body == body]
         for second in np.sort(rng.uniform(0.0, span, rng.poisson(span / mean_interval))).tolist():
-            yield Step(int(times[0]) + round(second * MICRO), cause, body, "", _step(stated, stepping, rng))
+            yield Step(int(times[0]) + round(second * MICRO), cause, body, "", _step(prior, stepping, rng))
 
 
-def _step(stated: DisturbancePrior, where: Sequence[int], rng: np.random.Generator) -> Array:
+def _step(prior: DisturbancePrior, where: Sequence[int], rng: np.random.Generator) -> Array:
     """Draw the sizes (M,) of a step of some motions, in SI units, correlated as specified; zero for the others.
 
     Array dimensions: M motions.
     """
-    out = np.zeros(len(stated.components))
-    root = covariance_root(stated.correlation[np.ix_(where, where)])
-    out[list(where)] = rng.standard_normal(len(where)) @ root * stated.sigma[list(where)]
+    out = np.zeros(len(prior.components))
+    root = covariance_root(prior.correlation[np.ix_(where, where)])
+    out[list(where)] = rng.standard_normal(len(where)) @ root * prior.sigma[list(where)]
     return out
 
 
@@ -247,7 +247,7 @@ class Simulation:
         Time of the first reading and origin of the time laws, in microseconds of TAI since 2000.
     seconds : float
         Length of the life, in seconds.
-    every : float
+    interval : float
         Interval between readings of the monitor, in seconds; temperatures are read at the same times.
     seed : int
         Seed of all random numbers.
@@ -272,7 +272,7 @@ class Simulation:
 
     start: int
     seconds: float
-    every: float
+    interval: float
     seed: int = 0
     frames: int = 10
     coefficient_error: float = 0.0
@@ -289,8 +289,8 @@ class Simulation:
 
         Array dimensions: T times.
         """
-        count = max(1, math.ceil(self.seconds / self.every - 1e-9))
-        return self.start + np.array([round(k * self.every * MICRO) for k in range(count)], np.int64)
+        count = max(1, math.ceil(self.seconds / self.interval - 1e-9))
+        return self.start + np.array([round(k * self.interval * MICRO) for k in range(count)], np.int64)
 
 
 @dataclass(frozen=True, eq=False)
@@ -416,7 +416,9 @@ def write_simulated(
     heads = {body: f"T_{body.removeprefix('base/').replace('/', '_')}" for body in sensed}
     rows = [",".join(("UTC", *heads.values()))]
     for k, moment in enumerate(simulated.life.times.tolist()):
-        cells = ("" if math.isnan(own[k]) else f"{own[k]:.{_KELVIN}f}" for own in sensed.values())
+        cells = (
+            "" if math.isnan(temperatures[k]) else f"{temperatures[k]:.{_KELVIN}f}" for temperatures in sensed.values()
+        )
         rows.append(",".join((utc_text(moment), *cells)))
     folder.write_text(TEMPERATURES, "\n".join(rows) + "\n")
     columns = {
@@ -482,8 +484,8 @@ def truth_numbers(plan: OperationSetup, what: Simulation, simulated: SimulatedRe
             "body": step.body,
             "event": step.event,
             "sizes": {
-                f"{one.name} [{one.unit}]": float(size) / one.unit_size
-                for one, size in zip(life.components, step.sizes, strict=True)
+                f"{component.name} [{component.unit}]": float(size) / component.unit_size
+                for component, size in zip(life.components, step.sizes, strict=True)
                 if size != 0.0
             },
         }
@@ -500,7 +502,7 @@ def truth_numbers(plan: OperationSetup, what: Simulation, simulated: SimulatedRe
         "events": [{"time_utc": utc_text(moment), "event": name} for moment, name in life.dates],
         "coefficients": dict(life.coefficients),
         "temperature_times_us": life.times.tolist(),
-        "temperature_changes_K": {body: own.tolist() for body, own in life.temperatures.items()},
+        "temperature_changes_K": {body: temperatures.tolist() for body, temperatures in life.temperatures.items()},
         "sensors_dead": {body: utc_text(moment) for body, moment in what.dead.items()},
         "sensors_stuck": {body: utc_text(moment) for body, moment in what.stuck.items()},
         "lost": [{"time_utc": utc_text(moment), "reason": why} for moment, why in simulated.lost],

@@ -24,7 +24,7 @@ from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.operate.estimate.operation_model import read_plan, store_plan
 from twin.operate.record.entries import utc_text
 from twin.operate.record.history import History, initialise_record
-from twin.operate.record.taking import IngestResult
+from twin.operate.record.ingest import IngestResult
 from twin.operate.record.telemetry import CONFIG, read_table_file, read_telemetry, tables_of
 from twin.operate.simulate import FOLDER, LIFE, TELEMETRY, Simulation, simulate_record, truth_numbers, write_simulated
 from twin.operate.terminal import input_errors, utc_option
@@ -58,12 +58,14 @@ def simulation(options: Mapping[str, str], several: Mapping[str, Sequence[str]],
     InputErrorText
         An option is not valid.
     """
-    every, days = options["--every"], float(options["--days"])
-    step = _quantity("--every", every, MOMENT)
+    interval, days = options["--every"], float(options["--days"])
+    step = _quantity("--every", interval, MOMENT)
     if not step > 0.0:
-        raise InputErrorText(f"--every: {every} is not a time from one reading to the next; write 6d, or 12 h")
+        raise InputErrorText(f"--every: {interval} is not a time from one reading to the next; write 6d, or 12 h")
     if not 0.0 < days * DAY / step <= MOST:
-        raise InputErrorText(f"--days: {days:g} days with a reading every {every}; allowed: from 1 to {MOST} readings")
+        raise InputErrorText(
+            f"--days: {days:g} days with a reading every {interval}; allowed: from 1 to {MOST} readings"
+        )
     error = _quantity("--coefficient-error", options["--coefficient-error"], SCALE)
     sigma = _quantity("--sensor-sigma", options["--sensor-sigma"], TEMPERATURE_DIFFERENCE)
     if error < 0.0:
@@ -215,7 +217,7 @@ def simulate_into(
         advance(INGEST, 0, 1)
         ingested = [] if history is None else ingest_files(history, folder.target / TELEMETRY)
         advance(INGEST, 1, 1)
-    refused = [reason for one in ingested for _, reason in one.refused]
+    refused = [reason for result in ingested for _, reason in result.refused]
     if refused:
         raise InputErrorText(f"{len(refused)} simulated readings were refused, the first: {refused[0]}")
     return {
@@ -224,7 +226,7 @@ def simulate_into(
         "files": str(folder.target),
         "truth": str(truth or folder.target / f"{LIFE}.json"),
         "readings": len(simulated.readings),
-        "entries": sum(one.new for one in ingested),
+        "entries": sum(result.new for result in ingested),
         "steps": len(simulated.life.steps),
         "lost": lost_readings,
         "seconds": time.monotonic() - clock,
@@ -276,9 +278,9 @@ def _require_known_sensors(experiment: MonitorExperiment, what: Simulation) -> N
             _require_name(option, body, warm if what.sensors is None else what.sensors)
 
 
-def _write_truth(place: Path, text: str) -> None:
+def _write_truth(path: Path, text: str) -> None:
     """Write the truth. Raise InputErrorText if it cannot be written."""
     try:
-        write_safely(place, text.encode())
+        write_safely(path, text.encode())
     except OSError as error:
-        raise InputErrorText(f"--truth: {place} cannot be written: {error.strerror or error}") from None
+        raise InputErrorText(f"--truth: {path} cannot be written: {error.strerror or error}") from None

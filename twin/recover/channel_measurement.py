@@ -37,7 +37,7 @@ from scenes.yaml.errors import Issue
 from twin.framework.frame_store import mean_of, release_memory
 from twin.recover.measured_frames import ChannelFrames, StateFrames, cannot_measure
 
-_MOST_GROWTH = 4.0
+_MOST_SIGMA_INCREASE = 4.0
 """Largest factor by which missing pixels may increase the sigma of a spot's position; beyond it the spot counts as
 lost.
 """
@@ -121,7 +121,7 @@ class ChannelResult:
         many = len(self.after) > 1
         return (
             ("before", self.before),
-            *((f"after {k + 1}" if many else "after", one) for k, one in enumerate(self.after)),
+            *((f"after {k + 1}" if many else "after", measured) for k, measured in enumerate(self.after)),
         )
 
 
@@ -173,8 +173,10 @@ class ChannelMeasurement:
         uncalibrated = channel.correction is None and channel.transfer is None
         untouched = all(screened.clean for screened in self._screened)
         untouched &= all(examined is None or examined.clean for examined in self._examined)
-        as_stated = uncalibrated and not self._noisy and not self._level
-        return full_frames and equal_counts and integers and as_stated and untouched and self._test.vibration == "none"
+        uncorrected = uncalibrated and not self._noisy and not self._level
+        return (
+            full_frames and equal_counts and integers and uncorrected and untouched and self._test.vibration == "none"
+        )
 
     def _template(self, state: StateFrames) -> SpotTemplate:
         assert self.shape is not None
@@ -345,10 +347,10 @@ class ChannelMeasurement:
         if examined is None or examined.clean:
             positions = self._direct_centroid(screened, state)
         else:
-            if examined.fit.missing > _MOST_GROWTH:
+            if examined.fit.missing > _MOST_SIGMA_INCREASE:
                 kinds = ", ".join(dict.fromkeys(f.kind for f in examined.findings if f.corrects))
-                growth = f"sigma would grow {1.0 + examined.fit.missing:.1f}-fold"
-                raise SpotError({0: f"too much of the spot is missing ({kinds}): {growth}"})
+                consequence = f"sigma would grow {1.0 + examined.fit.missing:.1f}-fold"
+                raise SpotError({0: f"too much of the spot is missing ({kinds}): {consequence}"})
             positions, self._costs[number] = examined.fit.positions, examined.fit.cost
             if self._test.analysis.centroid != "ml":
                 positions, self._costs[number] = self._repaired(examined, state)
@@ -427,8 +429,8 @@ class ChannelMeasurement:
         """
         screened, noise, template = examined.screened, self.channel.noise, self._template(state)
 
-        def measure(image: np.ndarray, own: NoiseModel) -> SpotPositions:
-            return self._centroid(image, screened.frames, own, state)
+        def measure(image: np.ndarray, noise_model: NoiseModel) -> SpotPositions:
+            return self._centroid(image, screened.frames, noise_model, state)
 
         return repaired_centroid(screened, examined.fit, noise, template, measure)
 

@@ -127,7 +127,7 @@ def _not_ascending(channel: ChannelFrames) -> int:
     times_by_state = [_recorded(state) for state in channel.after]
     if not all(times_by_state):
         return 0
-    return next((k for k, (one, two) in enumerate(pairwise(times_by_state), 1) if max(two) < min(one)), 0)
+    return next((k for k, (earlier, later) in enumerate(pairwise(times_by_state), 1) if max(later) < min(earlier)), 0)
 
 
 Shape = tuple[int, int]
@@ -288,7 +288,7 @@ def _channel(
     key: KeyPath = ("frames", name)
     before = _state(test, files.before, files.offset, (*key, BEFORE))
     offset = files.offset if files.offset_after is None else files.offset_after
-    after = tuple(_state(test, one, offset, (*key, AFTER)) for one in test.states(files))
+    after = tuple(_state(test, reference, offset, (*key, AFTER)) for reference in test.states(files))
     if ccd is None:
         times_by_state = (before, *after)
         ccd = (
@@ -296,11 +296,11 @@ def _channel(
             max(state.offset[1] + state.shape[1] for state in times_by_state),
         )
     for state in (before, *after):
-        _check_place(test, state, ccd)
+        _check_within_ccd(test, state, ccd)
         _check_values(test, state, detector)
-    stated = "offset" in files.model_fields_set
-    _check_part(test, before, before.shape == ccd or stated, f"the CCD of {ccd[0]} x {ccd[1]} pixels", "offset")
-    same = before.shape if stated else ccd
+    has_offset = "offset" in files.model_fields_set
+    _check_part(test, before, before.shape == ccd or has_offset, f"the CCD of {ccd[0]} x {ccd[1]} pixels", "offset")
+    same = before.shape if has_offset else ccd
     for state in after:
         known = state.shape == (same if files.offset_after is None else after[0].shape)
         _check_part(test, state, known, f"the frames before or those of the CCD, {same[0]} x {same[1]}", "offset_after")
@@ -349,7 +349,7 @@ def _stacked(test: Spec, files: tuple[str, ...], key: KeyPath) -> np.ndarray:
         for page in _pages(test, file, image, key):
             if stack is None:
                 shape, kind = page.shape, page.dtype
-                stack = allocate_frames((sum(len(one.header.pages) for one in images), *shape), kind)
+                stack = allocate_frames((sum(len(frame_file.header.pages) for frame_file in images), *shape), kind)
             if page.shape != shape:
                 sizes = (" x ".join(map(str, size)) for size in (shape, page.shape))
                 text = f"{files[0]} and {file} have frames of different sizes, {' and '.join(sizes)}"
@@ -403,7 +403,7 @@ def _readable(test: Spec, file: str, key: KeyPath) -> Iterator[None]:
         raise _input_error(test, key, f"{file}: {error.strerror or error}", "a readable file") from error
 
 
-def _check_place(test: Spec, state: StateFrames, ccd: Shape) -> None:
+def _check_within_ccd(test: Spec, state: StateFrames, ccd: Shape) -> None:
     ends = [first + size for first, size in zip(state.offset, state.shape, strict=True)]
     if ends[0] > ccd[0] or ends[1] > ccd[1]:
         text = f"{state.files[0]}: frames of {state.shape[0]} x {state.shape[1]} pixels"
@@ -461,11 +461,11 @@ def _maps(test: MeasurementSpec, what: str, name: str, ccd: Shape, before: State
 
     ``what`` tells which of the two; the result is None if the measurement has none.
     """
-    given: Any = getattr(test, what)
-    files = per_channel(given, name)
+    maps: Any = getattr(test, what)
+    files = per_channel(maps, name)
     if not files:
         return None
-    key: KeyPath = (what, name if name in given else "all")
+    key: KeyPath = (what, name if name in maps else "all")
     stack = _stacked(test, files, key)
     if stack.shape[1:] not in (ccd, before.shape):
         text = f"{files[0]} has frames of {stack.shape[1]} x {stack.shape[2]} pixels"

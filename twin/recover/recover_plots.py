@@ -13,7 +13,7 @@ from matplotlib.ticker import MaxNLocator
 
 from twin.framework import svg
 from twin.main_job.series_plots import time_unit
-from twin.main_job.spot_plots import cross, stretch
+from twin.main_job.spot_plots import asinh_scale, cross
 from twin.recover.channel_measurement import SpotResult
 from twin.recover.recover_run import RecoverRun, state_name
 
@@ -55,14 +55,14 @@ def spots_svg(run: RecoverRun, camera: str) -> str:
     """Draw the mean frames of one camera, a row for each channel."""
     with svg.look(f"measured-{camera}"):
         panels = _panels(run, camera)
-        norm = stretch(np.concatenate([spot.mean.ravel() for _, states in panels for _, spot, _ in states]))
+        norm = asinh_scale(np.concatenate([spot.mean.ravel() for _, states in panels for _, spot, _ in states]))
         figure, grid = _grid(len(panels))
         shown = None
         for line, (channel, states) in enumerate(panels):
-            for axes, (name, spot, place) in zip(grid[line], states, strict=True):
+            for axes, (name, spot, position) in zip(grid[line], states, strict=True):
                 shown = axes.imshow(spot.mean, cmap=svg.GRAY, norm=norm, interpolation="none", extent=_extent(spot))
                 _mark_unused(axes, spot)
-                cross(axes, place, svg.BEFORE if name == "before" else svg.AFTER, 0.11 * spot.mean.shape[1])
+                cross(axes, position, svg.BEFORE if name == "before" else svg.AFTER, 0.11 * spot.mean.shape[1])
                 _labels(axes, f"{channel}, {name}", line == len(panels) - 1)
         assert shown is not None
         _bar(figure, shown, grid, "mean frame [DN], asinh stretch")

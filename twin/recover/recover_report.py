@@ -46,27 +46,27 @@ def _corrected(run: RecoverRun) -> tuple[int, int, SpotResult | None, str]:
 def _verdict(run: RecoverRun) -> tuple[str, tuple[str, ...]]:
     """Return the verdict of the measurement and the sentences that follow it."""
     reading = run.last
-    found = reading.table.of(reading.judged)
+    readings = reading.table.of(reading.judged)
     title = reading.estimators[reading.judged].title
-    out = [one for one in found if abs(one.size) > FAR]
+    out = [row for row in readings if abs(row.size) > FAR]
     when = f" at {moment(run.times[-1])}, the last of {len(run.times)} times" if run.times else ""
     basis = "noise alone" if reading.disturbances is None else f"noise and disturbances {reading.disturbances.name}"
     if out:
-        clearest = max(out, key=lambda one: abs(one.size))
+        clearest = max(out, key=lambda row: abs(row.size))
         exceed = "exceeds" if len(out) == 1 else "exceed"
-        first = f"{len(out)} of {len(found)} readings of the {title}{when} {exceed} {FAR:g} σ (σ: {basis})"
+        first = f"{len(out)} of {len(readings)} readings of the {title}{when} {exceed} {FAR:g} σ (σ: {basis})"
         second = f"the clearest change is {clearest.name}, {clearest.read}"
     else:
         parts = []
         for p in parameters.CAMERA_PARAMETERS.values():
-            sigmas = [one.sigma for one in found if one.parameter == p]
+            sigmas = [row.sigma for row in readings if row.parameter == p]
             parts += [f"{p.symbol} {significant(FAR * max(sigmas), 2, floor=0.0)} {p.unit}"] if sigmas else []
         first = (
-            f"No change is detected{when}: none of the {len(found)} readings of the {title} exceeds {FAR:g} σ (σ: "
+            f"No change is detected{when}: none of the {len(readings)} readings of the {title} exceeds {FAR:g} σ (σ: "
             f"{basis})"
         )
         second = f"changes below {', '.join(parts)} would not be detected"
-    about = next((one for one in found if one.group == ANGLE_GROUP), max(found, key=lambda one: abs(one.size)))
+    about = next((row for row in readings if row.group == ANGLE_GROUP), max(readings, key=lambda row: abs(row.size)))
     limit = ""
     if reading.disturbances is not None:
         body, share = limits(reading, about)
@@ -129,7 +129,14 @@ def _frames_text(run: RecoverRun) -> str:
 def _summary(run: RecoverRun) -> Table:
     """Return the table of the cameras' changes by every estimator, with the sigma of the one that the verdict uses."""
     reading = run.last
-    heads = ["camera", "change", *(one.title for one in reading.estimators.values()), "σ", "σ of noise", "in σ"]
+    heads = [
+        "camera",
+        "change",
+        *(estimator.title for estimator in reading.estimators.values()),
+        "σ",
+        "σ of noise",
+        "in σ",
+    ]
     rows: list[list[Cell]] = []
     for rows_of_change in reading.table.by_change():
         judged_row = next(row for row in rows_of_change if row.estimator == reading.judged)
@@ -229,9 +236,17 @@ def _series(run: RecoverRun) -> Section:
     smoothed = run.smoothed
     heads = ["time [s]", "camera", "change", "unit", "value", "σ", "σ of noise"]
     rows: list[list[Cell]] = [
-        [time, one.camera or "both", one.parameter.symbol, one.parameter.unit, one.value, one.sigma, one.noise]
+        [
+            time,
+            change.camera or "both",
+            change.parameter.symbol,
+            change.parameter.unit,
+            change.value,
+            change.sigma,
+            change.noise,
+        ]
         for time, reading in zip(run.times, run.readings, strict=True)
-        for one in reading.table.of(reading.judged)
+        for change in reading.table.of(reading.judged)
     ]
     judged = run.last.estimators[run.last.judged].title
     caption = f"Value: reading of the {judged} at each time alone, relative to the same frames before."

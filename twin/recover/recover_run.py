@@ -283,7 +283,7 @@ def _recover_clean(
     centroid = setup.test.analysis.centroid
 
     def means(frames: Sequence[StateFrames]) -> np.ndarray:
-        return np.stack([mean_of(one.frames) for one in frames])
+        return np.stack([mean_of(state_frames.frames) for state_frames in frames])
 
     before = judged_spots(
         means([channel.before for channel in channels]), len(channels[0].before.frames), calibration, centroid
@@ -320,8 +320,8 @@ def _recover_corrected(
     for k in range(1, len(measurements[0].positions)):
         second = _joint_positions([measurement.positions[k] for measurement in measurements])
         covariances = [measurement.shift_covariance(k) for measurement in measurements]
-        noise, stated = np.concatenate(covariances), bench.disturbances
-        out.append(recovery_of(first, second, noise, calibration, stated, motions=bench.motions))
+        noise, disturbances = np.concatenate(covariances), bench.disturbances
+        out.append(recovery_of(first, second, noise, calibration, disturbances, motions=bench.motions))
         if smoother is not None:
             before, after = zip(*(measurement.noise_parts(k) for measurement in measurements), strict=True)
             smoother.take(out[-1].shift, _joint_noise(before), _joint_noise(after))
@@ -446,7 +446,9 @@ def _coarse_warnings(channels: Sequence[ChannelFrames], setup: MeasurementSetup)
     if setup.test.photon_transfer == "stated":
         return coarse_step_warnings(channels[0].raw_noise, f"area CCD {setup.detector.name}")
     whose = f"area CCD {setup.detector.name}, as measured,"
-    return tuple(text for one in channels for text in coarse_step_warnings(one.raw_noise, f"{one.name}: {whose}"))
+    return tuple(
+        text for channel in channels for text in coarse_step_warnings(channel.raw_noise, f"{channel.name}: {whose}")
+    )
 
 
 def _noise_causes(ratio: float) -> str:
@@ -491,7 +493,7 @@ def recover_numbers(run: RecoverRun) -> dict[str, Any]:
     }
     transfers = {r.channel.name: r.channel.transfer for r in run.channels if r.channel.transfer is not None}
     if transfers:
-        out["photon_transfer"] = {name: vars(one) for name, one in transfers.items()}
+        out["photon_transfer"] = {name: vars(transfer) for name, transfer in transfers.items()}
     if run.times is not None:
         out["times_s"] = list(run.times)
         out["series"] = [stated(reading.recovered_dict()) for reading in run.readings]

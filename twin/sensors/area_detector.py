@@ -245,8 +245,8 @@ class EmvaDetector:
             first = error.errors()[0]
             problem = first.get("ctx", {}).get("error")
             where = problem.within if isinstance(problem, Problem) else first["loc"]
-            found = ", ".join(f"{name} {self._numbers()[str(name)]!r}" for name in where)
-            raise ValueError(f"detector: {found}: {first['msg']}") from None
+            wrong = ", ".join(f"{name} {self._numbers()[str(name)]!r}" for name in where)
+            raise ValueError(f"detector: {wrong}: {first['msg']}") from None
 
     @classmethod
     def from_sheet(cls, sheet: DetectorSpec, exposure: float) -> EmvaDetector:

@@ -291,12 +291,12 @@ class _Group:
         self.sources = []
         self.last: list[Future[np.ndarray | None] | None] = [None] * len(streams)
         for image, sequence in enumerate(streams):
-            mean = numbers.mean[self.own(image)]
+            mean = numbers.mean[self.lanes(image)]
             self.huge.append(np.flatnonzero(mean >= SERIES_END))
             rng = np.random.Generator(np.random.SFC64(sequence))
             self.sources.append((*split_stream(rng, mean[self.huge[image]], frames, pixels, together), rng))
 
-    def own(self, image: int) -> slice:
+    def lanes(self, image: int) -> slice:
         """Return the range of lanes (entries of the kernels' arrays) that hold an image's pixels."""
         return slice(image * self.pixels, (image + 1) * self.pixels)
 
@@ -323,7 +323,7 @@ class _Group:
         if before is not None:
             before.result()  # another thread may still draw the image's previous frames from the same streams
         words, huge, rng = self.sources[image]
-        lanes, which = self.own(image), self.huge[image]
+        lanes, which = self.lanes(image), self.huge[image]
         huge_numbers: np.ndarray | None = None
 
         def draw() -> None:

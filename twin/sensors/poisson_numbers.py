@@ -125,8 +125,8 @@ def quantile_table() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     guide = _guide()
     cells = np.where(guide.known == _UNDECIDED, guide.least | 128, guide.known).astype(np.uint8)
     step = 1.0 / CELLS_PER_UNIT
-    chance = np.diff(guide.law.reshape(-1, MOST_IN_TABLE), axis=1, prepend=0.0)
-    bend = np.abs(np.diff(chance, axis=1, prepend=0.0)).max(axis=1)
+    probability = np.diff(guide.law.reshape(-1, MOST_IN_TABLE), axis=1, prepend=0.0)
+    bend = np.abs(np.diff(probability, axis=1, prepend=0.0)).max(axis=1)
     bound = 1.01 * np.maximum(bend[:-1], bend[1:]) * (1.0 + 2.0 * step) * step**2 / 8.0
     for table in (cells, bound):
         table.flags.writeable = False

@@ -105,12 +105,12 @@ def main(
         if out is not None and finished and not (folder / BLOCKS).exists():
             copyfile(out / BLOCKS, folder / BLOCKS)
         console = Console(quiet=True) if options.silent else errors
-        say = partial(console.print, markup=False, highlight=False, soft_wrap=True)
+        notify = partial(console.print, markup=False, highlight=False, soft_wrap=True)
         if progress_fd is None:
-            return study_command.run_study(setup, session, folder, chosen, say)
+            return study_command.run_study(setup, session, folder, chosen, notify)
         from twin.study.scripted import pipe_progress  # what a script needs
 
-        return study_command.run_study(setup, session, folder, chosen, say, pipe_progress(progress_fd))
+        return study_command.run_study(setup, session, folder, chosen, notify, pipe_progress(progress_fd))
 
     # --resume of a finished study writes its report again
     finished = resume and out is not None and isfile(out / BLOCKS) and read_manifest(out) is not None

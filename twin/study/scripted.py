@@ -329,7 +329,7 @@ def _with_middle_values(value: Any, key: KeyPath, spreads: list[Spread]) -> Any:
         return [_with_middle_values(part, (*key, k), spreads) for k, part in enumerate(value)]
     if not isinstance(value, str) or "(" not in value:
         return value
-    place = (*key, "change") if key[-1] == "temperature" else key
+    path = (*key, "change") if key[-1] == "temperature" else key
     ranges = {f"@{k}": match for k, match in enumerate(_RANGE.finditer(value))}
     names = iter(ranges)
     words = _RANGE.sub(lambda match: f" {next(names)} ", value).split()
@@ -340,7 +340,7 @@ def _with_middle_values(value: Any, key: KeyPath, spreads: list[Spread]) -> Any:
     row = len(numbers) > 1
     for k, word in enumerate(numbers):
         if word in ranges:
-            spreads.append(Spread((*place, k) if row else place, _factor(ranges[word], unit)))
+            spreads.append(Spread((*path, k) if row else path, _factor(ranges[word], unit)))
     middle = [f"{_middle(ranges[word])}" if word in ranges else word for word in numbers]
     return [f"{number} {unit}" for number in middle] if row else f"{middle[0]} {unit}"
 

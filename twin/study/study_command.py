@@ -52,7 +52,7 @@ def run_study(
     session: Session,
     store: Path,
     chosen: tuple[int | None, str | None],
-    say: Callable[[str], None],
+    notify: Callable[[str], None],
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> Result:
     """Run the missing runs of a study and write its run folder.
@@ -67,7 +67,7 @@ def run_study(
         Folder in which finished blocks of runs are stored.
     chosen : tuple
         Number of local processes (None: one per core), and address of a running cluster (None: none).
-    say : callable
+    notify : callable
         Function that receives the estimate of the computing time.
     progress : callable
         Function that receives the numbers of finished and of all runs.
@@ -97,7 +97,7 @@ def run_study(
 
     session.advance(START, 0, 1)
     with journal_of(setup, store / BLOCKS) as journal:
-        engine = Engine(plan, journal, session.backend.name, advance, say, warn)
+        engine = Engine(plan, journal, session.backend.name, advance, notify, warn)
         input_warnings = blur_warnings(base, session.backend) if cameras_of(base) else ()
         input_warnings = (*input_warnings, *coarse_warnings(base))
         warn(*input_warnings)
@@ -144,9 +144,9 @@ def _show(numbers: dict[str, Any], console: Console) -> None:
     for name, r in numbers["responses"].items():
         # as many digits as the standard error of the mean justifies
         known = r["std"] is not None and r["std"] > 0.0
-        places = decimals_for(r["std"] / math.sqrt(numbers["runs"])) if known else None
+        decimals = decimals_for(r["std"] / math.sqrt(numbers["runs"])) if known else None
         values = (r[key] for key in ("mean", "std", "p95", "p997"))
-        cells = (cell_text(v) if v is None or places is None else fixed(v, places) for v in values)
+        cells = (cell_text(v) if v is None or decimals is None else fixed(v, decimals) for v in values)
         table.add_row(name, unit_for_reports(r["unit"]), *cells)
     cli.print_verdict(console, numbers["verdict"], warned=bool(numbers["warnings"]))
     cli.print_whole(console, table)

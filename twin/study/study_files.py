@@ -45,7 +45,7 @@ def make_dataset(plan: Plan, result: BlockResult) -> xr.Dataset:
     for column in plan.columns:
         factor = study.factors[column.name]
         scaled = [f"{_path(scale.key)} ~ power {scale.power:g}" for scale in factor.scales]
-        key = "; ".join([" = ".join(_path(place) for place in factor.places)] * bool(factor.places) + scaled)
+        key = "; ".join([" = ".join(_path(path) for path in factor.places)] * bool(factor.places) + scaled)
         values = column.values.astype(object) if column.values.dtype.kind == "U" else column.values
         values = values.astype(np.int8) if values.dtype.kind == "b" else values
         long_name = f"factor {column.name}, {key}"
@@ -55,8 +55,8 @@ def make_dataset(plan: Plan, result: BlockResult) -> xr.Dataset:
         key = f"{_path(response.key)}{minus}"
         about = {"units": response.units, ROLE: "response", "key": key, "long_name": f"response {name}, {key}"}
         data[name] = (RUN, result.values[:, r], about)
-        for ending, place in response.sigma_keys.items():
-            about = {"units": response.units, ROLE: "sigma", "key": _path(place), "of": name}
+        for ending, path in response.sigma_keys.items():
+            about = {"units": response.units, ROLE: "sigma", "key": _path(path), "of": name}
             by = ", by noise alone" if ending == NOISE else ""
             about["long_name"] = f"standard deviation of {name}{by}"
             data[f"{name}{ending}"] = (RUN, (result.noises if by else result.sigmas)[:, r], about)
@@ -139,7 +139,7 @@ def summary(data: xr.Dataset, plan: Plan) -> dict[str, Any]:
         "factors": {
             column.name: {
                 "unit": column.unit,
-                "keys": [list(place) for place in study.factors[column.name].places],
+                "keys": [list(key) for key in study.factors[column.name].places],
                 "scaled_keys": [list(scale.key) for scale in study.factors[column.name].scales],
                 **_span(column.values),
             }

@@ -163,7 +163,7 @@ The phase of the transfer function of an F/9 beam changes by one cycle in 250 µ
 ten samples per cycle are accurate to 2e-4.
 """
 
-TABLE_REACH = 0.6e-3
+TABLE_EXTENT = 0.6e-3
 """Largest absolute defocus of the table of transfer functions, in metres; beyond it they are computed one by one."""
 
 
@@ -204,7 +204,7 @@ class EdgeOptics:
 
     @classmethod
     def build(
-        cls, light: PupilFunction | BandPupils, band: BandSpec, normal: np.ndarray, extent: float = TABLE_REACH
+        cls, light: PupilFunction | BandPupils, band: BandSpec, normal: np.ndarray, extent: float = TABLE_EXTENT
     ) -> EdgeOptics:
         """Compute the transfer functions for defocus up to +-``extent``, in metres.
 
@@ -255,7 +255,7 @@ _ROUND_CUTOFF = 10e3
 
 All positions in a band's field then share one sampling of the edge profile.
 """
-_ROUND_REACH = 4.0
+_EXTENT_STEP = 4.0
 """Step, in pixels, to which the extents of edge profiles are rounded up.
 
 All positions in a band's field then share one sampling of the edge profile.
@@ -312,13 +312,13 @@ class EdgeImager:
             return self.transfer(defocus, np.hypot(fx, fy))
 
         # rounded, so that all sites of a band share one sampling of the profile
-        extent = (0.5 * self.region * float(np.sum(np.abs(normal))) + abs(offset) / pitch) // _ROUND_REACH + 1.0
+        extent = (0.5 * self.region * float(np.sum(np.abs(normal))) + abs(offset) / pitch) // _EXTENT_STEP + 1.0
         cutoff = _ROUND_CUTOFF * (self.optics.cutoff // _ROUND_CUTOFF + 1.0)
-        profile = EdgeProfile.build(transfer, normal, cutoff, _ROUND_REACH * extent * pitch)
+        profile = EdgeProfile.build(transfer, normal, cutoff, _EXTENT_STEP * extent * pitch)
         return np.maximum(profile.image(HalfPlane(offset * profile.normal, profile.normal), grid, grid), 0.0)
 
 
-PLACES = {"left": 1.0, "centre": 0.0, "right": -1.0}
+POSITIONS = {"left": 1.0, "centre": 0.0, "right": -1.0}
 """Positions on the line as fractions of its usable half; left is the +Y' end."""
 
 MARGIN = 0.02
@@ -510,10 +510,10 @@ class TargetCamera:
         self.path = path
         self.ccd = ccd
         self.region = region
-        along = 0.5 * usable * band.pitch * np.array(list(PLACES.values()))
-        self.places = np.stack([along, np.full(len(along), band.offset)], axis=-1)
+        along = 0.5 * usable * band.pitch * np.array(list(POSITIONS.values()))
+        self.positions = np.stack([along, np.full(len(along), band.offset)], axis=-1)
         """Nominal positions (along the line, across it) on the detector of the targets of PLACES, metres."""
-        self.directions = path.directions(self.places)
+        self.directions = path.directions(self.positions)
 
     def views(self, state: State) -> dict[str, View]:
         """Return name of each position on the line (left, centre, right) -> its view in a state of the camera.
@@ -530,7 +530,9 @@ class TargetCamera:
             maps = [self.path.local_map(state, direction, extent) for direction in self.directions]
         except (AimError, BeamMissedError, ValueError) as error:
             raise TargetLostError(f"the line CCD of camera {self.path.name}: {error}") from error
-        return {name: self._view(name, hits[i], self.places[i], lights[i], maps[i]) for i, name in enumerate(PLACES)}
+        return {
+            name: self._view(name, hits[i], self.positions[i], lights[i], maps[i]) for i, name in enumerate(POSITIONS)
+        }
 
     def _lights(self, state: State, hits: np.ndarray, count: int | None = None) -> list[BandPupils]:
         """Return the pupil functions of every position on the line at the wavelengths of the camera's band.

@@ -26,7 +26,7 @@ from twin.framework.data_files import FrameFacts
 from twin.framework.random_streams import stream
 from twin.sensors.area_detector import FixedPattern
 from twin.sensors.line_ccd import LineCcd
-from twin.targets.target_images import DIRECTIONS, PLACES, BarDesign, TargetCamera, View, usable_pixels
+from twin.targets.target_images import DIRECTIONS, POSITIONS, BarDesign, TargetCamera, View, usable_pixels
 from twin.targets.target_path import TargetPath
 
 NYQUIST = 0.5
@@ -134,7 +134,7 @@ class PlaceTargets:
 
     Attributes
     ----------
-    place : (2,) ndarray
+    position : (2,) ndarray
         Nominal position (along, across) on the focal plane, in metres.
     shift : (2,) ndarray
         True displacement of the image of a fixed direction on the focal plane due to the perturbation, (along, across),
@@ -143,7 +143,7 @@ class PlaceTargets:
         Images in both states.
     """
 
-    place: np.ndarray
+    position: np.ndarray
     shift: np.ndarray
     before: TargetShots
     after: TargetShots
@@ -197,34 +197,34 @@ class TargetRun:
         Frames have H rows and W columns.
         """
         for camera, targets_of_camera in self.cameras.items():
-            for place, targets in targets_of_camera.places.items():
+            for position, targets in targets_of_camera.places.items():
                 for when, shots in targets.shots.items():
                     for name, frames in shots.frames.items():
                         facts = FrameFacts(
                             f"{camera}, line CCD {targets_of_camera.band}",
                             targets_of_camera.pitch,
-                            note=f"{name}, {place}, {when}",
+                            note=f"{name}, {position}, {when}",
                         )
-                        yield f"{camera}_{place}_{name}_{when}", name, frames, facts
+                        yield f"{camera}_{position}_{name}_{when}", name, frames, facts
 
     @property
     def has_edges(self) -> bool:
         """True if knife edges were rendered, so that there are MTF curves."""
-        return any(place.before.edges for camera in self.cameras.values() for place in camera.places.values())
+        return any(targets.before.edges for camera in self.cameras.values() for targets in camera.places.values())
 
     @property
     def warnings(self) -> tuple[str, ...]:
         """Warnings about targets that could not be measured, with the reason."""
         out = []
         for camera, targets_of_camera in self.cameras.items():
-            for place, targets in targets_of_camera.places.items():
+            for position, targets in targets_of_camera.places.items():
                 for when, shots in targets.shots.items():
                     kinds = (("knife edge", shots.edges), ("bars", shots.bars))
                     for what, readings in kinds:
                         for direction, reading in readings.items():
                             if reading.measured is None:
                                 out.append(
-                                    f"{what} ({direction}) at the {place} of {camera} {when}: no MTF at Nyquist "
+                                    f"{what} ({direction}) at the {position} of {camera} {when}: no MTF at Nyquist "
                                     f"(true value {reading.true_nyquist:.3f}): {reading.reason}"
                                 )
         return tuple(out)
@@ -237,35 +237,35 @@ class TargetRun:
         """
         cameras, truth = {}, {}
         for name, camera in self.cameras.items():
-            places, true_places = {}, {}
-            for place, targets in camera.places.items():
-                along, across = (1e3 * targets.place + 0.0).tolist()
+            measured, true_values = {}, {}
+            for position, targets in camera.places.items():
+                along, across = (1e3 * targets.position + 0.0).tolist()
                 columns = {when: shots.column for when, shots in targets.shots.items()}
                 where = {"along_mm": along, "across_mm": across, "columns": columns}
-                places[place] = {**where, **_directions(targets, _measured)}
+                measured[position] = {**where, **_directions(targets, _measured)}
                 shift = dict(zip(("along", "across"), (1e6 * targets.shift + 0.0).tolist(), strict=True))
                 lost = {when: shots.light_lost for when, shots in targets.shots.items()}
-                true_places[place] = {"image_shift_um": shift, "light_lost": lost, **_directions(targets, _true)}
+                true_values[position] = {"image_shift_um": shift, "light_lost": lost, **_directions(targets, _true)}
             cameras[name] = {
                 "band": camera.band,
                 "pitch_um": 1e6 * camera.pitch,
                 "nyquist_per_mm": 1e-3 * NYQUIST / camera.pitch,
-                "places": places,
+                "places": measured,
             }
-            truth[name] = {"places": true_places}
+            truth[name] = {"places": true_values}
         about = {"frames": self.frames, "obstruction": "traced" if self.obstruction else "ignore"}
         return {**about, "cameras": cameras, "truth": {"cameras": truth}}
 
 
-def _directions(targets: PlaceTargets, say: Any) -> dict[str, Any]:
-    """Return direction -> state (before, after) -> plain data of its measurement, as made by the function ``say``.
+def _directions(targets: PlaceTargets, plain: Any) -> dict[str, Any]:
+    """Return direction -> state (before, after) -> plain data of its measurement, as made by the function ``plain``.
 
-    ``say`` is called with the knife edge's and the bars' measurement, either of which may be None.
+    ``plain`` is called with the knife edge's and the bars' measurement, either of which may be None.
     """
     out: dict[str, Any] = {}
     for when, shots in targets.shots.items():
         for direction in sorted({*shots.edges, *shots.bars}):
-            out.setdefault(direction, {})[when] = say(shots.edges.get(direction), shots.bars.get(direction))
+            out.setdefault(direction, {})[when] = plain(shots.edges.get(direction), shots.bars.get(direction))
     return out
 
 
@@ -324,7 +324,7 @@ def target_pixels(resolved: ResolvedJob) -> int:
     """
     settings, names = resolved.targets, resolved.job.render.target_images
     kinds = sum({"knife_edge": len(DIRECTIONS), "bars": len(DIRECTIONS) + len(EVEN_FIELDS)}.get(n, 1) for n in names)
-    each = len(resolved.instrument.cameras) * len(PLACES) * 2 * kinds * settings.region**2
+    each = len(resolved.instrument.cameras) * len(POSITIONS) * 2 * kinds * settings.region**2
     return each * (settings.frames or 1)
 
 
@@ -420,7 +420,7 @@ def render_targets(
     """
     settings, images = resolved.targets, resolved.job.render.target_images
     frames = settings.frames or 1
-    total = len(instrument.cameras) * len(PLACES) * 2
+    total = len(instrument.cameras) * len(POSITIONS) * 2
     cameras, done = {}, 0
     for number, name in enumerate(instrument.cameras):
         camera = target_camera(resolved, instrument, name, backend)
@@ -428,16 +428,18 @@ def render_targets(
         before = camera.views({})
         after = camera.views(state) if state else before
         pattern = ccd.pattern(stream(seed, _PATTERN, number))
-        places = {}
-        for k, place in enumerate(PLACES):
-            shooter = _TargetRecorder(settings, frames, images, before[place], pattern)
+        targets = {}
+        for k, position in enumerate(POSITIONS):
+            shooter = _TargetRecorder(settings, frames, images, before[position], pattern)
             shots = []
-            for when, view in enumerate((before[place], after[place])):
+            for when, view in enumerate((before[position], after[position])):
                 advance(done, total)
                 shots.append(shooter.shoot(view, stream(seed, _EXPOSURE, number, k, when)))
                 done += 1
-            places[place] = PlaceTargets(camera.places[k], after[place].shift - before[place].shift, *shots)
-        cameras[name] = CameraTargets(_band(resolved, name), ccd.band.pitch, places)
+            targets[position] = PlaceTargets(
+                camera.positions[k], after[position].shift - before[position].shift, *shots
+            )
+        cameras[name] = CameraTargets(_band(resolved, name), ccd.band.pitch, targets)
     advance(done, total)
     return TargetRun(cameras, frames, resolved.job.render.obstructed)
 

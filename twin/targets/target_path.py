@@ -174,7 +174,7 @@ class TargetPath:
         """
         return self.model.line_principal_distance if self.collimator is None else self.collimator.focal_length
 
-    def directions(self, places: np.ndarray, state: State | None = None) -> np.ndarray:
+    def directions(self, positions: np.ndarray, state: State | None = None) -> np.ndarray:
         """Return the directions of light, world frame, (F, 3), imaged at F positions (F, 2) on the line CCD.
 
         Positions are (along, across), in metres.
@@ -184,7 +184,7 @@ class TargetPath:
         states = [state or {}]
         placed = self.assembly.place(states)
         body = line_body(self.root)
-        local = np.stack([places[:, 1], places[:, 0], np.zeros(len(places))], axis=-1)
+        local = np.stack([positions[:, 1], positions[:, 0], np.zeros(len(positions))], axis=-1)
         guess = self.model.toward_optics(placed.rotation[:, placed.index[body]].real)
         _, sight = chief_rays(
             self.backend,
@@ -246,15 +246,15 @@ class TargetPath:
         systems, to_stop = self._systems(state, len(directions), placed)
         target = self.stop.radius * points + np.array(self.stop.centre)
         launch, _ = aim_collimated(self.backend, to_stop, directions, self._launch(directions), target)
-        cut = {name: self.model.mirrors.index(name) for name in (self.model.edges if edges else ())}
-        kept = tuple(cut.values())
+        numbers = {name: self.model.mirrors.index(name) for name in (self.model.edges if edges else ())}
+        kept = tuple(numbers.values())
         traced = trace(self.backend, systems, make_rays(self.backend, launch, directions[:, None]), keep=kept)
         position, leaving, path, valid = traced.numpy()
-        if cut:
+        if numbers:
 
             def met(name: str) -> np.ndarray:
                 size = placed.scale[0, placed.index[f"{self.root}/{name}"]].real
-                return np.asarray(traced.hit(cut[name]) / size)
+                return np.asarray(traced.hit(numbers[name]) / size)
 
             valid = valid & self.model.unvignetted(met)
         if edges and self.shadows is not None:
@@ -295,13 +295,13 @@ class TargetPath:
         self,
         state: State,
         directions: np.ndarray,
-        places: np.ndarray,
+        positions: np.ndarray,
         target_shift: float = 0.0,
         wavelength: float | None = None,
     ) -> tuple[PupilFunction, ...]:
         """Return the pupil function of the image of each of F directions, about its position on the line CCD.
 
-        Lengths in the image are in metres of the nominal (unexpanded) line CCD, as in ``places``.
+        Lengths in the image are in metres of the nominal (unexpanded) line CCD, as in ``positions``.
 
         Parameters
         ----------
@@ -309,8 +309,8 @@ class TargetPath:
             State of the assembly.
         directions : (F, 3) ndarray
             Directions of the light, world.
-        places : (F, 2) ndarray
-            Image points about which the pupils are computed, from the method ``places`` for the same state; for all
+        positions : (F, 2) ndarray
+            Image points about which the pupils are computed, from the method ``positions`` for the same state; for all
             colours of an image those at the design wavelength.
         target_shift : float
             Displacement of the collimator's target from its focus, along the light, in metres.
@@ -328,7 +328,7 @@ class TargetPath:
         state = self.coloured(state, colour)
         placed, systems, rays = self._imaging(state, directions)
         shadows, _ = self._taken(placed, systems, rays, directions)
-        field = self._field(rays, systems, places, colour, target_shift)
+        field = self._field(rays, systems, positions, colour, target_shift)
         if not self.model.edges or shadows is None:
             return fit_pupils(field, self.nodes, DEGREE, shadows)
         points = np.stack([self.nodes.x, self.nodes.y], axis=-1)
@@ -337,14 +337,19 @@ class TargetPath:
         return tuple(with_enough_nodes(pupil, field.wavelength) for pupil in vignetted)
 
     def _field(
-        self, rays: ImagingRays, systems: SystemBatch, places: np.ndarray, wavelength: float, target_shift: float = 0.0
+        self,
+        rays: ImagingRays,
+        systems: SystemBatch,
+        positions: np.ndarray,
+        wavelength: float,
+        target_shift: float = 0.0,
     ) -> PupilField:
         """Return the plane waves of traced beams at the line CCD: optical path and amplitude over direction cosines.
 
-        The image axes are along the line and across it; ``places`` are the image points of reference, and
+        The image axes are along the line and across it; ``positions`` are the image points of reference, and
         ``target_shift`` is the displacement of the collimator's target from its focus, in metres.
         """
-        origin = systems.size[:, None] * np.stack([places[:, 1], places[:, 0], np.zeros(len(places))], axis=-1)
+        origin = systems.size[:, None] * np.stack([positions[:, 1], positions[:, 0], np.zeros(len(positions))], axis=-1)
         collimator = self.collimator
         incoming = None if collimator is None else lambda point: collimator.path(point, target_shift)
         field = pupil_field(rays, wavelength, origin, incoming)
@@ -352,7 +357,7 @@ class TargetPath:
         return swapped.scaled_by(systems.size)
 
     def vignetted_pupils(
-        self, state: State, directions: np.ndarray, places: np.ndarray, wavelength: float | None = None
+        self, state: State, directions: np.ndarray, positions: np.ndarray, wavelength: float | None = None
     ) -> tuple[VignettedPupil, ...]:
         """Return the pupil functions of a camera whose surface edges vignette its beams, with the edges as polygons.
 
@@ -365,7 +370,7 @@ class TargetPath:
             State of the assembly.
         directions : (F, 3) ndarray
             Directions of the light, world frame.
-        places : (F, 2) ndarray
+        positions : (F, 2) ndarray
             Image points (along, across) on the line CCD, in metres.
         wavelength : float | None
             Wavelength, in metres; None for the design wavelength.
@@ -380,13 +385,13 @@ class TargetPath:
         colour = self.model.spec.wavelength if wavelength is None else wavelength
         for nodes, tolerance in ((quadrature.disk(RINGS), SMOOTH), (self.nodes, VIGNETTED_RESIDUAL)):
             with suppress(UnphysicalError):
-                vignetted = self._cut_pupils(state, directions, places, colour, nodes)
+                vignetted = self._vignetted_pupils(state, directions, positions, colour, nodes)
                 if all(pupil.pupil.eikonal_residual <= tolerance * colour for pupil in vignetted):
                     return vignetted
-        return self._cut_pupils(state, directions, places, colour, quadrature.disk(MORE_RINGS))
+        return self._vignetted_pupils(state, directions, positions, colour, quadrature.disk(MORE_RINGS))
 
-    def _cut_pupils(
-        self, state: State, directions: np.ndarray, places: np.ndarray, colour: float, nodes: PupilNodes
+    def _vignetted_pupils(
+        self, state: State, directions: np.ndarray, positions: np.ndarray, colour: float, nodes: PupilNodes
     ) -> tuple[VignettedPupil, ...]:
         """Return vignetted pupils from rays traced through given nodes of the stop, for the wavelength ``colour``."""
         state = self.coloured(state, colour)
@@ -397,7 +402,7 @@ class TargetPath:
         edges = PupilEdges.of(beams, self.model, self.name, self.backend)
         outlines = edges.outlines(LINE_SIDES) + StopOutlines((), tuple(np.moveaxis(bodies, 1, 0)))
         illuminated = edges.passed[-1] & ~covered(bodies, np.stack([nodes.x, nodes.y], axis=-1), SMALLEST)
-        field = self._field(rays, systems, places, colour)
+        field = self._field(rays, systems, positions, colour)
         vignetted = vignetted_pupils(
             fit_pupils(field, nodes, DEGREE, None, illuminated), field.u, field.v, nodes, outlines, illuminated
         )
@@ -458,8 +463,8 @@ class TargetPath:
         points = np.stack([a.ravel() for a in np.meshgrid(step, step)], axis=-1)
         around = direction + (points[:, :1] * along + points[:, 1:] * across) / self.target_distance
         around = around / np.linalg.norm(around, axis=-1, keepdims=True)
-        places = self.places(state, np.concatenate([direction[None], around]))
-        design, wanted = _monomials(points / extent), places[1:] - places[0]
+        positions = self.places(state, np.concatenate([direction[None], around]))
+        design, wanted = _monomials(points / extent), positions[1:] - positions[0]
         terms, *_ = np.linalg.lstsq(design, wanted, rcond=None)
         residual = float(np.max(np.linalg.norm(design @ terms - wanted, axis=-1)))
         return LocalMap(extent, terms, residual)

@@ -57,18 +57,18 @@ class WavefrontNorm:
     tilt: np.ndarray
 
     @classmethod
-    def of(cls, lit: Sequence[tuple[np.ndarray, np.ndarray, np.ndarray]], degree: int) -> WavefrontNorm:
+    def of(cls, fields: Sequence[tuple[np.ndarray, np.ndarray, np.ndarray]], degree: int) -> WavefrontNorm:
         """Compute the matrices for the illuminated pupils of F fields.
 
         Parameters
         ----------
-        lit : sequence of tuple
+        fields : sequence of tuple
             For each field the nodes x, y and the weights of a quadrature over the illuminated pupil.
         degree : int
             Degree of the polynomials over the stop.
         """
         rest, tilt = [], []
-        for x, y, share in lit:
+        for x, y, share in fields:
             table = products(x, y, degree)
             level = np.stack([np.ones_like(x), x, y], axis=-1)
             weighted = level * share[:, None]

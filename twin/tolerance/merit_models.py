@@ -24,7 +24,7 @@ With more parameters the mixed derivatives would not fit in memory.
 """
 FARTHEST = 10.0
 """Largest ratio of a tolerance to its limit at which it is traced; its inverse is the smallest."""
-_MOST_TURNS = 40
+_MOST_ITERATIONS = 40
 """Largest number of iterations in the search for the inverse limit of a tolerance."""
 _GRID = 241
 """Number of ratios of a tolerance to its limit, in geometric steps, at which the model's loss is evaluated."""
@@ -269,8 +269,8 @@ def default_losses(bench: ToleranceBench, nominal: np.ndarray) -> np.ndarray:
     out = []
     for merit, value in zip(bench.merits, nominal, strict=True):
         margin = float(merit.worse(np.array(merit.spec.requirement), value))
-        stated = merit.spec.loss_si
-        out.append(stated if stated is not None else margin * share if margin > 0.0 else np.nan)
+        specified = merit.spec.loss_si
+        out.append(specified if specified is not None else margin * share if margin > 0.0 else np.nan)
     return np.array(out)
 
 
@@ -358,7 +358,7 @@ def _roots(excess: Callable[[np.ndarray, np.ndarray], np.ndarray], start: np.nda
     side, step, out = np.zeros(count), np.full(count, 0.05), np.full(count, np.nan)
     level = start.copy()
     top, bottom = np.log(FARTHEST), -2.0 * np.log(FARTHEST)
-    for _ in range(_MOST_TURNS):
+    for _ in range(_MOST_ITERATIONS):
         advance("limits for a loss", count - int(np.isnan(out).sum()), count)
         rows = np.flatnonzero(np.isnan(out))
         if not rows.size:

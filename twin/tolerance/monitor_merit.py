@@ -64,7 +64,7 @@ class MonitorMerit:
         Light path of the monitor spots, with area CCDs centred on their spots.
     images : SpotPath
         Light path of only those cameras whose spots move.
-    stated : Disturbances
+    disturbances : Disturbances
         Disturbances of the nominal instrument as independent motions.
     noise : (D, D) ndarray
         Covariance of the nominal instrument's spot shifts due to image noise, px^2.
@@ -79,7 +79,7 @@ class MonitorMerit:
     experiment: MonitorExperiment
     path: SpotPath
     images: SpotPath
-    stated: Disturbances
+    disturbances: Disturbances
     noise: np.ndarray
     changes: tuple[np.ndarray, np.ndarray]
     asked: Mapping[str, tuple[np.ndarray, np.ndarray | None]]
@@ -132,7 +132,7 @@ class MonitorMerit:
             gain = None if merit.estimator == POSTERIOR else gains[merit.estimator]
             asked[name] = np.concatenate([rows[key] for key in _readings(setup, experiment, name, merit, camera)]), gain
         root = known.root
-        stated = replace(
+        disturbances = replace(
             known, spots=known.spots @ root, parameters=known.parameters @ root, correlation=np.eye(len(root))
         )
         limit_state = states_of(numbers, np.array([[number.size for number in numbers]]))[0]
@@ -153,7 +153,7 @@ class MonitorMerit:
         per_unit = tuple(np.zeros((len(numbers), *change.shape[1:])) for change in changes)
         for out, change in zip(per_unit, changes, strict=True):
             out[moved] = change @ root / steps[moved, None, None]
-        return cls(experiment, path, images, stated, noise, (per_unit[0], per_unit[1]), asked)
+        return cls(experiment, path, images, disturbances, noise, (per_unit[0], per_unit[1]), asked)
 
     def variances(self, amounts: np.ndarray, states: Sequence[State]) -> dict[str, np.ndarray]:
         """Return name of each merit -> variances of its Q estimated quantities in S states, (S, Q), SI units squared.
@@ -233,12 +233,14 @@ class MonitorMerit:
         """
         out = {name: np.empty((len(noise), len(rows))) for name, (rows, _) in self.asked.items()}
         for s, covariance in enumerate(noise):
-            stated = replace(
-                self.stated, spots=self.stated.spots + spots[s], parameters=self.stated.parameters + parameters[s]
+            disturbances = replace(
+                self.disturbances,
+                spots=self.disturbances.spots + spots[s],
+                parameters=self.disturbances.parameters + parameters[s],
             )
-            best = stated.best_gain(covariance)
+            best = disturbances.best_gain(covariance)
             for name, (rows, gain) in self.asked.items():
-                out[name][s] = split(rows, stated, covariance, best if gain is None else gain).sigma ** 2
+                out[name][s] = split(rows, disturbances, covariance, best if gain is None else gain).sigma ** 2
         return out
 
 

@@ -179,8 +179,8 @@ MOST_STEPS = 12
 
 FIRST_RULE, LARGEST_RULE = 3, 17
 """Numbers of wavelengths of the first and of the largest quadrature rule over a spectrum that is tried."""
-EVERY = 4
-"""Distortion is evaluated at every ``EVERY``-th of the points along the line."""
+STRIDE = 4
+"""Distortion is evaluated at every ``STRIDE``-th of the points along the line."""
 _MOVE = 1e-3
 """Step of the numerical derivatives with respect to a compensator, as a fraction of its range."""
 
@@ -645,7 +645,7 @@ class ToleranceBench:
     @property
     def _along(self) -> np.ndarray:
         """Indices of the points of the line at which distortion is evaluated."""
-        return np.arange(0, LINE_POINTS, EVERY)
+        return np.arange(0, LINE_POINTS, STRIDE)
 
     def scaled(self, scales: np.ndarray) -> ToleranceBench:
         """Return the same budget and camera with the limit of each of E tolerances multiplied by ``scales`` (E,)."""

@@ -430,7 +430,7 @@ def _compensator_sections(run: ToleranceRun) -> tuple[Section, ...]:
 def _monitor_sections(run: ToleranceRun) -> tuple[Section, ...]:
     if not run.interpolation_errors or run.bench.monitor is None:
         return ()
-    stated = run.bench.monitor.stated.name
+    prior_name = run.bench.monitor.disturbances.name
     rows: list[list[Cell]] = []
     for result in run.merits:
         if result.merit.name in run.interpolation_errors:
@@ -446,10 +446,10 @@ def _monitor_sections(run: ToleranceRun) -> tuple[Section, ...]:
                 ]
             )
     text = (
-        f"Standard deviations of the monitor's readings under the disturbances {stated}, with the derivatives and the "
-        "noise of each camera as it is built and adjusted; its area CCDs have been set to its spots. Derivatives are "
-        f"interpolated between those of the tolerances; in {EXACT} of the cameras they were also traced for "
-        "comparison.",
+        f"Standard deviations of the monitor's readings under the disturbances {prior_name}, with the derivatives "
+        "and the noise of each camera as it is built and adjusted; its area CCDs have been set to its spots. "
+        f"Derivatives are interpolated between those of the tolerances; in {EXACT} of the cameras they were also "
+        "traced for comparison.",
     )
     heads = ("merit", "reading", "estimator", "designed", "relative difference of traced derivatives")
     table = Table("monitor", "Accuracy of the monitor's readings", "", heads, rows, (None, None, None, None, 7))

@@ -609,7 +609,8 @@ TOLERANCE: Record[ToleranceRun] = Record(
     Quantity(
         "merits",
         lambda run: {
-            one.merit.name: _merit_plain(one, run.interpolation_errors.get(one.merit.name)) for one in run.merits
+            merit.merit.name: _merit_plain(merit, run.interpolation_errors.get(merit.merit.name))
+            for merit in run.merits
         },
         "each in its unit; p90 is the value that 90 % of the cameras keep",
     ),

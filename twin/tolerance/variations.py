@@ -390,12 +390,12 @@ def _motions(
 
     The arrays hold rotations, shifts, figure terms and changes of shape.
     """
-    turns, shifts = rotate.tolist(), shift.tolist()
+    rotations, shifts = rotate.tolist(), shift.tolist()
     figures = {j: values.tolist() for j, values in figure.items()}
     shapes = {name: values.tolist() for name, values in shape.items()}
     return [
         Motion(
-            rotate=tuple(turns[s]),
+            rotate=tuple(rotations[s]),
             shift=tuple(shifts[s]),
             figure={j: values[s] for j, values in figures.items()},
             **{name: values[s] for name, values in shapes.items()},

@@ -190,10 +190,10 @@ def run_states(
     advance : Advance
         Called with the number of states done.
     """
-    stated, disturbances = experiment.stated, experiment.disturbances
-    assert stated is not None
+    prior, disturbances = experiment.stated, experiment.disturbances
+    assert prior is not None
     assert disturbances is not None
-    amounts = stated.draw(np.random.default_rng(stream(seed, _DRAWN)), count)
+    amounts = prior.draw(np.random.default_rng(stream(seed, _DRAWN)), count)
     half = 0.5 * (np.array(experiment.path.shape) - 1)
     true: list[np.ndarray] = []
     read: dict[str, list[np.ndarray]] = {}
@@ -213,7 +213,7 @@ def run_states(
     )
     for first in range(0, count, chunk):
         advance(STATES, first, count)
-        states = states_of(amounts[first : first + chunk], stated.components, experiment.thermal)
+        states = states_of(amounts[first : first + chunk], prior.components, experiment.thermal)
         position = experiment.path.coarse_trace(states).centre
         inside = np.flatnonzero(np.all(np.abs(position) <= half, axis=(0, 2)))
         # each state has its own random streams, independent of lost states
@@ -226,8 +226,8 @@ def run_states(
                 read.setdefault(name, []).append(np.stack([row.value for row in rows], axis=1))
                 sigma.setdefault(name, []).append(np.stack([row.sigma for row in rows], axis=1))
             true.append(np.stack([row.true for row in rows], axis=1))
-            for name, chance in _chances(observation.recovery, experiment, quantities).items():
-                probabilities.setdefault(name, []).append(chance)
+            for name, probability in _probabilities(observation.recovery, experiment, quantities).items():
+                probabilities.setdefault(name, []).append(probability)
             for k in range(len(observation.numbers)):
                 test = observation.recovery.consistency(disturbances, k)
                 squares.append(test.chi_square)
@@ -281,7 +281,7 @@ def _exposed(
     return before, after
 
 
-def _chances(
+def _probabilities(
     recovery: Recovery, experiment: MonitorExperiment, quantities: tuple[Quantity, ...]
 ) -> dict[str, np.ndarray]:
     """Return estimator -> probability that an interval contains the truth, given the spot shifts.
@@ -390,6 +390,6 @@ def run_uncertainty(
     coverage = None
     if states:
         coverage = run_states(experiment, limits.quantities, states, resolved.frames, seed, advance)
-    unobserved = unobserved_texts(limits.stated, noise, limits.quantities, limits.gain)
+    unobserved = unobserved_texts(limits.disturbances, noise, limits.quantities, limits.gain)
     sensor_warnings = (*blur_warnings(resolved, backend), *coarse_warnings(resolved))
     return UncertaintyRun(resolved, limits, seed, coverage, (*sensor_warnings, *unobserved), experiment.path.checked)

@@ -89,7 +89,7 @@ class MonitorLimits:
     ----------
     instrument : str
         Name of the instrument.
-    stated : Disturbances
+    disturbances : Disturbances
         Prior on the disturbances.
     quantities : tuple of Quantity
         The Q quantities.
@@ -110,7 +110,7 @@ class MonitorLimits:
     """
 
     instrument: str
-    stated: Disturbances
+    disturbances: Disturbances
     quantities: tuple[Quantity, ...]
     noise: np.ndarray
     frames: int
@@ -150,7 +150,7 @@ class MonitorLimits:
         The empty name stands for the variances before a measurement.
         """
         shares = {"": self.splits[BEST].before, **{name: split.after for name, split in self.splits.items()}}
-        return {name: Split.by(share, self.stated.labels) for name, share in shares.items()}
+        return {name: Split.by(share, self.disturbances.labels) for name, share in shares.items()}
 
     @cached_property
     def gain(self) -> np.ndarray:
@@ -158,23 +158,23 @@ class MonitorLimits:
 
         It gives the four parameters of each camera, in rad or m, per pixel of spot shift.
         """
-        return self.stated.best_gain(self.noise)
+        return self.disturbances.best_gain(self.noise)
 
     @cached_property
     def elasticities(self) -> tuple[Elasticity, ...]:
         """Sensitivity of every quantity's sigma to each number of the prior, relative change per relative change."""
-        return elasticities(self.rows, self.stated, self.noise, self.gain)
+        return elasticities(self.rows, self.disturbances, self.noise, self.gain)
 
     @cached_property
     def heavy_tail(self) -> HeavyTail:
         """Errors of the posterior under a prior with heavy tails."""
-        return heavy_tails(self.rows, self.stated, self.noise, self.gain)
+        return heavy_tails(self.rows, self.disturbances, self.noise, self.gain)
 
     @cached_property
-    def from_statement(self) -> np.ndarray:
+    def from_prior(self) -> np.ndarray:
         """Fractions of the Q posterior variances that would remain without image noise, due to the prior, (Q,)."""
         with_noise, noise_free = (
-            limits.posterior_sigma(self.rows, self.stated, noise) for noise in (self.noise, 0.0 * self.noise)
+            limits.posterior_sigma(self.rows, self.disturbances, noise) for noise in (self.noise, 0.0 * self.noise)
         )
         return np.minimum(np.square(noise_free / np.where(with_noise > 0.0, with_noise, np.inf)), 1.0)
 
@@ -186,8 +186,8 @@ class MonitorLimits:
         """
         names = {name for q in range(len(self.quantities)) for name, _ in self.lines(BEST, q)[:LINES]}
         # keep the order of the prior, since a set has none
-        labels = [label for label in dict.fromkeys(self.stated.labels) if label in names]
-        sigmas = limits.sigma_if_known(self.rows, self.stated, self.noise, [(label,) for label in labels])
+        labels = [label for label in dict.fromkeys(self.disturbances.labels) if label in names]
+        sigmas = limits.sigma_if_known(self.rows, self.disturbances, self.noise, [(label,) for label in labels])
         return dict(zip(labels, sigmas, strict=True))
 
 
@@ -273,7 +273,7 @@ def find_limits(
     reason = ""
     if second_monitor:
         try:
-            enlarged = limits.with_further_spots(prior, _second_monitor(experiment).spots, _own(prior))
+            enlarged = limits.with_further_spots(prior, _second_monitor(experiment).spots, _individual(prior))
             remedies.append(
                 Remedy(
                     "second_monitor",
@@ -295,7 +295,7 @@ def _left(rows: np.ndarray, prior: Disturbances, noise: np.ndarray) -> np.ndarra
     return limits.posterior_sigma(rows, prior, noise)
 
 
-def _own(prior: Disturbances) -> list[bool]:
+def _individual(prior: Disturbances) -> list[bool]:
     """Return, for each motion of the prior, True if a second monitor has a body of its own for it, as for prisms.
 
     Cameras and the central prism are shared by both monitors.
@@ -397,11 +397,11 @@ def combination_text(limits: MonitorLimits, number: int, most: int = 4) -> str:
     most : int
         Largest number of motions to name.
     """
-    combination, quantity, stated = limits.least_observable[number], limits.quantities[number], limits.stated
+    combination, quantity, prior = limits.least_observable[number], limits.quantities[number], limits.disturbances
     order = sorted(range(len(combination.amounts)), key=lambda k: -abs(combination.amounts[k]))[:most]
     named = [
-        f"{body_text(stated.labels[k])} {significant(combination.amounts[k] * stated.sigmas[k], 2, sign=True)} "
-        f"{unit_for_reports(stated.units[k])}"
+        f"{body_text(prior.labels[k])} {significant(combination.amounts[k] * prior.sigmas[k], 2, sign=True)} "
+        f"{unit_for_reports(prior.units[k])}"
         for k in order
         if combination.amounts[k]
     ]

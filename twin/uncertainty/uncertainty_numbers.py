@@ -51,9 +51,11 @@ class _Limited:
     @property
     def motions(self) -> list[tuple[str, float, str]]:
         """Label, amount and unit of the motions in the least observable combination."""
-        amounts, stated = self.limits.least_observable[self.q].amounts, self.limits.stated
+        amounts, disturbances = self.limits.least_observable[self.q].amounts, self.limits.disturbances
         order = np.argsort(-np.abs(amounts), kind="stable")[:SEEN]
-        return [(stated.labels[k], float(amounts[k] * stated.sigmas[k]), stated.units[k]) for k in order]
+        return [
+            (disturbances.labels[k], float(amounts[k] * disturbances.sigmas[k]), disturbances.units[k]) for k in order
+        ]
 
     def held(self, level: int) -> float:
         return float(self.limits.heavy_tail.held[level, self.q])
@@ -72,10 +74,12 @@ SHARE: Record[tuple[str, float]] = Record(
 )
 _SPLIT: Record[_Limited] = Record(
     "Contributions of motions to a variance.",
-    Quantity("sigma", lambda one: one.sigma, "standard deviation, whose square is divided"),
-    Quantity("lines", lambda one: one.lines[:LINES], "motions with the largest shares, largest first", record=SHARE),
-    Quantity("rest", lambda one: float(sum(share for _, share in one.lines[LINES:])), "share of all other motions"),
-    Quantity("noise", lambda one: one.noise, "share of the image noise"),
+    Quantity("sigma", lambda split: split.sigma, "standard deviation, whose square is divided"),
+    Quantity(
+        "lines", lambda split: split.lines[:LINES], "motions with the largest shares, largest first", record=SHARE
+    ),
+    Quantity("rest", lambda split: float(sum(share for _, share in split.lines[LINES:])), "share of all other motions"),
+    Quantity("noise", lambda split: split.noise, "share of the image noise"),
 )
 _AMOUNT: Record[tuple[str, float, str]] = Record(
     "A motion in a combination of motions.",
@@ -85,72 +89,90 @@ _AMOUNT: Record[tuple[str, float, str]] = Record(
 )
 _LEAST_OBSERVABLE: Record[_Limited] = Record(
     "Least observable motions that change a quantity.",
-    Quantity("change", lambda one: one.limits.least_observable[one.q].change, "change of the quantity by all of them"),
-    Quantity("motions", lambda one: one.motions, "the largest of them", record=_AMOUNT),
-    Quantity("spots_px", lambda one: one.limits.least_observable[one.q].spots, "spot shifts that they cause"),
     Quantity(
-        "spots_noise_px", lambda one: one.limits.least_observable[one.q].noise, "noise standard deviation of the shifts"
+        "change",
+        lambda limited: limited.limits.least_observable[limited.q].change,
+        "change of the quantity by all of them",
+    ),
+    Quantity("motions", lambda limited: limited.motions, "the largest of them", record=_AMOUNT),
+    Quantity(
+        "spots_px", lambda limited: limited.limits.least_observable[limited.q].spots, "spot shifts that they cause"
+    ),
+    Quantity(
+        "spots_noise_px",
+        lambda limited: limited.limits.least_observable[limited.q].noise,
+        "noise standard deviation of the shifts",
     ),
 )
 _ELASTICITY: Record[tuple[Elasticity, int]] = Record(
     "Sensitivity of the posterior's standard deviation to a number of the prior.",
-    Quantity("number", lambda one: one[0].number, "name of the number"),
-    Quantity("value", lambda one: one[0].size, "its value in the prior"),
-    Quantity("unit", lambda one: one[0].unit, "unit of the number"),
-    Quantity("bodies", lambda one: len(one[0].bodies), "number of bodies that it applies to"),
-    Quantity("elasticity", lambda one: float(one[0].elasticity[one[1]]), "relative change per relative change"),
+    Quantity("number", lambda entry: entry[0].number, "name of the number"),
+    Quantity("value", lambda entry: entry[0].size, "its value in the prior"),
+    Quantity("unit", lambda entry: entry[0].unit, "unit of the number"),
+    Quantity("bodies", lambda entry: len(entry[0].bodies), "number of bodies that it applies to"),
+    Quantity("elasticity", lambda entry: float(entry[0].elasticity[entry[1]]), "relative change per relative change"),
     Quantity(
         "doubled",
-        lambda one: float(one[0].doubled[one[1]]),
+        lambda entry: float(entry[0].doubled[entry[1]]),
         "standard deviation if the number is twice as large, and the prior is unchanged",
     ),
     Quantity(
         "doubled_in_prior",
-        lambda one: float(one[0].doubled_in_prior[one[1]]),
+        lambda entry: float(entry[0].doubled_in_prior[entry[1]]),
         "standard deviation if the number is twice as large, also in the prior",
     ),
 )
 _HEAVY_TAIL: Record[_Limited] = Record(
     "Errors of the posterior if each number of the prior is the scale of Student's t distribution.",
-    Quantity("degrees", lambda one: one.limits.heavy_tail.degrees, "degrees of freedom of that distribution"),
-    Quantity("rms", lambda one: float(one.limits.heavy_tail.rms[one.q]), "root mean square of the error"),
-    Quantity("held_68", lambda one: one.held(0), "half-width of the interval that contains 68.3 % of the errors"),
-    Quantity("held_95", lambda one: one.held(1), "half-width of the interval that contains 95.4 % of the errors"),
-    Quantity("held_997", lambda one: one.held(2), "half-width of the interval that contains 99.7 % of the errors"),
+    Quantity("degrees", lambda limited: limited.limits.heavy_tail.degrees, "degrees of freedom of that distribution"),
+    Quantity("rms", lambda limited: float(limited.limits.heavy_tail.rms[limited.q]), "root mean square of the error"),
+    Quantity(
+        "held_68", lambda limited: limited.held(0), "half-width of the interval that contains 68.3 % of the errors"
+    ),
+    Quantity(
+        "held_95", lambda limited: limited.held(1), "half-width of the interval that contains 95.4 % of the errors"
+    ),
+    Quantity(
+        "held_997", lambda limited: limited.held(2), "half-width of the interval that contains 99.7 % of the errors"
+    ),
     Quantity(
         "beyond_3_sigma",
-        lambda one: float(one.limits.heavy_tail.beyond[one.q]),
+        lambda limited: float(limited.limits.heavy_tail.beyond[limited.q]),
         "probability of an error beyond 3 sigma; 0.0027 for a normal error",
     ),
 )
 _LIMITED: Record[_Limited] = Record(
     "Limits of one quantity, in the unit at the end of its key.",
-    Quantity("before", lambda one: one, "variance before the measurement", record=_SPLIT),
-    Quantity("after", lambda one: one.after, "variance that each estimator leaves", record=_SPLIT),
-    Quantity("sigma_if_known", lambda one: one.sigma_if_known, "remaining standard deviation if that motion is known"),
-    Quantity("least_observable", lambda one: one, "least observable motions", record=_LEAST_OBSERVABLE),
+    Quantity("before", lambda limited: limited, "variance before the measurement", record=_SPLIT),
+    Quantity("after", lambda limited: limited.after, "variance that each estimator leaves", record=_SPLIT),
+    Quantity(
+        "sigma_if_known", lambda limited: limited.sigma_if_known, "remaining standard deviation if that motion is known"
+    ),
+    Quantity("least_observable", lambda limited: limited, "least observable motions", record=_LEAST_OBSERVABLE),
     Quantity(
         "from_statement",
-        lambda one: float(one.limits.from_statement[one.q]),
+        lambda limited: float(limited.limits.from_prior[limited.q]),
         "share of the posterior's variance that remains without image noise",
     ),
     Quantity(
         "elasticities",
-        lambda one: one.followed,
+        lambda limited: limited.followed,
         "numbers of the prior with the largest elasticities",
         record=_ELASTICITY,
     ),
-    Quantity("student_t", lambda one: one, "errors under a prior with heavy tails", record=_HEAVY_TAIL),
+    Quantity("student_t", lambda limited: limited, "errors under a prior with heavy tails", record=_HEAVY_TAIL),
 )
 _REMEDY: Record[tuple[Remedy, Sequence[limits.Quantity]]] = Record(
     "A further measurement.",
-    Quantity("what", lambda one: one[0].what, "description of the measurement"),
-    Quantity("left", lambda one: _by_quantity(one[1], one[0].sigma), "remaining standard deviation of each quantity"),
+    Quantity("what", lambda entry: entry[0].what, "description of the measurement"),
+    Quantity(
+        "left", lambda entry: _by_quantity(entry[1], entry[0].sigma), "remaining standard deviation of each quantity"
+    ),
 )
 LIMITS: Record[MonitorLimits] = Record(
     "uncertainty.json",
     Quantity("name", lambda result: result.instrument, "the instrument"),
-    Quantity("disturbances", lambda result: result.stated.name, "name of the prior on disturbances"),
+    Quantity("disturbances", lambda result: result.disturbances.name, "name of the prior on disturbances"),
     Quantity("frames", lambda result: result.frames, "frames of each state"),
     Quantity("outside", lambda result: result.outside, "probability that a spot leaves its CCD"),
     Quantity(
@@ -161,7 +183,7 @@ LIMITS: Record[MonitorLimits] = Record(
     ),
     Quantity(
         "remedies",
-        lambda result: {one.name: (one, result.quantities) for one in result.remedies},
+        lambda result: {remedy.name: (remedy, result.quantities) for remedy in result.remedies},
         "further measurements",
         record=_REMEDY,
     ),
@@ -188,18 +210,30 @@ class _Counted:
 
 COUNT: Record[_Counted] = Record(
     "Errors of one quantity by one estimator in random states.",
-    Quantity("rms", lambda one: float(one.coverage.rms(one.estimator)[one.q]), "root mean square of the errors"),
+    Quantity(
+        "rms",
+        lambda covered: float(covered.coverage.rms(covered.estimator)[covered.q]),
+        "root mean square of the errors",
+    ),
     Quantity(
         "rms_over_sigma",
-        lambda one: float(one.coverage.ratio(one.estimator)[one.q]),
+        lambda covered: float(covered.coverage.ratio(covered.estimator)[covered.q]),
         "root mean square of the errors over their sigmas",
     ),
-    Quantity("held_68", lambda one: one.held(0), "share of the 68 % intervals that contain the truth"),
-    Quantity("held_95", lambda one: one.held(1), "share of the 95 % intervals that contain the truth"),
-    Quantity("expected_68", lambda one: one.expected(0), "expected share of the 68 % intervals that contain the truth"),
-    Quantity("expected_95", lambda one: one.expected(1), "expected share of the 95 % intervals that contain the truth"),
-    Quantity("limits_68", lambda one: one.limits(0), "limits of held_68 if every sigma is right"),
-    Quantity("limits_95", lambda one: one.limits(1), "limits of held_95 if every sigma is right"),
+    Quantity("held_68", lambda covered: covered.held(0), "share of the 68 % intervals that contain the truth"),
+    Quantity("held_95", lambda covered: covered.held(1), "share of the 95 % intervals that contain the truth"),
+    Quantity(
+        "expected_68",
+        lambda covered: covered.expected(0),
+        "expected share of the 68 % intervals that contain the truth",
+    ),
+    Quantity(
+        "expected_95",
+        lambda covered: covered.expected(1),
+        "expected share of the 95 % intervals that contain the truth",
+    ),
+    Quantity("limits_68", lambda covered: covered.limits(0), "limits of held_68 if every sigma is right"),
+    Quantity("limits_95", lambda covered: covered.limits(1), "limits of held_95 if every sigma is right"),
 )
 _OUTLIER: Record[tuple[str, str, str, float, int]] = Record(
     "A count outside its limits.",

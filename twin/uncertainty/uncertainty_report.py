@@ -67,7 +67,7 @@ def limits_section(
     shown = SvgFigure(
         "limits",
         "What the measurement removes, and what remains",
-        f"Prior: {limits.stated.name}. Left: standard deviation of every quantity's error after the "
+        f"Prior: {limits.disturbances.name}. Left: standard deviation of every quantity's error after the "
         "measurement over that before it. Right: variance that remains in the posterior, by bodies; those of both "
         "cameras together.",
         limits_svg(limits) if figure is None else figure,
@@ -108,12 +108,13 @@ def uncertainty_report(run: UncertaintyRun) -> Report:
             )
         )
     return Report(
-        f"{limits.instrument}: what limits its monitor under {limits.stated.name}",
+        f"{limits.instrument}: what limits its monitor under {limits.disturbances.name}",
         *answer(*_verdict(limits)[:1], coverage_text, *_verdict(limits)[1:]),
         (
             (
                 "Disturbances",
-                f"{limits.stated.name}, {len(limits.stated.labels)} motions of {len(set(limits.stated.bodies))} bodies",
+                f"{limits.disturbances.name}, {len(limits.disturbances.labels)} motions of "
+                f"{len(set(limits.disturbances.bodies))} bodies",
             ),
             ("Frames", f"{limits.frames} before and {limits.frames} after"),
         ),
@@ -144,7 +145,7 @@ def _verdict(limits: MonitorLimits) -> tuple[str, ...]:
     if best.sigma[q] > 0.95 * split.sigma[q]:
         advice = "neither more frames nor ground points nor further spots would reduce it by 5 %"
     return (
-        f"Under {limits.stated.name} the posterior leaves a standard deviation of "
+        f"Under {limits.disturbances.name} the posterior leaves a standard deviation of "
         f"{significant(split.sigma[q], 2)} {unit} of the {name}, {significant(split.sigma_before[q], 2)} {unit} before "
         "the measurement",
         f"{body_text(motion)} contributes {100 * share:.0f} % of the remaining variance, noise of the images "
@@ -159,8 +160,9 @@ def _percent(share: float) -> str:
 
 def _loss_text(limits: MonitorLimits) -> str:
     return (
-        f"In {_percent(limits.outside)} of all states of the prior {limits.stated.name} a spot leaves its area CCD, "
-        "and nothing is measured: a larger CCD or smaller motions of the cameras would help; sigmas ignore this loss"
+        f"In {_percent(limits.outside)} of all states of the prior {limits.disturbances.name} a spot leaves its area "
+        "CCD, and nothing is measured: a larger CCD or smaller motions of the cameras would help; sigmas ignore "
+        "this loss"
     )
 
 
@@ -260,7 +262,7 @@ def _prior_section(limits: MonitorLimits) -> Section:
     tail, split = limits.heavy_tail, limits.splits[BEST]
     heavy: list[Sequence[Cell]] = []
     for q, quantity in enumerate(limits.quantities):
-        share, sigma = 100.0 * float(limits.from_statement[q]), float(split.sigma[q])
+        share, sigma = 100.0 * float(limits.from_prior[q]), float(split.sigma[q])
         widths = (float(tail.rms[q]), *(float(width) for width in tail.held[:, q]))
         heavy.append((quantity_text(quantity), sigma, share, *widths, 100.0 * float(tail.beyond[q])))
     tails = Table(
@@ -369,8 +371,8 @@ def _states(coverage: Coverage) -> Section:
         "in 95 % interval [%]",
     )
     caption = "Readings minus truth in the quantity's unit, and the share of intervals that contain the truth."
-    places = (None, None, None, 3, 1, None, 1, None)
-    table = Table("coverage", "Random states", caption, (*heads, "limits of these"), rows, places, 3)
+    decimals = (None, None, None, 3, 1, None, 1, None)
+    table = Table("coverage", "Random states", caption, (*heads, "limits of these"), rows, decimals, 3)
     return Section("Do the sigmas hold?", tuple(text), (table,))
 
 
@@ -446,7 +448,7 @@ def _by_body(axes: Axes, limits: MonitorLimits) -> None:
     total = split.sigma**2
     parts = {
         name: value / total
-        for name, value in Split.by(split.after, [part_of(body) for body in limits.stated.bodies]).items()
+        for name, value in Split.by(split.after, [part_of(body) for body in limits.disturbances.bodies]).items()
     }
     order = sorted(parts, key=lambda name: -float(np.sum(np.abs(parts[name]))))
     named, others = order[: len(PALETTE)], order[len(PALETTE) :]

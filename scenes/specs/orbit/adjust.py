@@ -411,8 +411,8 @@ class OrbitAdjustSpec(PayloadTestSpec):
                 if name not in trackers:
                     raise unknown("no such star tracker in the passes", name, trackers, ("angles", k, "between", j))
             if len(set(angle.between)) == 1:
-                problem, place = "an angle of a star tracker with itself", ("angles", k, "between")
-                raise Problem(problem, angle.between[0], "two star trackers", within=place)
+                problem, key = "an angle of a star tracker with itself", ("angles", k, "between")
+                raise Problem(problem, angle.between[0], "two star trackers", within=key)
         lasting = [
             item for item in self.errors.attitude.values() if (item.law, item.shared_by) == ("constant", "tracker")
         ]

@@ -152,7 +152,7 @@ class PointsSpec(Spec):
         return self
 
 
-class PatchPlaceSpec(Spec):
+class PatchPositionSpec(Spec):
     """Position of a patch of ground.
 
     Attributes
@@ -188,7 +188,7 @@ class CalibrationImagesSpec(Spec):
         Number of ground samples along each side of a pixel.
     """
 
-    patches: tuple[PatchPlaceSpec, ...]
+    patches: tuple[PatchPositionSpec, ...]
     lines: Side = 500
     pixels: Side = 500
     ground: GroundSpec = GroundSpec.model_construct()

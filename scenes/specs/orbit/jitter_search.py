@@ -21,20 +21,20 @@ Axis = Literal["roll", "pitch", "yaw"]
 AXES: tuple[Axis, ...] = ("roll", "pitch", "yaw")
 
 
-def _some_lines(names: tuple[str, ...] | None) -> tuple[str, ...] | None:
+def _require_lines(names: tuple[str, ...] | None) -> tuple[str, ...] | None:
     if names is not None and (len(names) < 2 or len(set(names)) < len(names)):
         raise Problem("too few lines, or a repeated line", names_text(names) or "none", "two lines or more, each once")
     return names
 
 
-def _some_axes(names: tuple[Axis, ...]) -> tuple[Axis, ...]:
+def _require_axes(names: tuple[Axis, ...]) -> tuple[Axis, ...]:
     if not names or len(set(names)) < len(names):
         raise Problem("no axis, or a repeated axis", names_text(names) or "none", "roll, pitch, yaw, each once at most")
     return names
 
 
-Axes = Annotated[tuple[Axis, ...], AfterValidator(_some_axes)]
-SomeLines = Annotated[tuple[Name, ...] | None, AfterValidator(_some_lines)]
+Axes = Annotated[tuple[Axis, ...], AfterValidator(_require_axes)]
+LineNames = Annotated[tuple[Name, ...] | None, AfterValidator(_require_lines)]
 
 
 class SplineSpec(Spec):
@@ -165,7 +165,7 @@ class OrbitJitterSpec(PayloadTestSpec):
         Seed of all random numbers.
     """
 
-    lines: SomeLines = None
+    lines: LineNames = None
     earth: EarthSpec = EarthSpec.model_construct()
     orbit: OrbitSpec
     attitude: AttitudeSpec = AttitudeSpec.model_construct(steering="yaw")

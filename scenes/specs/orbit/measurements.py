@@ -17,7 +17,7 @@ from optics.numerics.number_tree import FrozenMap
 from scenes.specs.orbit.angle import Angles, EffectsSpec, LightEffectsSpec, Moment
 from scenes.specs.orbit.calibration import LaunchSpec, MapLimitsSpec
 from scenes.specs.orbit.flight import EarthSpec, Interval, LengthSigmas, PayloadTestSpec, SlowErrorsSpec, UtcTime
-from scenes.specs.orbit.jitter_search import JitterSearchSpec, SomeLines
+from scenes.specs.orbit.jitter_search import JitterSearchSpec, LineNames
 from scenes.specs.orbit.scene import ImagePointsSpec
 from scenes.yaml.errors import KeyPath, Problem, names_text
 from scenes.yaml.spec import Flag, Name, Named, Number, Reference, Spec, SpecType, Text, Whole, not_empty
@@ -56,7 +56,7 @@ def _right_handed(axes: tuple[Toward, Toward, Toward]) -> tuple[Toward, Toward, 
 BodyAxes = Annotated[tuple[Toward, Toward, Toward], AfterValidator(_right_handed)]
 
 OrbitFrame = Literal["ITRS", "GCRS", "EME2000", "TEME"]
-TurnFrame = Literal["ITRS", "GCRS", "EME2000", "TEME", "orbital"]
+RotationFrame = Literal["ITRS", "GCRS", "EME2000", "TEME", "orbital"]
 Sequence = Literal["xyz", "xzy", "yxz", "yzx", "zxy", "zyx"]
 Satellite = Annotated[str, Field(strict=True, min_length=1, max_length=100)]
 ClockOffset = Annotated[float, Quantity(TIME, largest="1000 s")]
@@ -134,7 +134,7 @@ class AttitudeFileSpec(Spec):
 
     file: Reference
     satellite: Satellite | None = None
-    frame: TurnFrame | None = None
+    frame: RotationFrame | None = None
     time_scale: TimeScale | None = None
     epoch: ClockReading | None = None
     leap_seconds: Literal["counted", "skipped"] | None = None
@@ -501,7 +501,7 @@ class MeasuredTestSpec(FixedTestSpec):
 
     @model_validator(mode="before")
     @classmethod
-    def _says_where_the_data_are(cls, value: Any) -> Any:
+    def _check_sources(cls, value: Any) -> Any:
         if isinstance(value, Mapping):
             here = [key for key in ("conventions", "passes") if value.get(key) is not None]
             if ("data" in value) == bool(here) or len(here) == 1:
@@ -581,7 +581,7 @@ class MeasuredJitterSpec(MeasuredTestSpec):
         Settings of the search: frequencies, axes, false-alarm probability and models.
     """
 
-    lines: SomeLines = None
+    lines: LineNames = None
     search: JitterSearchSpec
 
 

@@ -249,8 +249,8 @@ class CorrectionSpec(Spec):
 
         For a mechanism with steps it is a whole number of them.
         """
-        reach, step = self._size("range"), self._size("step")
-        return reach if reach is None or step is None else step * math.floor(reach / step + _WHOLE)
+        full_range, step = self._size("range"), self._size("step")
+        return full_range if full_range is None or step is None else step * math.floor(full_range / step + _WHOLE)
 
     @property
     def band(self) -> float:

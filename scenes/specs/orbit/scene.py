@@ -58,12 +58,12 @@ def _apart(outlines: tuple[tuple[Corner, ...], ...]) -> tuple[tuple[Corner, ...]
     """Raise `Problem` if obstructions overlap or leave less than a tenth of the pupil free."""
     shapes = [np.array(outline, float)[None] for outline in outlines]
     shapes = [shape if area(shape)[0] > 0.0 else shape[:, ::-1] for shape in shapes]
-    for k, one in enumerate(shapes):
+    for k, polygon in enumerate(shapes):
         for other in shapes[:k]:
-            if abs(area(intersect(one, *sides(other)))[0]) > _SMALLEST:
+            if abs(area(intersect(polygon, *sides(other)))[0]) > _SMALLEST:
                 raise Problem("outlines overlap", "", "polygons that do not overlap")
-    turn = 2.0 * np.pi * np.arange(64) / 64
-    disk = np.stack([np.cos(turn), np.sin(turn)], axis=-1)[None]
+    angle = 2.0 * np.pi * np.arange(64) / 64
+    disk = np.stack([np.cos(angle), np.sin(angle)], axis=-1)[None]
     if sum(float(area(intersect(shape, *sides(disk)))[0]) for shape in shapes) > 0.9 * np.pi:
         raise Problem("the pupil is covered", "", "outlines that leave at least a tenth of the pupil open")
     return outlines
@@ -325,7 +325,7 @@ class ImagePointsSpec(Spec):
     false_alarm: Annotated[Number, Field(gt=0.0, lt=0.5)] = 1e-3
 
     @model_validator(mode="after")
-    def _are_some(self) -> "ImagePointsSpec":
+    def _are_not_empty(self) -> "ImagePointsSpec":
         if not self.control + self.check + self.tie:
             raise Problem("no points", "control, check and tie 0", "some points, or no section `points`")
         return self

@@ -147,7 +147,7 @@ class AngleSetup(ExperimentSetup[OrbitAngleSpec]):
                 if line not in lines:
                     raise test.error(unknown("no such line", line, lines), ("angles", name, k))
         if self.camera is not None:
-            _require_turns(test, lines)
+            _require_rotations(test, lines)
         ends = (test.strips.first, test.strips.last)
         _require_ends(test, "strips", ends, self.usual_pixels, f"the lines of {self.camera_name}")
         return self.model_copy(update={"test": test.model_copy(update={"angles": FrozenMap(angles)})})
@@ -199,7 +199,7 @@ class CalibrationSetup(PayloadSetup[OrbitCalibrationSpec]):
             raise test.error(problem, ("camera",), found=found, allowed=_THREE_LINES)
         _require_known("line", test, ("perturb",), test.perturb, LINES)
         _require_known("line", test, ("drift",), test.drift, LINES)
-        _require_places(test, (*test.perturb, *test.drift), camera)
+        _require_movable(test, (*test.perturb, *test.drift), camera)
         if "nadir" in test.perturb and any(test.perturb["nadir"].principal_point):
             raise test.error(
                 "the nadir line's principal point is the gauge",
@@ -306,7 +306,7 @@ class SimulateSetup(PayloadSetup[OrbitSimulateSpec]):
             if name not in names:
                 allowed = f"{names_text(names)}, the lines of {camera.name}"
                 raise test.error(unknown("no such line", name, names, allowed=allowed), key)
-        _require_places(test, test.perturb, camera)
+        _require_movable(test, test.perturb, camera)
         _require_images_of(test, test.lines, camera)
         line, pixels = f"the line {test.patch.line} of {camera.name}", camera.pixels_of(test.patch.line)
         _require_pixel(test, ("patch", "pixel"), test.patch.pixel, pixels, line)
@@ -514,7 +514,7 @@ def _require_sensors(test: OrbitAdjustSpec | MeasuredAdjustSpec) -> None:
             raise test.error(unknown("the block has no such sensor", name, test.sensors), ("without",))
 
 
-def _require_turns(test: OrbitAngleSpec, lines: tuple[str, ...]) -> None:
+def _require_rotations(test: OrbitAngleSpec, lines: tuple[str, ...]) -> None:
     """Raise `InputError` unless every change rotates one of a payload's lines.
 
     For an instrument, the actions of its nodes are checked when it is built.
@@ -593,7 +593,7 @@ def _require_several(test: Spec, named: tuple[str, ...] | None, camera: ThreeLin
 _THREE_LINES = "a camera with lines forward, nadir and backward"
 
 
-def _require_places(test: Spec, changes: Iterable[str], camera: ThreeLineCameraSpec) -> None:
+def _require_movable(test: Spec, changes: Iterable[str], camera: ThreeLineCameraSpec) -> None:
     """Raise `InputError` for a change of the interior orientation of a line that is defined by look angles."""
     for name in changes:
         if name in camera.lines and camera.lines[name].by_look_angles:

@@ -57,7 +57,7 @@ class CcdSpec(Spec):
     psi_y: LookAngles | None = None
 
     @model_validator(mode="after")
-    def _is_known_in_one_way(self) -> "CcdSpec":
+    def _check_single_specification(self) -> "CcdSpec":
         if self.last <= self.first:
             raise Problem("a CCD of one pixel or none", f"{self.first} to {self.last}", "a last pixel after the first")
         if (self.psi_x is None) != (self.psi_y is None):

@@ -34,25 +34,25 @@ from twin.operate.record.entries import MICRO
 _FILTER = (PendingReading, BadReading, FilterState, Disturbances, HeatInputs, Innovation, Jump, Observed, Quantity)
 """Classes of the filter that a serialised estimate may contain."""
 _CLASSES = (*_FILTER, SeriesFilter, TimeLaw, Track)
-_PARAMETERS = ChainMap(CAMERA_PARAMETERS, {one.key: one for one in (ANGLE, *GROUND)})
+_PARAMETERS = ChainMap(CAMERA_PARAMETERS, {parameter.key: parameter for parameter in (ANGLE, *GROUND)})
 
 
 def packed(value: Any) -> bytes:
     """Serialise a value of frozen data classes, sequences, mappings, arrays, numbers and texts as bytes."""
     arrays: dict[str, np.ndarray] = {}
 
-    def plain(one: Any) -> Any:
-        if isinstance(one, np.ndarray):
-            arrays[name := f"array_{len(arrays)}"] = one
+    def plain(item: Any) -> Any:
+        if isinstance(item, np.ndarray):
+            arrays[name := f"array_{len(arrays)}"] = item
             return {"array": name}
-        if isinstance(one, Parameter):
-            return {"parameter": one.key}
-        if is_dataclass(one) and not isinstance(one, type):
-            own = {each.name: plain(getattr(one, each.name)) for each in fields(one) if each.init}
-            return {"class": type(one).__name__, "of": own}
-        if isinstance(one, Mapping):
-            return {"mapping": [[plain(key), plain(each)] for key, each in one.items()]}
-        return [plain(each) for each in one] if isinstance(one, tuple | list) else one
+        if isinstance(item, Parameter):
+            return {"parameter": item.key}
+        if is_dataclass(item) and not isinstance(item, type):
+            content = {each.name: plain(getattr(item, each.name)) for each in fields(item) if each.init}
+            return {"class": type(item).__name__, "of": content}
+        if isinstance(item, Mapping):
+            return {"mapping": [[plain(key), plain(each)] for key, each in item.items()]}
+        return [plain(each) for each in item] if isinstance(item, tuple | list) else item
 
     text, file = json.dumps(plain(value)).encode(), io.BytesIO()
     np.savez(file, allow_pickle=False, plain=np.frombuffer(text, np.uint8), **arrays)
@@ -69,18 +69,18 @@ def unpacked(content: bytes, *classes: type) -> Any:
     classes : type
         Data classes that occur in the value, in addition to those of the filter.
     """
-    known: dict[str, Any] = {one.__name__: one for one in (*_CLASSES, *classes)}
+    known: dict[str, Any] = {item.__name__: item for item in (*_CLASSES, *classes)}
 
-    def value(one: Any) -> Any:
-        if isinstance(one, list):
-            return tuple(value(each) for each in one)
-        if not isinstance(one, dict):
-            return one
-        if "class" in one:
-            return known[one["class"]](**{name: value(each) for name, each in one["of"].items()})
-        if "mapping" in one:
-            return {value(key): value(each) for key, each in one["mapping"]}
-        return arrays[one["array"]] if "array" in one else _PARAMETERS[one["parameter"]]
+    def value(item: Any) -> Any:
+        if isinstance(item, list):
+            return tuple(value(each) for each in item)
+        if not isinstance(item, dict):
+            return item
+        if "class" in item:
+            return known[item["class"]](**{name: value(each) for name, each in item["of"].items()})
+        if "mapping" in item:
+            return {value(key): value(each) for key, each in item["mapping"]}
+        return arrays[item["array"]] if "array" in item else _PARAMETERS[item["parameter"]]
 
     with np.load(io.BytesIO(content), allow_pickle=False) as file:
         arrays = {name: file[name] for name in file.files}
@@ -381,8 +381,8 @@ class EstimatorState:
         """
         assert self.pending is not None
         number, time = self.pending
-        entries = [one for one in self.excluded if (one[0], one[1]) != (time, "monitor")]
-        bad = tuple(one for one in self.bad_readings if one[0] != time)
+        entries = [entry for entry in self.excluded if (entry[0], entry[1]) != (time, "monitor")]
+        bad = tuple(entry for entry in self.bad_readings if entry[0] != time)
         if not excluded:
             return replace(self, pending=None, excluded=tuple(entries), bad_readings=bad)
         good, bad = self.used != number, (*bad, (time, excluded))
@@ -403,7 +403,7 @@ class EstimatorState:
         Each is (body, time_us of the first equal reading).
         """
         stuck = ((sensor.body, sensor.since_us) for sensor in self.sensors.values() if sensor.stuck)
-        return tuple(one for one in stuck if one not in self.stuck_sensors)
+        return tuple(body for body in stuck if body not in self.stuck_sensors)
 
     @property
     def jointly_disagreeing(self) -> tuple[str, ...]:
@@ -415,10 +415,10 @@ class EstimatorState:
         bodies = tuple(sorted(sensor.body for sensor in self.sensors.values() if sensor.disagrees))
         return bodies if len(bodies) > 1 else ()
 
-    def with_innovation(self, time: int, found: Innovation) -> EstimatorState:
+    def with_innovation(self, time: int, predicted: Innovation) -> EstimatorState:
         """Return the state with the innovation (reading minus prediction) of a monitor reading that was used."""
-        innovation = (time, found.chi_square, len(found.white))
-        scores = self.scores.updated(found.white, found.log_score)
+        innovation = (time, predicted.chi_square, len(predicted.white))
+        scores = self.scores.updated(predicted.white, predicted.log_score)
         innovations = (*self.innovations, innovation)[-HISTORY_LENGTH:]
         first = (*self.first_innovations, innovation)[: SPANS[-1]]
         return replace(
@@ -501,13 +501,13 @@ class EntryFilter:
                 state = state.excluding(int(entry["time_us"]), str(entry["kind"]), str(entry["subject"]), reason)
         entries = [entry for entry in entries if entry["decided"] is None or entry["decided"][0]]
         warm = sorted(
-            (entry for entry in entries if entry["kind"] == "temperature"), key=lambda one: str(one["subject"])
+            (entry for entry in entries if entry["kind"] == "temperature"), key=lambda reading: str(reading["subject"])
         )
-        for one in warm:
-            state = self._temperature(state, one)
-        for one in entries:
-            if one["kind"] == "monitor":
-                state = self._monitor(state, one)
+        for reading in warm:
+            state = self._temperature(state, reading)
+        for reading in entries:
+            if reading["kind"] == "monitor":
+                state = self._monitor(state, reading)
         return state
 
     def observed(self, entry: Mapping[str, Any]) -> Observed:

@@ -110,15 +110,15 @@ class Operation:
             raise Problem("the record has no reading of the monitor", None, allowed)
         self.epoch = int(first["time_us"])
         before = [
-            (camera, channel, one["before"])
+            (camera, channel, reading["before"])
             for camera, parts in content_of(first)["numbers"]["spots"].items()
-            for channel, one in parts.items()
+            for channel, reading in parts.items()
         ]
-        self._before = {(camera, channel): one for camera, channel, one in before}
+        self._before = {(camera, channel): reading for camera, channel, reading in before}
         self._sensors = tuple(body for body in history.subjects("temperature") if body in history.bodies["warm"])
         self._plan_digest: str = plan_digest(plan) if previous is None else previous._plan_digest
         order = [list(plan.model.instrument.cameras), list(plan.disturbances.causes)]
-        parts = [self._plan_digest, order, self.epoch, list(self._sensors), [list(one) for one in before]]
+        parts = [self._plan_digest, order, self.epoch, list(self._sensors), [list(reading) for reading in before]]
         self.key = digest_of_data([source_digest(), *parts])
         """SHA-256 of everything besides the readings that the estimate depends on."""
         if previous is not None and previous.key == self.key:
@@ -143,7 +143,7 @@ class Operation:
         checkpoint = self.history.checkpoint(self.key, number=_MODEL)
         if checkpoint is not None:
             return cast("OperationModel", unpacked(checkpoint.content, OperationModel))
-        sigma = np.array([(one["row_sigma"], one["column_sigma"]) for one in self._before.values()])
+        sigma = np.array([(spot["row_sigma"], spot["column_sigma"]) for spot in self._before.values()])
         model = traced_model(self.plan, sigma, self._sensors, self.experiment)
         self.history.save_checkpoint(self.key, _MODEL, -(2**62), 0, packed(model))
         return model
@@ -163,7 +163,7 @@ class Operation:
     @cached_property
     def _entry_filter(self) -> EntryFilter:
         """Kalman filter that allows for steps of the motions at the record's events."""
-        causes = self.model.series_filter.stated.causes
+        causes = self.model.series_filter.prior.causes
         steps = []
         for time, _, stepping in self.events:
             motions = tuple(k for k, cause in enumerate(causes) if cause in stepping)
@@ -175,7 +175,7 @@ class Operation:
     def _moments(self, after_us: int | None) -> Iterator[list[dict[str, Any]]]:
         """Yield the entries that the estimate uses, grouped by time, in the order of time."""
         used = (entry for entry in self.history.entries(after_us=after_us) if entry["kind"] in USED)
-        for _, entries in groupby(used, key=lambda one: int(one["time_us"])):
+        for _, entries in groupby(used, key=lambda row: int(row["time_us"])):
             yield [
                 {**entry, "content": content_of(entry), "decided": self._decisions.get(entry["id"])}
                 for entry in entries
@@ -286,9 +286,9 @@ class Operation:
             state.innovations,
             jumps,
             self.events,
-            tuple(sorted(sensors, key=lambda one: one.body)),
+            tuple(sorted(sensors, key=lambda item: item.body)),
             state.excluded,
-            {one.name: share for one, share in zip(self.quantities, state.explained.tolist(), strict=True)},
+            {item.name: share for item, share in zip(self.quantities, state.explained.tolist(), strict=True)},
             self._sigma_inflation,
             self.too_many_jumps,
             self._requirement_status(),
@@ -311,15 +311,15 @@ class Operation:
 
     def _understated_causes(self) -> tuple[str, ...]:
         """Return the causes, in the prior, of temperatures with which the sensors of several bodies disagree."""
-        stated, heat, disagreeing = (
-            self.model.series_filter.stated,
+        prior, heat, disagreeing = (
+            self.model.series_filter.prior,
             self.model.series_filter.heat,
             self.estimator_state.disagreeing,
         )
         if heat is None:
             return ()
-        lasting = (k for k in heat.motions.tolist() if stated.bodies[k] in disagreeing and not stated.laws[k].white)
-        return tuple(dict.fromkeys(stated.causes[k] for k in lasting))
+        lasting = (k for k in heat.motions.tolist() if prior.bodies[k] in disagreeing and not prior.laws[k].white)
+        return tuple(dict.fromkeys(prior.causes[k] for k in lasting))
 
     def _detected_jump(self, detected_us: int, jump: Jump) -> DetectedJump:
         """Return a jump of the filter with its sizes and its effect on every quantity, in reporting units."""
@@ -330,9 +330,9 @@ class Operation:
         read, changed = rows @ (self.model.reading @ change[:width]), rows @ change[width:]
         sigma = np.sqrt(np.einsum("qi,ij,qj->q", rows, spread[width:, width:], rows))
         each = zip(self.quantities, read.tolist(), changed.tolist(), sigma.tolist(), strict=True)
-        line_changes = {one.name: (was, now, spread) for one, was, now, spread in each}
+        line_changes = {quantity.name: (was, now, spread) for quantity, was, now, spread in each}
         return DetectedJump(
-            jump.body, after, until, detected_us, sizes, jump.log_ratio, jump.chance, jump.rivals, line_changes
+            jump.body, after, until, detected_us, sizes, jump.log_ratio, jump.false_alarm, jump.rivals, line_changes
         )
 
     def _requirement_status(self) -> tuple[RequirementStatus, ...]:
@@ -345,8 +345,8 @@ class Operation:
         out = []
         for requirement in operation.requirements:
             k = [each.name for each in ahead.quantities].index(requirement.name)
-            chance = beyond(ahead.values[:, k], ahead.sigmas[:, k], requirement.largest)
-            broken = np.flatnonzero(chance > 1.0 - requirement.probability)
+            exceedance = beyond(ahead.values[:, k], ahead.sigmas[:, k], requirement.largest)
+            broken = np.flatnonzero(exceedance > 1.0 - requirement.probability)
             breaks_us = int(ahead.times[broken[0]]) if len(broken) else None
             unit = self.quantities[k].parameter.unit
             holds = not (len(broken) and broken[0] == 0)
@@ -356,7 +356,7 @@ class Operation:
                     unit,
                     requirement.largest,
                     requirement.probability,
-                    float(chance[0]),
+                    float(exceedance[0]),
                     holds,
                     breaks_us,
                 )
@@ -415,8 +415,8 @@ class Operation:
 
         For a body without a specified rate, one jump is expected.
         """
-        stated, lasted = self.model.series_filter.stated, (self.estimator_state.time - self.epoch) / MICRO
-        mean_intervals = {body: law.every_s for body, law in zip(stated.bodies, stated.laws, strict=True) if law.jump}
+        prior, lasted = self.model.series_filter.prior, (self.estimator_state.time - self.epoch) / MICRO
+        mean_intervals = {body: law.every_s for body, law in zip(prior.bodies, prior.laws, strict=True) if law.jump}
         mean = sum(1.0 if rate is None else lasted / rate for rate in mean_intervals.values())
         count = len(self.estimator_state.jumps)
         return bool(count > 1 and pdtrc(count - 1, mean) < FALSE_ALARM)
@@ -444,8 +444,8 @@ class Operation:
     ) -> Course:
         """Convert estimated camera parameters and covariances at given times to all quantities with their sigmas."""
         rows = self.model.rows
-        changes = np.array([one for one, _ in estimates]).reshape(len(times), rows.shape[1])
-        covariance = np.array([one for _, one in estimates]).reshape(len(times), rows.shape[1], rows.shape[1])
+        changes = np.array([part for part, _ in estimates]).reshape(len(times), rows.shape[1])
+        covariance = np.array([part for _, part in estimates]).reshape(len(times), rows.shape[1], rows.shape[1])
         covariance = covariance * sigma_inflation[:, None, None] ** 2
         variance = np.einsum("qi,tij,qj->tq", rows, covariance, rows)
         sigmas = np.sqrt(np.maximum(variance, 0.0))
@@ -475,7 +475,7 @@ class Operation:
 
         After the newest reading it is the present factor. Array dimensions: T times.
         """
-        innovations = [one for span in self._segments(None) for one in span.new_innovations]
+        innovations = [innovation for span in self._segments(None) for innovation in span.new_innovations]
         squares = self._unexplained(innovations)
         counts = np.searchsorted([time for time, _, _ in innovations], times, side="right")
         out = inflation_factors(squares, counts, True, self._lasting([time for time, _, _ in innovations]))
@@ -498,7 +498,7 @@ class Operation:
         Problem
             The time is before the first reading.
         """
-        stated = self.model.series_filter.stated
+        prior = self.model.series_filter.prior
         series_filter = replace(
             self._entry_filter.series_filter, steps=(*self._entry_filter.series_filter.steps, *self._steps())
         )
@@ -507,14 +507,16 @@ class Operation:
             np.array([time_us], np.int64),
             lambda mean, covariance, time: series_filter.motions_of(mean, covariance, time, since, acting),
         )
-        (mean, spread), size = estimates[0], stated.sigmas
+        (mean, spread), size = estimates[0], prior.sigmas
         spread = spread * self._sigma_inflation_at(np.array([time_us], np.int64))[0] ** 2
-        return Motions(int(time_us), stated.labels, stated.units, size * mean, size[:, None] * spread * size)
+        return Motions(int(time_us), prior.labels, prior.units, size * mean, size[:, None] * spread * size)
 
-    def _steps(self, told_after: int | None = None) -> tuple[Step, ...]:
+    def _steps(self, detected_after: int | None = None) -> tuple[Step, ...]:
         """Return the detected jumps as steps for the filter, optionally only those detected after a time."""
-        own = (jump for jump in self.estimator_state.jumps if told_after is None or jump.time > told_after)
-        return tuple(Step.of(one.jump) for one in own)
+        later_jumps = (
+            jump for jump in self.estimator_state.jumps if detected_after is None or jump.time > detected_after
+        )
+        return tuple(Step.of(detected.jump) for detected in later_jumps)
 
     def _states_at(
         self, times: NDArray[np.int64], each: Callable[[Array, Array, float], tuple[Array, Array]]
@@ -586,13 +588,15 @@ class Operation:
         have detected.
         """
         entry_filter, start = self._entry_filter, self._checkpoint_before(time)
-        told = None if start is None else start.time
-        steps = (*entry_filter.series_filter.steps, *self._steps(told))
-        used, left = self._used_entries(told)
+        start_time = None if start is None else start.time
+        steps = (*entry_filter.series_filter.steps, *self._steps(start_time))
+        used, left = self._used_entries(start_time)
         wanted = set(used.tolist())
-        every = (entry for entries in self._moments(told) for entry in entries)
-        said = {one["id"]: entry_filter.observed(one) for one in every if one["id"] in wanted}
-        observed = [said[number] for number in used.tolist()]
+        entries_of_moments = (entry for entries in self._moments(start_time) for entry in entries)
+        spots_by_id = {
+            reading["id"]: entry_filter.observed(reading) for reading in entries_of_moments if reading["id"] in wanted
+        }
+        observed = [spots_by_id[number] for number in used.tolist()]
         filter_state = (entry_filter.start(self._begin()) if start is None else start).filter_state
         filter_state = _without_search(filter_state)
         knowing = replace(entry_filter.series_filter, steps=steps, window=0)
@@ -609,8 +613,8 @@ class Operation:
         """
         spans = self._segments(after_us)
         width = len(self._entry_filter.series_filter.walking)
-        left = np.concatenate([one.undetected_shares.reshape(len(one.used), width) for one in spans])
-        used, pending = np.concatenate([one.used for one in spans]), self.estimator_state.pending
+        left = np.concatenate([span.undetected_shares.reshape(len(span.used), width) for span in spans])
+        used, pending = np.concatenate([span.used for span in spans]), self.estimator_state.pending
         good = used != (0 if pending is None else pending[0])
         return used[good], left[good]
 
@@ -630,11 +634,14 @@ class Operation:
             for checkpoint in self.history.checkpoints(self.key)
             if checkpoint.number > _HEAD
         )
-        return [*(replace(one, filter_state=_without_search(one.filter_state)) for one in checkpoints), last]
+        return [
+            *(replace(segment, filter_state=_without_search(segment.filter_state)) for segment in checkpoints),
+            last,
+        ]
 
     def _begin(self) -> int:
         """Return the time of the first entry that the estimate uses, in microseconds of TAI since 2000."""
-        return min(int(one["time_us"]) for kind in USED if (one := self.history.first(kind)) is not None)
+        return min(int(entry["time_us"]) for kind in USED if (entry := self.history.first(kind)) is not None)
 
     def _checkpoint_before(self, time: int) -> EstimatorState | None:
         """Return the newest permanent checkpoint before a time and all jumps detected since; None if there is none."""
@@ -644,7 +651,7 @@ class Operation:
             if checkpoint is None:
                 return None
             earlier = [
-                self.epoch + int(jump.jump.chances[0][0] * MICRO)
+                self.epoch + int(jump.jump.time_distribution[0][0] * MICRO)
                 for jump in last.jumps
                 if jump.time > checkpoint.time_us
             ]

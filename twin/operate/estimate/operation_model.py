@@ -103,20 +103,20 @@ def traced_model(
         The instrument lacks a body of the plan, or the body cannot move or be warmed as specified.
     """
     plan = setup.operation
-    stated, motions = experiment.disturbances, experiment.stated
-    assert stated is not None  # a plan states what moves
+    disturbances, motions = experiment.disturbances, experiment.stated
+    assert disturbances is not None  # a plan states what moves
     assert motions is not None
     stepping = {cause for causes in plan.events.values() for cause in causes}
     series_filter = SeriesFilter(
-        stated,
+        disturbances,
         np.diag(reference_sigma.ravel() ** 2),
         heat_inputs(motions, experiment.thermal, sensors, plan.coefficients),
         life_s=plan.mission,
         window=plan.window,
-        stepping=tuple(k for k, cause in enumerate(stated.causes) if cause in stepping),
+        stepping=tuple(k for k, cause in enumerate(disturbances.causes) if cause in stepping),
         before_s=BEFORE * plan.mission,
     )
-    spots = [(name, channel) for name, one in experiment.cameras.items() for channel in one.channels]
+    spots = [(name, channel) for name, calibration in experiment.cameras.items() for channel in calibration.channels]
     alone = [camera.parameter_jacobian @ np.linalg.pinv(camera.spot_jacobian) for camera in experiment.cameras.values()]
     return OperationModel(
         series_filter, tuple(spots), quantities(experiment.cameras, experiment.ground), np.asarray(block_diag(*alone))
@@ -124,7 +124,7 @@ def traced_model(
 
 
 def heat_inputs(
-    stated: DisturbancePrior, thermal: ThermalModel, sensors: Sequence[str], sigma: float
+    prior: DisturbancePrior, thermal: ThermalModel, sensors: Sequence[str], sigma: float
 ) -> HeatInputs | None:
     """Return the model of the sensors' readings as a linear function of the prior's temperatures.
 
@@ -133,7 +133,7 @@ def heat_inputs(
 
     Parameters
     ----------
-    stated : DisturbancePrior
+    prior : DisturbancePrior
         All M specified components of motion and temperature.
     thermal : ThermalModel
         Thermal model of the instrument.
@@ -143,23 +143,27 @@ def heat_inputs(
         Relative standard deviation, over the bodies, of the ratio of the true to the computed optical effect of a
         body's temperature.
     """
-    heat = [k for k, component in enumerate(stated.components) if component.kind in HEAT]
-    still = {stated.components[k].body: Temperature() for k in heat}
+    heat = [k for k, component in enumerate(prior.components) if component.kind in HEAT]
+    still = {prior.components[k].body: Temperature() for k in heat}
     rows = np.zeros((len(sensors), len(heat)))
     for column, k in enumerate(heat):
-        one = stated.components[k]
-        gradient = tuple(one.sigma if one.kind == "gradient" and one.axis == axis else 0.0 for axis in range(3))
-        temperature = Temperature(
-            one.sigma if one.kind == "temperature" else 0.0, (gradient[0], gradient[1], gradient[2])
+        heat_component = prior.components[k]
+        gradient = tuple(
+            heat_component.sigma if heat_component.kind == "gradient" and heat_component.axis == axis else 0.0
+            for axis in range(3)
         )
-        fields = thermal.fields({**still, one.body: temperature})
+        temperature = Temperature(
+            heat_component.sigma if heat_component.kind == "temperature" else 0.0,
+            (gradient[0], gradient[1], gradient[2]),
+        )
+        fields = thermal.fields({**still, heat_component.body: temperature})
         rows[:, column] = [fields[body].change if body in fields else 0.0 for body in sensors]
     read = np.any(rows != 0.0, axis=1)
     observed = np.any(rows != 0.0, axis=0)
     if not np.any(observed):
         return None
     motions = np.array(heat)[observed]
-    bodies = [stated.components[k].body for k in motions.tolist()]
+    bodies = [prior.components[k].body for k in motions.tolist()]
     names = tuple(dict.fromkeys(bodies))
     reading_bodies = tuple(body for body, temperature in zip(sensors, read, strict=True) if temperature)
     factors = np.array([names.index(body) for body in bodies])
@@ -202,10 +206,10 @@ def quantity_names(instrument: InstrumentSpec) -> tuple[str, ...]:
     Their order is that of `analysis.monitor.limits.quantities`.
     """
     cameras = tuple(instrument.cameras)
-    names = [f"{camera} {one.key}" for camera in cameras for one in CAMERA_PARAMETERS.values()]
+    names = [f"{camera} {parameter.key}" for camera in cameras for parameter in CAMERA_PARAMETERS.values()]
     if len(cameras) == 2:
         names.append(f"{ANGLE_GROUP} {ANGLE.key}")
-        names += [f"{GROUND_GROUP} {one.key}" for one in GROUND] if instrument.altitude is not None else []
+        names += [f"{GROUND_GROUP} {parameter.key}" for parameter in GROUND] if instrument.altitude is not None else []
     return tuple(names)
 
 

@@ -20,7 +20,7 @@ from analysis.arrays import Array
 from analysis.monitor.disturbances import FALSE_ALARM
 from analysis.monitor.limits import Quantity
 from analysis.monitor.parameters import ANGLE_GROUP, GROUND_GROUP
-from analysis.statistics import chance_beyond, limit_of
+from analysis.statistics import limit_of, p_value_of
 from scenes.specs.operation import OperationSpec
 from twin.framework.artefact import decimals_for, fixed, plain
 from twin.operate.estimate.estimate_snapshot import SPANS, Scores
@@ -82,7 +82,7 @@ class _Dated:
     def to_dict(self) -> dict[str, Any]:
         """Return the fields as plain data, times as UTC."""
         out = vars(self).copy()
-        for key in [one for one in out if one.endswith("_us")]:
+        for key in [name for name in out if name.endswith("_us")]:
             time = out.pop(key)
             out[f"{key.removesuffix('us')}utc"] = None if time is None else utc_text(time)
         return out
@@ -127,8 +127,8 @@ class DetectedJump(_Dated):
     @property
     def summary(self) -> str:
         """Time and size of the jump, in words."""
-        own = (f"{n.removeprefix(f'{self.body} ')} {with_sigma(z, s, u, sign=True)}" for n, u, z, s in self.sizes)
-        return f"between {utc_text(self.after_us)} and {utc_text(self.until_us)}: {', '.join(own)}"
+        sizes = (f"{n.removeprefix(f'{self.body} ')} {with_sigma(z, s, u, sign=True)}" for n, u, z, s in self.sizes)
+        return f"between {utc_text(self.after_us)} and {utc_text(self.until_us)}: {', '.join(sizes)}"
 
     def to_dict(self) -> dict[str, Any]:
         """Return the jump's body, times, sizes and effects as plain data, times as UTC."""
@@ -190,7 +190,7 @@ class RequirementStatus(_Dated):
         Limit of the absolute change.
     probability : float
         Required probability that the change is within the limit.
-    chance_now : float
+    exceedance_now : float
         Probability that the limit is exceeded now.
     holds_now : bool
         True if the requirement is met now.
@@ -203,7 +203,7 @@ class RequirementStatus(_Dated):
     unit: str
     limit: float
     probability: float
-    chance_now: float
+    exceedance_now: float
     holds_now: bool
     breaks_us: int | None
 
@@ -426,7 +426,9 @@ def raise_alarms(history: History, plan: OperationSpec, result: FilterResult) ->
         Alarms that were added.
     """
     before = history.alarms()
-    return [one for one in alarms_of(plan, result) if not _is_repeated(one, before) and history.raise_alarm(one)]
+    return [
+        alarm for alarm in alarms_of(plan, result) if not _is_repeated(alarm, before) and history.raise_alarm(alarm)
+    ]
 
 
 def alarms_of(plan: OperationSpec, result: FilterResult) -> Iterator[Alarm]:
@@ -444,7 +446,7 @@ def alarms_of(plan: OperationSpec, result: FilterResult) -> Iterator[Alarm]:
         text = next(warning for warning in result.warnings if result.understated_causes[0] in warning)
         yield Alarm(CONTRADICTION, "temperatures", result.time, text, {"causes": list(result.understated_causes)})
     far = [*_contradictions(plan, result), *map(_of_bad, result.bad_readings)]
-    yield from sorted(far, key=lambda one: one.time)[-1:]
+    yield from sorted(far, key=lambda occurrence: occurrence.time)[-1:]
 
 
 def _is_repeated(alarm: Alarm, before: Sequence[Row]) -> bool:
@@ -453,13 +455,15 @@ def _is_repeated(alarm: Alarm, before: Sequence[Row]) -> bool:
     An earlier alarm counts while it is open and, in general, within the time `AGAIN` of it. A jump is repeated if the
     times in which it may have occurred overlap; a contradiction is not, since each reading can raise one.
     """
-    same = [one for one in before if (one["kind"], one["subject"]) == (alarm.kind, alarm.subject)]
+    same = [earlier for earlier in before if (earlier["kind"], earlier["subject"]) == (alarm.kind, alarm.subject)]
     if alarm.kind == JUMP:  # later readings determine the time of a jump better
         began, ended = alarm.content["after_us"], alarm.content["until_us"]
-        return any(one["content"]["after_us"] < ended and began < one["content"]["until_us"] for one in same)
+        return any(
+            earlier["content"]["after_us"] < ended and began < earlier["content"]["until_us"] for earlier in same
+        )
     if alarm.kind == CONTRADICTION:  # each reading raises its own alarm
-        return any(one["acknowledged"] is None or alarm.time <= one["time_us"] for one in same)
-    return any(one["acknowledged"] is None or abs(alarm.time - one["time_us"]) < AGAIN for one in same)
+        return any(earlier["acknowledged"] is None or alarm.time <= earlier["time_us"] for earlier in same)
+    return any(earlier["acknowledged"] is None or abs(alarm.time - earlier["time_us"]) < AGAIN for earlier in same)
 
 
 def name_of(quantity: str, quantities: Sequence[Quantity]) -> str:
@@ -473,18 +477,18 @@ def name_of(quantity: str, quantities: Sequence[Quantity]) -> str:
         All estimated quantities.
     """
     group = quantity.partition(" ")[0]
-    symbol = next(one.parameter.symbol for one in quantities if one.name == quantity)
+    symbol = next(candidate.parameter.symbol for candidate in quantities if candidate.name == quantity)
     return {ANGLE_GROUP: f"{symbol} between the cameras", GROUND_GROUP: f"{symbol} on the ground"}.get(
         group, f"{symbol} of {group}"
     )
 
 
-def percent(chance: float) -> str:
+def percent(probability: float) -> str:
     """Return a probability as text in percent, with as many decimals as distinguish it from certainty."""
-    rest = min(chance, 1.0 - chance)
+    rest = min(probability, 1.0 - probability)
     if rest < LEAST:
-        return "less than 0.0001 %" if chance < 0.5 else "more than 99.9999 %"
-    return f"{fixed(100.0 * chance, decimals_for(100.0 * rest))} %"
+        return "less than 0.0001 %" if probability < 0.5 else "more than 99.9999 %"
+    return f"{fixed(100.0 * probability, decimals_for(100.0 * rest))} %"
 
 
 def _of_requirement(requirement: RequirementStatus, time: int, quantities: Sequence[Quantity]) -> Alarm:
@@ -492,7 +496,9 @@ def _of_requirement(requirement: RequirementStatus, time: int, quantities: Seque
     name, allowed = name_of(requirement.quantity, quantities), percent(1.0 - requirement.probability)
     limit = f"{plain(requirement.limit)} {requirement.unit}"
     if not requirement.holds_now:
-        text = f"{name} exceeds {limit} with a probability of {percent(requirement.chance_now)}; {allowed} is allowed"
+        text = (
+            f"{name} exceeds {limit} with a probability of {percent(requirement.exceedance_now)}; {allowed} is allowed"
+        )
         return Alarm(BROKEN, requirement.quantity, time, text, requirement.to_dict())
     assert requirement.breaks_us is not None
     since = utc_text(requirement.breaks_us)
@@ -510,8 +516,8 @@ def _of_jump(jump: DetectedJump) -> Alarm:
 
 def with_sigma(value: float, sigma: float, unit: str, sign: bool = False) -> str:
     """Return a value with its standard deviation (to two digits) and unit as text, with a plus sign on request."""
-    places = decimals_for(sigma)
-    return f"{fixed(value, places, sign)} ± {fixed(sigma, places)} {unit.replace('um', 'µm')}"
+    decimals = decimals_for(sigma)
+    return f"{fixed(value, decimals, sign)} ± {fixed(sigma, decimals)} {unit.replace('um', 'µm')}"
 
 
 def _of_bad(bad: tuple[int, str]) -> Alarm:
@@ -538,10 +544,10 @@ def _contradictions(plan: OperationSpec, result: FilterResult) -> Iterator[Alarm
     previous_times += [time for time, _, _ in innovations[:-1]]
     for previous, (time, chi_square, degrees) in zip(previous_times, innovations, strict=True):
         share = min((time - previous) / (plan.mission * MICRO), 1.0)
-        chance = float(chance_beyond(chi_square, degrees))
+        p_value = float(p_value_of(chi_square, degrees))
         if (
             share <= 0.0
-            or chance >= FALSE_ALARM * share
+            or p_value >= FALSE_ALARM * share
             or any(after < time <= innovations for after, innovations in spans)
         ):
             continue

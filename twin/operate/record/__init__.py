@@ -32,6 +32,6 @@ def require_file(file: Path) -> None:
         raise NotARecord(f"no record at {file}; python -m twin.operate init DIR INSTRUMENT makes one")
 
 
-def file_of(place: str) -> Path | None:
+def file_of(location: str) -> Path | None:
     """Return the path of a record's file in a folder; None if the location is the address of a database."""
-    return None if "://" in place else Path(place).absolute() / FILE
+    return None if "://" in location else Path(location).absolute() / FILE

@@ -174,11 +174,11 @@ def micros(text: str, scale: str = "UTC", seconds: float = 0.0) -> int:
     Problem
         The text is not a date and time.
     """
-    one = single_reading(text)
-    if scale == "UTC" and one.second[0] < DAY:
-        second = float(one.second[0]) + _leap(int(one.day[0]))
-        return _count(int(one.day[0]), second + seconds)
-    instant = one.instants(scale)
+    reading = single_reading(text)
+    if scale == "UTC" and reading.second[0] < DAY:
+        second = float(reading.second[0]) + _leap(int(reading.day[0]))
+        return _count(int(reading.day[0]), second + seconds)
+    instant = reading.instants(scale)
     return _count(int(instant.day[0]), float(instant.second[0]) + seconds)
 
 
@@ -244,13 +244,13 @@ def instrument_digest(instrument: Mapping[str, Any], cameras: Mapping[str, Any])
     cameras : Mapping[str, Any]
         Name of a camera's file -> plain data of the prescription.
     """
-    own = {key: value for key, value in instrument.items() if key not in _NOT_THE_INSTRUMENT}
-    monitor = own.get("monitor")
+    described = {key: value for key, value in instrument.items() if key not in _NOT_THE_INSTRUMENT}
+    monitor = described.get("monitor")
     if isinstance(monitor, Mapping) and isinstance(monitor.get("area_ccd"), Mapping):
         left = {key: value for key, value in monitor["area_ccd"].items() if key not in ("detector", "exposure")}
-        own["monitor"] = {**monitor, "area_ccd": left}
-    bare = {name: {k: v for k, v in one.items() if k != "description"} for name, one in cameras.items()}
-    return digest_of_data({"instrument": own, "cameras": bare})
+        described["monitor"] = {**monitor, "area_ccd": left}
+    bare = {name: {k: v for k, v in camera.items() if k != "description"} for name, camera in cameras.items()}
+    return digest_of_data({"instrument": described, "cameras": bare})
 
 
 def digest_of_job(job: ResolvedJob) -> str:

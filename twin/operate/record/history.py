@@ -34,6 +34,7 @@ from twin.operate.record.entries import (
     now,
     utc_text,
 )
+from twin.operate.record.ingest import Ingest, IngestResult
 from twin.operate.record.schema import (
     ACKNOWLEDGEMENT,
     ALARM,
@@ -50,7 +51,6 @@ from twin.operate.record.schema import (
     url_of,
     writing,
 )
-from twin.operate.record.taking import Ingest, IngestResult
 
 USED = ("monitor", "temperature")
 """Kinds of entries that the estimate uses as observations; events are used as times at which motions may step."""
@@ -83,8 +83,8 @@ class History:
         ``warm``: paths of the bodies that have a temperature; ``cameras``: names of the cameras.
     """
 
-    def __init__(self, place: str, until: int | None = None) -> None:
-        url, self._until = url_of(place), until
+    def __init__(self, location: str, until: int | None = None) -> None:
+        url, self._until = url_of(location), until
         self._engine = opened(url)
         self.url = url.render_as_string(hide_password=True)
         with self.reading() as connection:
@@ -273,7 +273,7 @@ class History:
                 for k, s, n, a, b in streams
             ],
             "refused": refused,
-            "open": sum(not one["taken_since"] for one in refused),
+            "open": sum(not refusal["taken_since"] for refusal in refused),
         }
 
     def store_plan(self, file: str, content: Mapping[str, Any]) -> bool:
@@ -315,11 +315,11 @@ class History:
             # query each subject by the index, which orders by subject before time
             rows = [
                 connection.execute(
-                    select(*c).where(c.kind == kind, c.subject == one).order_by(c.time_us, c.id).limit(1)
+                    select(*c).where(c.kind == kind, c.subject == stream_subject).order_by(c.time_us, c.id).limit(1)
                 )
                 .mappings()
                 .one()
-                for one in _subjects(connection, kind)
+                for stream_subject in _subjects(connection, kind)
             ]
         return dict(min(rows, key=lambda row: (row["time_us"], row["id"]))) if rows else None
 
@@ -528,7 +528,7 @@ def _streams(connection: Connection) -> Iterator[tuple[str, str]]:
 
 
 def _subjects(connection: Connection, kind: str) -> list[str]:
-    return [subject for own, subject in _streams(connection) if own == kind]
+    return [subject for stream_kind, subject in _streams(connection) if stream_kind == kind]
 
 
 def _stream_extent(connection: Connection, kind: str, subject: str) -> tuple[int, int, int]:
@@ -538,7 +538,9 @@ def _stream_extent(connection: Connection, kind: str, subject: str) -> tuple[int
     """
     c = ENTRY.c
     aggregates = (func.count(), func.min(c.time_us), func.max(c.time_us))
-    queries = [select(one).select_from(ENTRY).where(c.kind == kind, c.subject == subject) for one in aggregates]
+    queries = [
+        select(aggregate).select_from(ENTRY).where(c.kind == kind, c.subject == subject) for aggregate in aggregates
+    ]
     count, first, last = (int(connection.execute(query).scalar_one()) for query in queries)
     return count, first, last
 
@@ -555,12 +557,12 @@ def bodies_of(job: ResolvedJob) -> dict[str, list[str]]:
     return {"warm": warm, "cameras": list(job.instrument.cameras)}
 
 
-def initialise_record(place: str, job: ResolvedJob, simulated: bool = False) -> tuple[int, ...]:
+def initialise_record(location: str, job: ResolvedJob, simulated: bool = False) -> tuple[int, ...]:
     """Create the record of an instrument if there is none.
 
     Parameters
     ----------
-    place : str
+    location : str
         Folder, or address of a database.
     job : ResolvedJob
         Job of the instrument.
@@ -579,8 +581,8 @@ def initialise_record(place: str, job: ResolvedJob, simulated: bool = False) -> 
     RecordFailed
         The record cannot be created.
     """
-    url = url_of(place)
-    folder = Path(str(url.database)).parent if url.get_backend_name() == "sqlite" and "://" not in place else None
+    url = url_of(location)
+    folder = Path(str(url.database)).parent if url.get_backend_name() == "sqlite" and "://" not in location else None
     if folder is not None:
         try:
             make_folders(folder)

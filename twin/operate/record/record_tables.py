@@ -33,9 +33,9 @@ _FROM = (
 )
 
 
-def _readings(meaning: str, *own: Quantity[Row]) -> Record[Row]:
+def _readings(meaning: str, *quantities: Quantity[Row]) -> Record[Row]:
     """Return the columns of readings: their time, their values, and their file."""
-    return Record(meaning, *_WHEN, *own, *_FROM)
+    return Record(meaning, *_WHEN, *quantities, *_FROM)
 
 
 def _value(k: int) -> Any:
@@ -96,9 +96,9 @@ TABLES: Mapping[str, Record[Row]] = {
         _key("camera", "camera of the instrument"),
         _key("estimator", "estimator of the change"),
         *(
-            _number(f"{name}{end}", said)
+            _number(f"{name}{end}", description)
             for name in ("d_alpha_arcsec", "d_beta_arcsec", "d_gamma_arcsec", "d_f_um")
-            for end, said in (
+            for end, description in (
                 ("", "change"),
                 ("_sigma", "its total sigma"),
                 ("_sigma_noise", "its sigma from image noise"),
@@ -130,8 +130,8 @@ def tables(history: History) -> list[DataTable]:
     rows: dict[str, list[Row]] = {name: [] for name in TABLES}
     for entry in history.entries():
         row = {**entry, "content": content_of(entry)}
-        for name, one in _rows(row):
-            rows[name].append(one)
+        for name, cells in _rows(row):
+            rows[name].append(cells)
     rows["refused"] = list(history.refusals())
     made = {name: [record(row) for row in rows[name]] for name, record in TABLES.items()}
     return [TABLES[name].data_table(name, TABLES[name].meaning, of) for name, of in made.items() if of]
@@ -144,8 +144,8 @@ def _rows(row: Row) -> Iterator[tuple[str, Row]]:
         yield ("run" if kind in RUNS else kind), row
         return
     numbers = row["content"]["numbers"]
-    for camera, found in numbers["cameras"].items():
-        for estimator, one in found.items():
-            yield "monitor", {**row, "camera": camera, "estimator": estimator, "numbers": one}
-    for estimator, one in (numbers.get("intersection_angle") or {}).items():
-        yield "intersection_angle", {**row, "estimator": estimator, "numbers": one}
+    for camera, by_estimator in numbers["cameras"].items():
+        for estimator, estimate in by_estimator.items():
+            yield "monitor", {**row, "camera": camera, "estimator": estimator, "numbers": estimate}
+    for estimator, estimate in (numbers.get("intersection_angle") or {}).items():
+        yield "intersection_angle", {**row, "estimator": estimator, "numbers": estimate}

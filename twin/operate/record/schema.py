@@ -202,8 +202,8 @@ def guarded(connection: Connection) -> bool:
     if connection.dialect.name == "sqlite":
         rows = connection.execute(text("SELECT name, sql FROM sqlite_master WHERE type = 'trigger'"))
         there = {name: " ".join(sql.split()) for name, sql in rows}
-        own = [_triggers(table) for table in _METADATA.sorted_tables if table.name not in _DERIVED]
-        return there == {name: sql for triggers in own for name, sql in triggers.items()}
+        expected = [_triggers(table) for table in _METADATA.sorted_tables if table.name not in _DERIVED]
+        return there == {name: sql for triggers in expected for name, sql in triggers.items()}
     if connection.dialect.name != "postgresql":
         return False
     query = (
@@ -260,10 +260,12 @@ def version(connection: Connection) -> int:
     return int(connection.execute(select(func.max(SCHEMA.c.version))).scalar_one() or 0)
 
 
-def require_version(found: int) -> None:
+def require_version(version: int) -> None:
     """Raise NotARecord if a different version of the program made the record."""
-    if found != VERSION:
-        raise NotARecord(f"the record has version {found}, this program needs {VERSION}; use the program that made it")
+    if version != VERSION:
+        raise NotARecord(
+            f"the record has version {version}, this program needs {VERSION}; use the program that made it"
+        )
 
 
 WAIT = 60.0
@@ -272,7 +274,7 @@ _LOCK = 7_236_001
 """Number of the advisory lock that PostgreSQL grants to one writer at a time."""
 
 
-def url_of(place: str) -> URL:
+def url_of(location: str) -> URL:
     """Return the address of the database of a folder, or the given address.
 
     Raises
@@ -280,10 +282,10 @@ def url_of(place: str) -> URL:
     NotARecord
         SQLAlchemy does not know this address.
     """
-    if (file := file_of(place)) is not None:
+    if (file := file_of(location)) is not None:
         return URL.create("sqlite", database=str(file))
     try:
-        return make_url(place)
+        return make_url(location)
     except (ArgumentError, ValueError):
         raise NotARecord("not an address of a database; write DIALECT://USER@HOST/DATABASE, or a folder") from None
 

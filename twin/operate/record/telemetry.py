@@ -72,12 +72,12 @@ def kind_of_run(folder: Path) -> str:
     return next((kind for kind in RUNS if is_file(folder / RESULTS[kind])), "")
 
 
-def run_entries(place: Path, kind: str, moment: int, history: History, assume_instrument: bool) -> FileContent:
+def run_entries(path: Path, kind: str, moment: int, history: History, assume_instrument: bool) -> FileContent:
     """Return the readings of a run folder; its errors are returned as a refusal.
 
     Parameters
     ----------
-    place : Path
+    path : Path
         Run folder, or the file of results in it.
     kind : str
         Kind of reading; empty for the one that the folder holds.
@@ -88,7 +88,7 @@ def run_entries(place: Path, kind: str, moment: int, history: History, assume_in
     assume_instrument : bool
         True to assume that a run which does not name its instrument is of the record's instrument.
     """
-    folder = place.parent if place.name in RESULTS.values() else place
+    folder = path.parent if path.name in RESULTS.values() else path
     kind = kind or kind_of_run(folder)
     file = folder / RESULTS.get(kind, RESULTS["monitor"])
     manifest = read_manifest(folder)
@@ -112,15 +112,15 @@ def run_entries(place: Path, kind: str, moment: int, history: History, assume_in
 def _image_digests(manifest: Manifest) -> dict[str, str]:
     """Return the SHA-256 of the images that a run measured: those that it read, otherwise those that it wrote."""
     read = {name: digest for name, digest in manifest.inputs.items() if name.lower().endswith(_IMAGES)}
-    own = {name: digest for name, digest in manifest.sha256.items() if name.startswith("images/")}
-    return read or {name: digest for name, digest in own.items() if name.endswith((".tiff", ".fits"))}
+    digests = {name: digest for name, digest in manifest.sha256.items() if name.startswith("images/")}
+    return read or {name: digest for name, digest in digests.items() if name.endswith((".tiff", ".fits"))}
 
 
 def _require_unchanged(folder: Path, file: Path, digest: str, manifest: Manifest) -> None:
     """Raise Problem if the results of a run have been altered since it wrote them."""
     known = {file.name: digest}
     known |= {CONFIG: digest_of(folder / CONFIG)} if is_file(folder / CONFIG) else {}
-    changed = [name for name, own in known.items() if manifest.sha256.get(name) != own]
+    changed = [name for name, known_digest in known.items() if manifest.sha256.get(name) != known_digest]
     if changed:
         problem = f"{folder}: changed since its run: {names_text(changed)}"
         raise Problem(problem, None, "the folder as the run left it; python -m twin.verify lists the changes")
@@ -262,7 +262,7 @@ def _items(table: ReadingTableSpec, path: Path, history: History) -> tuple[list[
         if heads.count(head) != 1:
             text = f"{'no' if head not in heads else 'more than one'} column {head!r}"
             raise InputError(Issue(text, str(path), line, (), names_text(heads), None, nearest(head, heads)))
-    place = {head: heads.index(head) for head in wanted}
+    column_of = {head: heads.index(head) for head in wanted}
     items: list[Entry | Refusal] = []
     for number, cells in rows[1:]:
         if isinstance(cells, str):
@@ -271,22 +271,28 @@ def _items(table: ReadingTableSpec, path: Path, history: History) -> tuple[list[
         if len(cells) != len(heads):
             items.append(Refusal(f"{len(cells)} cells under {len(heads)} heads", number))
             continue
-        row = {head: cells[k].strip() for head, k in place.items()}
+        row = {head: cells[k].strip() for head, k in column_of.items()}
         try:
             moment = _moment(table, row[table.time])
         except Problem as problem:
             items.append(Refusal(f"{table.time}: {one_line(problem)}", number))
             continue
         if table.kind in VALUES:
-            read = ((one, column, [row[head] for head in column.column]) for one, column in table.columns.items())
+            read = (
+                (subject, column, [row[head] for head in column.column]) for subject, column in table.columns.items()
+            )
             # empty cells are not readings
-            items += [_entry_or_refusal(_reading, table, history, *one, moment, number) for one in read if any(one[2])]
+            items += [
+                _entry_or_refusal(_reading, table, history, *item, moment, number) for item in read if any(item[2])
+            ]
         elif table.kind == EVENT:
             items.append(_entry_or_refusal(_event, table, row, moment, number))
         else:
-            found = run_entries(path.parent / row[str(table.name)], table.kind, moment, history, assume_instrument=True)
-            frames |= found.frames
-            items += [replace(item, line=number) for item in found.items]
+            content = run_entries(
+                path.parent / row[str(table.name)], table.kind, moment, history, assume_instrument=True
+            )
+            frames |= content.frames
+            items += [replace(item, line=number) for item in content.items]
     return items, frames
 
 
@@ -297,7 +303,7 @@ def _keyword_items(
 
     Other keywords are not readings.
     """
-    by_keyword = {one.column[0]: (subject, one) for subject, one in table.columns.items()}
+    by_keyword = {definition.column[0]: (subject, definition) for subject, definition in table.columns.items()}
     items: list[Entry | Refusal] = []
     for number, cells in rows:
         if isinstance(cells, str):
@@ -433,7 +439,7 @@ class Sources:
 
     Attributes
     ----------
-    places : Sequence[Path]
+    paths : Sequence[Path]
         Paths of YAML files, run folders, and folders that contain such files and folders.
     moment : int | None
         Time of the run folders named directly, in microseconds of TAI since 2000; None if their names contain it.
@@ -445,7 +451,7 @@ class Sources:
         Path -> modification time and size when it was read.
     """
 
-    places: Sequence[Path]
+    paths: Sequence[Path]
     moment: int | None
     assume_instrument: bool
     watching: bool = False
@@ -461,15 +467,15 @@ class Sources:
         InputError
             A YAML file is not valid.
         """
-        for place in self.places:
-            if place.suffix not in _YAML and is_run_folder(place if place.is_dir() else place.parent):
-                yield from self._run(place, self.moment, history)
+        for path in self.paths:
+            if path.suffix not in _YAML and is_run_folder(path if path.is_dir() else path.parent):
+                yield from self._run(path, self.moment, history)
                 continue
-            described = sorted(place.glob("*.yaml")) if place.is_dir() else [place]
-            runs = sorted(one for one in place.iterdir() if is_run_folder(one)) if place.is_dir() else []
-            if not described and not runs and not (self.watching and place.is_dir()):
+            described = sorted(path.glob("*.yaml")) if path.is_dir() else [path]
+            runs = sorted(folder for folder in path.iterdir() if is_run_folder(folder)) if path.is_dir() else []
+            if not described and not runs and not (self.watching and path.is_dir()):
                 raise InputErrorText(
-                    f"{place}: neither a run folder nor a folder with a YAML file that describes tables"
+                    f"{path}: neither a run folder nor a folder with a YAML file that describes tables"
                 )
             named: set[Path] = set()
             for file in described:
@@ -483,30 +489,30 @@ class Sources:
         spec = read_telemetry(file, history)
         for table in spec.readings:
             for path in tables_of(spec, table):
-                own = _runs_named(table, path) if table.kind in RUNS else []
-                named |= {one.resolve() for one in own}
-                if not self._is_unchanged(path, own):
+                runs = _runs_named(table, path) if table.kind in RUNS else []
+                named |= {run.resolve() for run in runs}
+                if not self._is_unchanged(path, runs):
                     yield read_table_file(table, path, history)
 
-    def _run(self, place: Path, moment: int | None, history: History) -> Iterator[FileContent]:
+    def _run(self, path: Path, moment: int | None, history: History) -> Iterator[FileContent]:
         """Yield the readings of a run folder, unless it is unchanged since the last poll."""
-        folder = place if place.is_dir() else place.parent
+        folder = path if path.is_dir() else path.parent
         moment = time_of_name(folder.name) if moment is None else moment
-        if moment is None and place in self.places:
-            raise InputErrorText(f"{place}: the run folder has no time; give --time UTC, or put the UTC into its name")
+        if moment is None and path in self.paths:
+            raise InputErrorText(f"{path}: the run folder has no time; give --time UTC, or put the UTC into its name")
         if self._is_unchanged(folder / MANIFEST):
             return
         if moment is None:
             reason = "the run folder has no time; put the UTC into its name: recover-2026-03-05T03-05-00Z"
             yield FileContent(str(folder), digest_of_data(str(folder)), "", [Refusal(f"{folder.name}: {reason}")], {})
         else:
-            yield run_entries(place, "", moment, history, self.assume_instrument)
+            yield run_entries(path, "", moment, history, self.assume_instrument)
 
     def _is_unchanged(self, path: Path, named: Sequence[Path] = ()) -> bool:
         """Return whether a watched file, or a run folder it names, is unchanged or may still be written."""
         if not self.watching:
             return False
-        states = [one.stat() for one in (path, *named)]
+        states = [file.stat() for file in (path, *named)]
         now = tuple(number for state in states for number in (state.st_mtime_ns, state.st_size))
         if self.seen.get(str(path)) == now or any(time.time() - state.st_mtime < SETTLED for state in states):
             return True
@@ -522,4 +528,4 @@ def _runs_named(table: ReadingTableSpec, path: Path) -> list[Path]:
     except (InputError, OSError, ValueError):
         return []
     named = (path.parent / cells[column].strip() / MANIFEST for cells in rows if len(cells) > column)
-    return [one for one in named if is_file(one)]
+    return [run for run in named if is_file(run)]

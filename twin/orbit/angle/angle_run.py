@@ -493,7 +493,7 @@ def frame_rows(flight: AnglePass, common: Measurement) -> tuple[FrameRow, ...]:
     common : Measurement
         Measurement with all projection centres at the station, from `reduce_to_station`.
     """
-    places = {
+    frames = {
         "Earth-fixed": (np.eye(3), np.zeros(3)),
         "local level": (flight.local, flight.middle_point),
         "orbital": (flight.orbital, flight.station),
@@ -501,7 +501,7 @@ def frame_rows(flight: AnglePass, common: Measurement) -> tuple[FrameRow, ...]:
     }
     count = len(flight.pairs)
     rows = []
-    for frame, (axes, origin) in places.items():
+    for frame, (axes, origin) in frames.items():
         moved = common.in_frame(axes, origin)
         for method in METHODS:
             with warnings.catch_warnings(record=True) as caught:

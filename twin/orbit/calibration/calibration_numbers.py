@@ -164,7 +164,9 @@ def _sums(meanings: Mapping[str, str], parts: Callable[[Any], Any] = lambda part
     return [Quantity(name, total(name), meaning) for name, meaning in meanings.items()]
 
 
-SCREENED: Record[Screening] = Record("Image points of a field in the adjustment.", *_sums(_SCREENED, lambda one: [one]))
+SCREENED: Record[Screening] = Record(
+    "Image points of a field in the adjustment.", *_sums(_SCREENED, lambda screening: [screening])
+)
 
 
 def _degrees(parts: Sequence[LineComparison]) -> Array:
@@ -346,7 +348,7 @@ CHIP_STEP: Record[ChipStep] = Record(
     "A step of x (along the track) or y within a line, at a joint between chips.",
     Quantity("line", lambda step: step.line, "line camera"),
     Quantity("axis", lambda step: step.axis, "direction of the step, x or y"),
-    Quantity("place_m", lambda step: step.place, "position y of the joint in the focal plane", shown="mm"),
+    Quantity("place_m", lambda step: step.position, "position y of the joint in the focal plane", shown="mm"),
     Quantity("step_m", lambda step: step.step, "step estimated from the residuals", shown="um"),
     Quantity("sigma_m", lambda step: step.sigma, "its standard deviation, all steps estimated together", shown="um"),
     Quantity("detectable_m", lambda step: step.detectable, "step that is detected in half of all cases", shown="um"),

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 _FEW = 30
 """Smallest number of degrees of freedom of the check points' intersections at which a small p-value raises a warning.
 """
-_LEAST_CHANCE = 1e-3
+_LEAST_P_VALUE = 1e-3
 """p-value of the chi-square of the check points' intersections below which there is a warning."""
 _WIDE = 2.0
 """Ratio of the residuals of a line's image points to their sigmas above which there is a warning."""
@@ -149,8 +149,8 @@ def _measured_facts(setup: MeasuredCalibrationSetup, run: CalibrationRun) -> tup
     lengths = ", ".join(format_quantity(v, LENGTH) for v in gps.noise)
     quaternion = "as declared in the platform's files"
     if conventions.quaternion is not None and conventions.body_axes is not None:
-        turns = conventions.quaternion.turns.replace("_", " ")
-        quaternion = f"scalar {conventions.quaternion.scalar}, {turns}, body {', '.join(conventions.body_axes)}"
+        direction = conventions.quaternion.turns.replace("_", " ")
+        quaternion = f"scalar {conventions.quaternion.scalar}, {direction}, body {', '.join(conventions.body_axes)}"
     paths = {flight.measured.interpolation for flight in run.campaign.passes}
     joined = {"spline": "cubic splines", "lagrange": "Lagrange polynomials of ten readings"}
     light = "none" if not any_effect(run.campaign.effects) else f"{'' if test.effects.corrected else 'not '}corrected"
@@ -201,11 +201,11 @@ def _measured_warnings(run: CalibrationRun) -> list[str]:
                 "were multiplied by these factors"
             )
     for flight in run.campaign.passes:
-        places = np.concatenate([flight.control_ground, flight.check_ground])
-        if twice := duplicates(np.concatenate([flight.control_ids, flight.check_ids]), places):
+        positions = np.concatenate([flight.control_ground, flight.check_ground])
+        if twice := duplicates(np.concatenate([flight.control_ids, flight.check_ids]), positions):
             warnings.append(f"{flight.name}: {twice}")
         fit = intersection_fit(run.campaign, flight, run.fields[flight.name].adjustment)
-        if fit.degrees_of_freedom >= _FEW and fit.p_value < _LEAST_CHANCE:
+        if fit.degrees_of_freedom >= _FEW and fit.p_value < _LEAST_P_VALUE:
             warnings.append(
                 f"{flight.name}: rays of the check points do not intersect within their sigmas (p = "
                 f"{fit.p_value:.1g}): the sigmas of image points or attitude are too small, or the attitude has slow "

@@ -315,7 +315,7 @@ def _run(setup: AnyCalibration, seed: int, advance: Advance) -> CalibrationRun:
         advance("calibration", 3 + k, parts)
     first = campaign.spec.schemes[0][0]
     control = next(p.control for p in campaign.passes if p.name == first)
-    in_turn = stepwise(
+    stepwise_result = stepwise(
         [control], campaign.laboratory, campaign.noise, held=gauge_of(campaign).held, tolerance=STEPWISE_TOLERANCE
     )
     alone = {name: result.adjustment for name, result in fields.items()}
@@ -332,7 +332,7 @@ def _run(setup: AnyCalibration, seed: int, advance: Advance) -> CalibrationRun:
         together,
         None if campaign.known_truth is None else true_values(campaign, together.names),
         FrozenMap(fields),
-        in_turn,
+        stepwise_result,
         laboratory_errors(campaign),
         schemes,
         SchemeMeans.of(schemes),
@@ -405,14 +405,14 @@ def third_differences(flight: FieldPass) -> tuple[ThirdDifference | None, ThirdD
     """Return third differences of a pass's orbit and attitude readings; None for fewer than five even readings."""
     measured, table = flight.measured, flight.measured.table
     fixes, looks = _even(table.orbit_time), _even(table.attitude_time[measured.covers(table.attitude_time)])
-    places = table.position[np.isin(table.orbit_time, fixes)]
+    positions = table.position[np.isin(table.orbit_time, fixes)]
     turned = np.swapaxes(measured.orbital_to_itrs(looks), 1, 2) @ measured.body_to_itrs(looks)
     # small angles: the skew part of the rotation
     skew = 0.5 * (turned - np.swapaxes(turned, 1, 2))
     angles = np.stack([skew[:, 2, 1], skew[:, 0, 2], skew[:, 1, 0]], axis=-1)
     orbit, attitude = (
         third_difference(time, values) if len(time) >= _LEAST_EVEN else None
-        for time, values in ((fixes, places), (looks, angles))
+        for time, values in ((fixes, positions), (looks, angles))
     )
     return orbit, attitude
 
@@ -443,7 +443,7 @@ def _test(setup: AnyCalibration) -> dict[str, Any]:
     """Return the content of a test file for the exported measurements, with the test's schemes, sigmas and limits."""
     spec = setup.test
     plain: Mapping[str, Any] = spec.plain()
-    given_errors = plain["errors"]
+    error_spec = plain["errors"]
     common = {
         "name": spec.name,
         "description": spec.description,
@@ -454,12 +454,12 @@ def _test(setup: AnyCalibration) -> dict[str, Any]:
         "strip": bool(spec.strip),
     }
     if isinstance(setup, MeasuredCalibrationSetup):
-        return common | {"errors": given_errors, "screening": setup.test.screening, "ties": setup.test.ties}
-    gps, tracker = given_errors["gps"], given_errors["star_tracker"]
+        return common | {"errors": error_spec, "screening": setup.test.screening, "ties": setup.test.ties}
+    gps, tracker = error_spec["gps"], error_spec["star_tracker"]
     errors = {
         "gps": {key: gps[key] for key in ("noise", "drift", "interval")},
         "star_tracker": {key: tracker[key] for key in ("noise", "slow", "interval")},
-        "season": given_errors["season"],
+        "season": error_spec["season"],
     }
     if not setup.test.errors.switched_on:
         nothing = {"noise": ["0 m"] * 3, "interval": gps["interval"]}

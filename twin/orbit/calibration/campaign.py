@@ -100,10 +100,10 @@ def light_shift(
     seconds = sensor.time(line)
     arm = ground - sensor.trajectory.position(seconds)
     geometric = np.einsum("nji,nj->ni", sensor.trajectory.body_to_itrs(seconds), arm) - model.position
-    return _place(geometric, model) - _place(sensor.camera.look(pixel), model)
+    return _image_position(geometric, model) - _image_position(sensor.camera.look(pixel), model)
 
 
-def _place(direction: np.ndarray, model: LineModel) -> np.ndarray:
+def _image_position(direction: np.ndarray, model: LineModel) -> np.ndarray:
     """Project n directions (n, 3) in the body frame to the focal plane, (n, 2), in metres from the principal point."""
     a, b, c = (direction @ model.to_body).T
     ideal = -model.interior[0] * np.stack([a / c, b / c], axis=-1)
@@ -155,7 +155,7 @@ class PassData:
     lines: Mapping[str, LineCameraSpec]
     unit: float | None = None
 
-    def places(self, name: str, pixel: np.ndarray) -> np.ndarray:
+    def positions(self, name: str, pixel: np.ndarray) -> np.ndarray:
         """Return the positions of n pixels of a line in its focal plane, (n, 2), in metres."""
         return pixel_positions(self.lines[name], pixel, self.sensors[name].camera.pixels, self.pitch[name])
 
@@ -211,7 +211,7 @@ class PassData:
         for name, row in images.items():
             sensor = self.sensors[name]
             seconds = sensor.time(row.line)
-            image = self.places(name, row.pixel)
+            image = self.positions(name, row.pixel)
             station, attitude = sensor.trajectory.position(seconds), sensor.trajectory.body_to_itrs(seconds)
             # times relative to the readings, between which the model of shared noise interpolates
             rays = Rays.of(row.point, image, station, attitude, seconds - self.phase)

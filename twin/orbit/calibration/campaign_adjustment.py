@@ -51,8 +51,10 @@ def gauge_of(campaign: Campaign) -> Gauge:
     """
     launch, season = campaign.spec.launch, np.array(campaign.spec.errors.season)
     start = dict.fromkeys(campaign.inner, launch.interior)
-    turns = np.hypot(launch.bias, season).tolist()
-    start |= {f"{p.name} {axis}": s for p in campaign.passes for axis, s in zip(BIAS, turns, strict=True) if s > 0.0}
+    rotations = np.hypot(launch.bias, season).tolist()
+    start |= {
+        f"{p.name} {axis}": s for p in campaign.passes for axis, s in zip(BIAS, rotations, strict=True) if s > 0.0
+    }
     return Gauge(held=(f"{campaign.reference} x", f"{campaign.reference} y"), start=FrozenMap(start))
 
 
@@ -217,7 +219,7 @@ _LEAST_FREEDOM = 3
 """Smallest number of degrees of freedom of a fit against latitude from which rates during the passes are predicted: the
 variance of Student's t exists from three on.
 """
-_ONE_LATITUDE = np.radians(1.0)
+_SAME_LATITUDE = np.radians(1.0)
 """Range of the fields' latitudes, in radians, below which no fit against latitude is made."""
 
 
@@ -279,7 +281,7 @@ def latitude_fits(campaign: Campaign, together: Adjustment) -> tuple[LatitudeFit
     Returns an empty tuple for fewer than `LEAST_FIELDS` fields, or for fields within one degree of latitude.
     """
     latitude = np.array([p.latitude for p in campaign.passes])
-    if len(latitude) < LEAST_FIELDS or np.ptp(latitude) < _ONE_LATITUDE:
+    if len(latitude) < LEAST_FIELDS or np.ptp(latitude) < _SAME_LATITUDE:
         return ()
     fits = []
     for axis in BIAS:

@@ -58,7 +58,7 @@ if TYPE_CHECKING:
         CalibrationImagesSpec,
         FieldSpec,
         OrbitCalibrationSpec,
-        PatchPlaceSpec,
+        PatchPositionSpec,
         PointsSpec,
     )
     from scenes.specs.orbit.scene import GroundSpec
@@ -273,7 +273,7 @@ def _match_counts(records: list[PatchRecord]) -> str:
     return "; ".join(words)
 
 
-def _middle(patch: PatchPlaceSpec, nadir: Sensor, height: float) -> tuple[float, float]:
+def _middle(patch: PatchPositionSpec, nadir: Sensor, height: float) -> tuple[float, float]:
     """Return the longitude and latitude of a patch's middle, in radians."""
     at = (0.0 - nadir.first_line_time) / nadir.line_time
     step = nadir.ground(np.array([at, at + 1.0]), np.array([patch.pixel]), height)
@@ -406,7 +406,7 @@ def _pass(
     pictures, drift = stream(seed, _PICTURES), _sample_drift(spec, seed)
     readings = _sample_readings(spec, drift, seed)
     cameras = line_cameras(drifted_payload(changed, drift))
-    rng_place, rng_image, rng_ground, rng_season, rng_data = (np.random.default_rng(s) for s in seed.spawn(5))
+    rng_position, rng_image, rng_ground, rng_season, rng_data = (np.random.default_rng(s) for s in seed.spawn(5))
     trajectory = _trajectory(name, field, spec, earth, seed)
     errors = spec.errors
     rotation = np.array(errors.star_tracker.bias) + np.array(errors.season) * rng_season.standard_normal(3)
@@ -425,7 +425,7 @@ def _pass(
     images = None
     if imager is None:
         assert spec.points is not None
-        points = _simulated_points(field, spec, spec.points, sensors, pass_info, (rng_place, rng_image, rng_ground))
+        points = _simulated_points(field, spec, spec.points, sensors, pass_info, (rng_position, rng_image, rng_ground))
     else:
         points, images = imager.measured(field, sensors, pass_info, effects, pictures)
     ties: Mapping[str, ImagePoints] = {}
@@ -488,8 +488,8 @@ def _measurements_of(
         coordinates = coordinates + np.array(datum) @ east_north_up(lon, lat)
     count, checks = len(coordinates), len(points.check_ground)
     more = 1 + max((int(r.point.max()) for r in ties.values() if len(r.point)), default=-1)
-    given = np.where(is_control[:, None], coordinates, np.nan)
-    itrs = np.concatenate([given, points.check_ground, np.full((more, 3), np.nan)])
+    control_ground = np.where(is_control[:, None], coordinates, np.nan)
+    itrs = np.concatenate([control_ground, points.check_ground, np.full((more, 3), np.nan)])
     role = np.array(["control" if c else "tie" for c in is_control] + ["check"] * checks + ["tie"] * more, object)
     covariance = np.zeros((len(role), 3, 3))
     covariance[:count][is_control] = level_covariance(coordinates[is_control], *points.sigma)
@@ -511,8 +511,8 @@ def _simulated_points(
     random: tuple[np.random.Generator, np.random.Generator, np.random.Generator],
 ) -> FieldPoints:
     """Draw ground points, their image points and the control coordinates, from three random streams."""
-    random_places, image, ground = random
-    points, seen = _points(data.name, field, spec, wanted, sensors, random_places)
+    random_positions, image, ground = random
+    points, seen = _points(data.name, field, spec, wanted, sensors, random_positions)
     errors = spec.errors
     sigma, control = (v * errors.switched_on for v in (errors.image, errors.control))
     images = {}

@@ -410,7 +410,7 @@ class ChipStep:
         Name of the line camera.
     axis : str
         Direction of the step, x or y.
-    place : float
+    position : float
         Position y of the joint in the focal plane, in metres.
     step : float
         Estimated displacement of all pixels beyond the joint, in metres.
@@ -425,7 +425,7 @@ class ChipStep:
 
     line: str
     axis: str
-    place: float
+    position: float
     step: float
     sigma: float | None
     detectable: float | None
@@ -439,7 +439,7 @@ class ChipStep:
         limit = float(norm.isf(0.5 * _STEP_ALARM / max(steps.size, 1)))
         chip_steps = []
         for k, (value, sigma) in enumerate(zip(test.estimate.tolist(), test.sigma.tolist(), strict=True)):
-            line, position = steps.places[k // 2]
+            line, position = steps.positions[k // 2]
             values = (value, sigma, limit * sigma, abs(value) > limit * sigma)
             chip_steps.append(
                 cls(line, "xy"[k % 2], position, *(values if np.isfinite(sigma) else (0.0, None, None, False)))
@@ -455,7 +455,7 @@ def _joints(campaign: Campaign) -> tuple[tuple[str, float], ...]:
         ccds = data.lines[name].ccds or ()
         pixels = [0.5 * (a.last + b.first) for a, b in pairwise(ccds)]
         pixels = pixels or [0.5 * (data.sensors[name].camera.pixels - 1)]
-        joints += [(name, float(y)) for y in data.places(name, np.array(pixels))[:, 1]]
+        joints += [(name, float(y)) for y in data.positions(name, np.array(pixels))[:, 1]]
     return tuple(joints)
 
 
@@ -465,7 +465,7 @@ def step_warnings(numbers: tuple[ChipStep, ...]) -> list[str]:
     if not detected:
         return []
     listed = ", ".join(
-        f"{n.line} {n.axis} {1e6 * n.step:+.1f} ± {1e6 * (n.sigma or 0.0):.1f} µm at {1e3 * n.place:.1f} mm"
+        f"{n.line} {n.axis} {1e6 * n.step:+.1f} ± {1e6 * (n.sigma or 0.0):.1f} µm at {1e3 * n.position:.1f} mm"
         for n in detected
     )
     return [f"residuals show a step within a line: {listed}; the positions of its chips in the camera's file are wrong"]

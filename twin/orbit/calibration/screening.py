@@ -32,7 +32,7 @@ _SETTLED = 1.05
 to the matches of the three lines with one template cannot be seen in residuals, because they move the adjusted
 point.
 """
-_OWN_SIGMAS = 4.0
+_OUTLIER_SIGMAS = 4.0
 """Number of sigmas by which the variance of one line in one pass must exceed those of the others to get a separate
 factor; by chance this happens with a probability of 3e-5. A variance from the median of n correct points has a
 relative standard deviation of 1.44 / sqrt(n), where 1.44 = 1 / ln 2.
@@ -198,7 +198,7 @@ def _factors(fit: Adjustment, good: _Accepted) -> dict[tuple[str, str], float]:
         common = max(robust_variance(np.concatenate([squares[key] for key in variances])), 1.0)
         beyond = {k: (v / common - 1.0) * np.sqrt(len(squares[k])) / _MEDIAN_SPREAD for k, v in variances.items()}
         worst = max(beyond, key=lambda k: beyond[k])
-        if beyond[worst] <= _OWN_SIGMAS:
+        if beyond[worst] <= _OUTLIER_SIGMAS:
             factor = float(np.sqrt(robust_variance(np.concatenate([squares[key] for key in variances]))))
             return separate | (dict.fromkeys(variances, factor) if factor > _SETTLED else {})
         separate[worst] = float(np.sqrt(variances[worst]))
@@ -350,7 +350,7 @@ def ground_sample(flight: FieldPass, line: str) -> tuple[float, float]:
     middle = 0.5 * (sensor.lines - 1) if row is None or not len(row.line) else float(np.mean(row.line))
     pixel = 0.5 * (sensor.camera.pixels - 1)
     step = 0.5 if 0.0 <= middle - 0.5 and middle + 0.5 <= sensor.lines - 1 else 0.25
-    places = np.array([[middle - step, pixel], [middle + step, pixel], [middle, pixel - step], [middle, pixel + step]])
-    ground = sensor.ground(places[:, 0], places[:, 1], flight.data.height)
+    points = np.array([[middle - step, pixel], [middle + step, pixel], [middle, pixel - step], [middle, pixel + step]])
+    ground = sensor.ground(points[:, 0], points[:, 1], flight.data.height)
     along, across = (float(np.linalg.norm(ground[k + 1] - ground[k])) / (2.0 * step) for k in (0, 2))
     return along, across

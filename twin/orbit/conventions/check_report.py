@@ -58,34 +58,38 @@ READING: Record[CheckedReading] = Record(
 )
 VALUE_TEST: Record[ValueTest] = Record(
     "Test of one value of a convention, with the other conventions as in the best reading.",
-    Quantity("value", lambda one: one.value, "tested value of the convention"),
-    Quantity("stated", lambda one: one.stated, "true for the stated value"),
-    Quantity("best", lambda one: one.best, "true for the value of the best reading"),
-    Quantity("possible", lambda one: one.possible, "true if the points do not exclude the value"),
+    Quantity("value", lambda test: test.value, "tested value of the convention"),
+    Quantity("stated", lambda test: test.specified, "true for the stated value"),
+    Quantity("best", lambda test: test.best, "true for the value of the best reading"),
+    Quantity("possible", lambda test: test.possible, "true if the points do not exclude the value"),
     Quantity(
         "cost_above_best",
-        lambda one: one.excess if np.isfinite(one.excess) else None,
+        lambda test: test.excess if np.isfinite(test.excess) else None,
         "minus twice the log of the likelihood over that of the best reading",
     ),
-    Quantity("displacement_m", lambda one: one.moved, "root mean square displacement of the points on the ground"),
-    Quantity("why_impossible", lambda one: one.why or None, "reason why the value is impossible"),
+    Quantity("displacement_m", lambda test: test.moved, "root mean square displacement of the points on the ground"),
+    Quantity("why_impossible", lambda test: test.why or None, "reason why the value is impossible"),
 )
 CONVENTION: Record[tuple[ValueTest, ...]] = Record(
     "A convention: its stated and its best value, and whether the points determine it.",
-    Quantity("stated", lambda answers: next(one.value for one in answers if one.stated), "value in the test's file"),
-    Quantity("best", lambda answers: next(one.value for one in answers if one.best), "value in the best reading"),
-    Quantity("determined", lambda answers: sum(one.possible for one in answers) == 1, "true if one value is possible"),
+    Quantity(
+        "stated", lambda answers: next(test.value for test in answers if test.specified), "value in the test's file"
+    ),
+    Quantity("best", lambda answers: next(test.value for test in answers if test.best), "value in the best reading"),
+    Quantity(
+        "determined", lambda answers: sum(test.possible for test in answers) == 1, "true if one value is possible"
+    ),
     Quantity("values", lambda answers: answers, "test of each value", record=VALUE_TEST),
 )
 
 
-def places_of(run: Check, changes: Changes) -> list[dict[str, Any]]:
+def positions_of(run: Check, changes: Changes) -> list[dict[str, Any]]:
     """Return the ground positions of the first image points under one interpretation of the files.
 
     The list has one entry per point: longitude, latitude, and the distances from the given ground point, east and north
     in metres.
     """
-    positions = run.places[changes]
+    positions = run.positions[changes]
     if isinstance(positions, str):
         return []
     rows, known = [], run.readings.ground.points
@@ -96,27 +100,27 @@ def places_of(run: Check, changes: Changes) -> list[dict[str, Any]]:
         a, b, _ = Earth().geodetic(here)
         level = np.einsum("nij,nj->ni", east_north_up(a, b), at - here)
         for k, point in enumerate(raw):
-            place = {"longitude_deg": float(np.degrees(lon[k])), "latitude_deg": float(np.degrees(lat[k]))}
+            position = {"longitude_deg": float(np.degrees(lon[k])), "latitude_deg": float(np.degrees(lat[k]))}
             off = {"east_m": float(level[k, 0]), "north_m": float(level[k, 1])}
-            rows.append({"point": str(known.ids[point]), "camera": camera, **place, **off})
+            rows.append({"point": str(known.ids[point]), "camera": camera, **position, **off})
     return rows
 
 
-PLACE: Record[PlacedReading] = Record(
+POSITION: Record[PlacedReading] = Record(
     "Ground positions of the first image points under a reading, east and north of their ground points.",
     Quantity("changes", lambda of: dict(of[1]), "conventions that differ from the stated ones, with their values"),
     Quantity(
         "why_impossible",
-        lambda of: at if isinstance(at := of[0].places[of[1]], str) else None,
+        lambda of: at if isinstance(at := of[0].positions[of[1]], str) else None,
         "reason why the points have no ground position",
     ),
-    Quantity("points", lambda of: places_of(*of), "one entry for each point"),
+    Quantity("points", lambda of: positions_of(*of), "one entry for each point"),
 )
 
 
 def _best(run: Check) -> dict[str, Any]:
     """Return the value of each convention in the best interpretation of the files."""
-    reading = changed(run.stated, run.best.changes)
+    reading = changed(run.specified, run.best.changes)
     return {name: TESTED_CONVENTIONS[name].get(reading) for name in run.answers}
 
 
@@ -124,7 +128,9 @@ CHECK: Record[Check] = Record(
     "check.json. Conventions under which a pass explains its ground points.",
     Quantity("result", lambda run: run.verdict, "confirmed (as stated), another (others fit) or none"),
     Quantity("best", lambda run: dict(run.best.changes), "changed conventions of the best reading"),
-    Quantity("equally_likely", lambda run: [dict(one) for one in run.equally_likely], "equally likely readings"),
+    Quantity(
+        "equally_likely", lambda run: [dict(reading) for reading in run.equally_likely], "equally likely readings"
+    ),
     Quantity("reading", _best, "every convention of the best reading"),
     Quantity("readings_tried", lambda run: run.count, "number of readings that were tried"),
     Quantity("decided_by_cost", lambda run: DECIDED, "difference of cost from which two readings are separated"),
@@ -139,8 +145,13 @@ CHECK: Record[Check] = Record(
     ),
     Quantity("gross_errors", lambda run: run.wrong, "rejected points of each line"),
     Quantity("conventions", lambda run: run.answers, "tests of each convention", record=CONVENTION),
-    Quantity("ranking", lambda run: [(run, one) for one in run.tried], "readings, the likeliest first", record=READING),
-    Quantity("places", lambda run: [(run, one) for one in run.places], "ground positions", record=PLACE),
+    Quantity(
+        "ranking",
+        lambda run: [(run, reading) for reading in run.tried],
+        "readings, the likeliest first",
+        record=READING,
+    ),
+    Quantity("places", lambda run: [(run, reading) for reading in run.positions], "ground positions", record=POSITION),
 )
 
 
@@ -162,7 +173,7 @@ def check_report(run: Check) -> Report:
         (*more, *_lead(run)),
         _facts(run),
         _ranking(run),
-        (_conventions(run), _places(run)),
+        (_conventions(run), _positions_section(run)),
         warnings=_warnings(run),
         code=code,
     )
@@ -170,7 +181,7 @@ def check_report(run: Check) -> Report:
 
 def _verdict(run: Check) -> tuple[str, tuple[str, ...]]:
     """Return the verdict of the check, and the sentences that follow it in the report."""
-    best, stated = run.best.fit, run.stated_fit
+    best, specified = run.best.fit, run.specified_fit
     if run.verdict == "none" or best is None:
         left = "the points cannot have been imaged under any of them" if best is None else (
             f"the best of {run.count} readings ({changes_text(run.best.changes)}) leaves {_metres(best.rms)} rms, "
@@ -188,7 +199,11 @@ def _verdict(run: Check) -> tuple[str, tuple[str, ...]]:
         cannot = f"the points do not determine these conventions: {', '.join(undetermined)}"
     if run.verdict == "confirmed":
         return answer(f"The stated conventions are confirmed: they fit the ground points to {size}", cannot)
-    was = f"under them {stated.why}" if stated.fit is None else f"with residuals of {_metres(stated.fit.rms)} rms"
+    was = (
+        f"under them {specified.why}"
+        if specified.fit is None
+        else f"with residuals of {_metres(specified.fit.rms)} rms"
+    )
     right = f"the points agree with {changes_text(run.best.changes)}, to {size}"
     return answer(f"The stated conventions are wrong, {was}", right, cannot)
 
@@ -208,10 +223,10 @@ def _lead(run: Check) -> tuple[str, ...]:
     lines = [f"Equally likely: {changes_text(changes)}." for changes in run.equally_likely]
     for name, answers in run.answers.items():
         convention = TESTED_CONVENTIONS[name]
-        stated = next(test for test in answers if test.stated)
+        specified = next(test for test in answers if test.specified)
         best = next(test for test in answers if test.best)
-        if run.verdict == "another" and not stated.possible:
-            lines.append(f"{convention.title}: {convention.text(best.value)}, not {convention.text(stated.value)}.")
+        if run.verdict == "another" and not specified.possible:
+            lines.append(f"{convention.title}: {convention.text(best.value)}, not {convention.text(specified.value)}.")
         elif _undetermined(answers):
             others = [test for test in answers if test.possible and not test.best]
             moved = max(test.moved or 0.0 for test in others)
@@ -247,9 +262,12 @@ def _row(tried: TriedReading, run: Check) -> tuple[Cell, ...]:
 
 def _ranking(run: Check) -> Table:
     """Return the table of the likeliest interpretations of the files."""
-    stated, single = run.stated_fit, [tried for tried in run.tried if len(tried.changes) <= 1 and tried is not run.best]
+    specified, single = (
+        run.specified_fit,
+        [tried for tried in run.tried if len(tried.changes) <= 1 and tried is not run.best],
+    )
     first = [run.best, *(tried for tried in run.tried if tried.changes in run.equally_likely)]
-    first += [stated] if stated not in first else []
+    first += [specified] if specified not in first else []
     rest = [tried for tried in single if tried not in first][: _LISTED - len(first)]
     return Table(
         "ranking",
@@ -272,7 +290,14 @@ def _conventions(run: Check) -> Section:
             verdict = "best" if test.best else "not excluded" if test.possible else test.why or "excluded"
             cost = max(test.excess, 0.0) if np.isfinite(test.excess) else None
             rows.append(
-                (convention.title, convention.text(test.value), "yes" if test.stated else "", test.moved, cost, verdict)
+                (
+                    convention.title,
+                    convention.text(test.value),
+                    "yes" if test.specified else "",
+                    test.moved,
+                    cost,
+                    verdict,
+                )
             )
     text = (
         "Each convention by itself, the others as in the best reading. A value is not excluded if it moves the points "
@@ -290,15 +315,15 @@ def _conventions(run: Check) -> Section:
     return Section("Test of each convention", text, (table,))
 
 
-def _places(run: Check) -> Section:
+def _positions_section(run: Check) -> Section:
     """Return the report section on the ground positions of the first points."""
     rows: list[tuple[Cell, ...]] = []
-    for changes, positions in run.places.items():
+    for changes, positions in run.positions.items():
         if isinstance(positions, str):
             rows.append((changes_text(changes), "", "", None, None, None, None, positions))
-        for k, place in enumerate(places_of(run, changes)):
-            numbers = [place[key] for key in ("longitude_deg", "latitude_deg", "east_m", "north_m")]
-            rows.append((changes_text(changes) if k == 0 else "", place["point"], place["camera"], *numbers, ""))
+        for k, row in enumerate(positions_of(run, changes)):
+            numbers = [row[key] for key in ("longitude_deg", "latitude_deg", "east_m", "north_m")]
+            rows.append((changes_text(changes) if k == 0 else "", row["point"], row["camera"], *numbers, ""))
     table = Table(
         "places",
         "Ground positions of the first points",

@@ -98,7 +98,7 @@ class ValueTest:
     ----------
     value : str, float, bool or tuple
         Value of the convention.
-    stated, best : bool
+    specified, best : bool
         True if the value is the one that the test file specifies, and if it is that of the best interpretation.
     excess : float
         Cost (minus twice the log likelihood) minus that of the best interpretation, divided by the factor by which the
@@ -111,7 +111,7 @@ class ValueTest:
     """
 
     value: Any
-    stated: bool
+    specified: bool
     best: bool
     excess: float
     moved: float | None
@@ -133,7 +133,7 @@ class Check:
         Test file with the camera.
     readings : PassReadings
         Content of the files before interpretation.
-    stated : PassConventions
+    specified : PassConventions
         Conventions that the test file specifies.
     tried : tuple of TriedReading
         Interpretations with a fit, the likeliest first, then those that are impossible.
@@ -148,7 +148,7 @@ class Check:
         Tested values of each convention.
     first_points : dict of str to ndarray
         Indices of the ground points whose positions are listed, by line.
-    places : dict
+    positions : dict
         Ground positions of the first points of each line, ITRS, metres, by changes of one convention; a text says why
         there are none.
     count : int
@@ -159,14 +159,14 @@ class Check:
 
     setup: CheckSetup
     readings: PassReadings
-    stated: PassConventions
+    specified: PassConventions
     tried: tuple[TriedReading, ...]
     best: TriedReading
     verdict: Verdict
     factor: float
     answers: dict[str, tuple[ValueTest, ...]]
     first_points: dict[str, np.ndarray]
-    places: dict[Changes, dict[str, np.ndarray] | str]
+    positions: dict[Changes, dict[str, np.ndarray] | str]
     count: int
     wrong: dict[str, tuple[str, ...]]
 
@@ -188,7 +188,7 @@ class Check:
         )
 
     @property
-    def stated_fit(self) -> TriedReading:
+    def specified_fit(self) -> TriedReading:
         """Interpretation that the test file specifies, with its fit."""
         return next(tried for tried in self.tried if not tried.changes)
 
@@ -204,10 +204,10 @@ def run_check(setup: CheckSetup, backend: Backend | None, seed: int, advance: Ad
         Files cannot be read, or there are fewer than three points.
     """
     advance("readings", 0, 3)
-    readings, stated = pass_readings.read_pass(setup.test, setup.camera, Path())
-    bench = _bench(setup, readings, stated)
-    others = pass_readings.alternatives(stated, readings.platform.attitude.quaternion is not None)
-    best, tried, count = _best_reading(bench, stated, others)
+    readings, specified = pass_readings.read_pass(setup.test, setup.camera, Path())
+    bench = _bench(setup, readings, specified)
+    others = pass_readings.alternatives(specified, readings.platform.attitude.quaternion is not None)
+    best, tried, count = _best_reading(bench, specified, others)
     advance("readings", 1, 3)
     wrong: dict[str, tuple[str, ...]] = dict.fromkeys(readings.images, ())
     if best.fit is not None:
@@ -217,21 +217,23 @@ def run_check(setup: CheckSetup, backend: Backend | None, seed: int, advance: Ad
             ids, images = readings.ground.points.ids, bench.readings.images
             wrong = {name: tuple(map(str, ids[images[name].point[mask]])) for name, mask in masks.items()}
             bench = bench.without(masks)
-            tried = [_tried(bench, stated, item.changes) for item in tried]
+            tried = [_tried(bench, specified, item.changes) for item in tried]
             best = _best(tried)
     advance("readings", 2, 3)
     ratio = np.inf if best.fit is None else best.fit.chi_square / best.fit.freedom
     verdict: Verdict = "none" if ratio > _FITS else "another" if best.changes else "confirmed"
     factor = max(float(ratio), 1.0) if np.isfinite(ratio) else 1.0
-    answers = {name: _answers(bench, stated, best, name, values, factor) for name, values in others.items()}
-    places = {item: _first_places(bench, stated, item, setup.test.shown) for item in _shown(others, best)}
+    answers = {name: _answers(bench, specified, best, name, values, factor) for name, values in others.items()}
+    positions = {item: _first_positions(bench, specified, item, setup.test.shown) for item in _shown(others, best)}
     tried.sort(key=lambda item: (item.cost, len(item.changes)))
     advance("readings", 3, 3)
     first = {name: raw.point[: setup.test.shown] for name, raw in bench.readings.images.items()}
-    return Check(setup, readings, stated, tuple(tried), best, verdict, factor, answers, first, places, count, wrong)
+    return Check(
+        setup, readings, specified, tuple(tried), best, verdict, factor, answers, first, positions, count, wrong
+    )
 
 
-def _bench(setup: CheckSetup, readings: PassReadings, stated: PassConventions) -> PassBench:
+def _bench(setup: CheckSetup, readings: PassReadings, specified: PassConventions) -> PassBench:
     """Return the object that fits interpretations of the files to at most the test's number of image points."""
     cameras = line_cameras(setup.camera)
     images = {}
@@ -249,7 +251,7 @@ def _bench(setup: CheckSetup, readings: PassReadings, stated: PassConventions) -
 
 
 def _best_reading(
-    bench: PassBench, stated: PassConventions, others: dict[str, tuple[Any, ...]]
+    bench: PassBench, specified: PassConventions, others: dict[str, tuple[Any, ...]]
 ) -> tuple[TriedReading, list[TriedReading], int]:
     """Return the best interpretation, those that were fitted, and the number of those that were compared."""
     start: Changes = ()
@@ -262,12 +264,12 @@ def _best_reading(
             if key in seen:
                 continue
             seen.add(key)
-            size = _rough(bench, changed(stated, changes))
+            size = _rough(bench, changed(specified, changes))
             if len(changes) <= 1 or np.isfinite(size):
                 rough.append((size, len(changes), changes))
         rough.sort(key=lambda item: item[:2])
         chosen = [item[2] for k, item in enumerate(rough) if k < _CANDIDATES or item[1] <= 1]
-        fitted |= {_key(changes): _tried(bench, stated, changes) for changes in chosen}
+        fitted |= {_key(changes): _tried(bench, specified, changes) for changes in chosen}
         best = _best(list(fitted.values()))
         if best.fit is None or best.fit.chi_square / best.fit.freedom <= _FITS or best.changes == start:
             break
@@ -288,10 +290,10 @@ def _rough(bench: PassBench, reading: PassConventions) -> float:
         return np.inf
 
 
-def _tried(bench: PassBench, stated: PassConventions, changes: Changes) -> TriedReading:
+def _tried(bench: PassBench, specified: PassConventions, changes: Changes) -> TriedReading:
     """Fit one interpretation of the files, the specified one with `changes`, to the points."""
     try:
-        return TriedReading(changes, bench.fit(changed(stated, changes)))
+        return TriedReading(changes, bench.fit(changed(specified, changes)))
     except ImpossibleError as error:
         return TriedReading(changes, None, str(error))
 
@@ -319,13 +321,13 @@ def _wrong(bench: PassBench, fit: Fit) -> dict[str, np.ndarray]:
 
 
 def _answers(
-    bench: PassBench, stated: PassConventions, best: TriedReading, name: str, values: tuple[Any, ...], factor: float
+    bench: PassBench, specified: PassConventions, best: TriedReading, name: str, values: tuple[Any, ...], factor: float
 ) -> tuple[ValueTest, ...]:
     """Test every value of a convention, with the others as in the best interpretation."""
-    convention, reading = TESTED_CONVENTIONS[name], changed(stated, best.changes)
-    stated_value, best_value = convention.get(stated), convention.get(reading)
+    convention, reading = TESTED_CONVENTIONS[name], changed(specified, best.changes)
+    specified_value, best_value = convention.get(specified), convention.get(reading)
     answers = []
-    for value in (stated_value, *values):
+    for value in (specified_value, *values):
         conventions = convention.put(reading, value)
         try:
             fit = bench.fit(conventions)
@@ -335,10 +337,12 @@ def _answers(
                 else float(np.sqrt(np.mean(np.sum((fit.residual - best.fit.residual) ** 2, 1))))
             )
             answers.append(
-                ValueTest(value, value == stated_value, value == best_value, (fit.cost - best.cost) / factor, moved, "")
+                ValueTest(
+                    value, value == specified_value, value == best_value, (fit.cost - best.cost) / factor, moved, ""
+                )
             )
         except ImpossibleError as error:
-            answers.append(ValueTest(value, value == stated_value, value == best_value, np.inf, None, str(error)))
+            answers.append(ValueTest(value, value == specified_value, value == best_value, np.inf, None, str(error)))
     return tuple(answers)
 
 
@@ -348,12 +352,12 @@ def _shown(others: dict[str, tuple[Any, ...]], best: TriedReading) -> list[Chang
     return list(dict.fromkeys([(), best.changes, *singles]))
 
 
-def _first_places(
-    bench: PassBench, stated: PassConventions, changes: Changes, count: int
+def _first_positions(
+    bench: PassBench, specified: PassConventions, changes: Changes, count: int
 ) -> dict[str, np.ndarray] | str:
     """Return the ground positions of the first points of each line, or why there are none."""
     try:
-        return {name: at[:count] for name, at in bench.places(changed(stated, changes)).items()}
+        return {name: at[:count] for name, at in bench.positions(changed(specified, changes)).items()}
     except ImpossibleError as error:
         return str(error)
 
@@ -374,7 +378,7 @@ def exported(run: Check) -> dict[str, str]:
 
 def measurements(run: Check) -> PassMeasurements:
     """Return the pass in the project's own conventions, converted by the specified interpretation of its files."""
-    readings, reading = run.readings, run.stated
+    readings, reading = run.readings, run.specified
     table = platform_table(readings.platform, reading.platform)
     times, images = {}, {}
     for name, raw in readings.images.items():

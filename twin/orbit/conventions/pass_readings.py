@@ -154,7 +154,7 @@ def read_pass(spec: OrbitCheckSpec, camera: ThreeLineCameraSpec, folder: Path) -
     else:
         images = _image_points(spec.image_points, ground, lines, folder)
     half = 0.5 if spec.image_points.centre == "half" else 0.0
-    stated = PassConventions(
+    specified = PassConventions(
         conventions,
         spec.lines.time_scale,
         0.0,
@@ -163,7 +163,7 @@ def read_pass(spec: OrbitCheckSpec, camera: ThreeLineCameraSpec, folder: Path) -
         half + spec.image_points.first_pixel,
         spec.image_points.first_pixel_sees,
     )
-    return PassReadings(_around(platform, lines), lines, ground, images), stated
+    return PassReadings(_around(platform, lines), lines, ground, images), specified
 
 
 def read_line_clocks(spec: LineTimesFileSpec, cameras: tuple[str, ...], folder: Path) -> dict[str, LineClock]:
@@ -273,13 +273,13 @@ def _around(platform: PlatformReadings, lines: Mapping[str, LineClock]) -> Platf
     day, second = min(ends)
     last = max((d - day) * 86400.0 + s - second for d, s in ends)
 
-    def cut(clock: Readings) -> slice:
+    def covering(clock: Readings) -> slice:
         since = (clock.day - day) * 86400.0 + clock.second - second
         begin, end = (int(np.searchsorted(since, t)) for t in (-_AROUND, last + _AROUND))
         return slice(max(begin - _LEAST_AROUND, 0), end + _LEAST_AROUND)
 
     orbit, attitude = platform.orbit, platform.attitude
-    a, b = cut(orbit.clock), cut(attitude.clock)
+    a, b = covering(orbit.clock), covering(attitude.clock)
     if len(orbit.clock.taken(a)) < 2 or len(attitude.clock.taken(b)) < 2:
         return platform  # the caller reports missing readings
     return replace(platform, orbit=orbit.taken(a), attitude=attitude.taken(b))
@@ -375,12 +375,12 @@ TESTED_CONVENTIONS: Mapping[str, TestedConvention] = FrozenMap(
 """Conventions that a check tests, with their possible values, by name."""
 
 
-def alternatives(stated: PassConventions, quaternions: bool) -> dict[str, tuple[Any, ...]]:
+def alternatives(specified: PassConventions, quaternions: bool) -> dict[str, tuple[Any, ...]]:
     """Return the values of each convention other than the specified one, without conventions that do not apply.
 
     Parameters
     ----------
-    stated : PassConventions
+    specified : PassConventions
         Specified interpretation of the files.
     quaternions : bool
         True if the attitude is quaternions, False if it is angles.
@@ -388,10 +388,10 @@ def alternatives(stated: PassConventions, quaternions: bool) -> dict[str, tuple[
     without = {"angle_sequence"} if quaternions else {"quaternion_scalar", "quaternion_turns"}
     values = {}
     for name, convention in TESTED_CONVENTIONS.items():
-        here = convention.get(stated)
+        here = convention.get(specified)
         if name in without or (name == "attitude_frame" and here == "orbital"):
             continue
-        values[name] = tuple(v for v in convention.values(stated) if v != here)
+        values[name] = tuple(v for v in convention.values(specified) if v != here)
     return values
 
 
@@ -420,14 +420,14 @@ def singles_and_pairs(others: Mapping[str, tuple[Any, ...]], start: Changes = ()
                 yield (*start, first, second)
 
 
-def changed(stated: PassConventions, changes: Changes) -> PassConventions:
+def changed(conventions: PassConventions, changes: Changes) -> PassConventions:
     """Return the specified interpretation of the files with these changes."""
     for name, value in changes:
-        stated = TESTED_CONVENTIONS[name].put(stated, value)
-    return stated
+        conventions = TESTED_CONVENTIONS[name].put(conventions, value)
+    return conventions
 
 
-_TURN, _SHIFT, _DELAY, _RISE = 1e-5, 10.0, 1e-3, 10.0
+_ROTATION, _SHIFT, _DELAY, _RISE = 1e-5, 10.0, 1e-3, 10.0
 """Steps of the numerical derivatives with respect to rotation (radians), shift (metres), delay (seconds) and height
 (metres).
 """
@@ -447,7 +447,7 @@ class _PerturbedPlatform:
     """Platform with a small rotation and shift added at each of several times, for numerical derivatives."""
 
     path: TabulatedTrajectory
-    turn: np.ndarray | None = None
+    rotation: np.ndarray | None = None
     shift: np.ndarray | None = None
 
     def position(self, seconds: Any) -> np.ndarray:
@@ -460,7 +460,7 @@ class _PerturbedPlatform:
 
     def body_to_itrs(self, seconds: Any) -> np.ndarray:
         matrix = self.path.body_to_itrs(seconds)
-        return matrix if self.turn is None else matrix @ self.turn
+        return matrix if self.rotation is None else matrix @ self.rotation
 
 
 @dataclass(frozen=True, eq=False)
@@ -548,7 +548,7 @@ class PassBench:
         except InputError as error:
             return ImpossibleError(error.issues[0].problem)
 
-    def places(self, reading: PassConventions, most: int | None = None) -> dict[str, np.ndarray]:
+    def positions(self, reading: PassConventions, most: int | None = None) -> dict[str, np.ndarray]:
         """Return the ground positions of image points by line, ITRS, (n, 3) for n points, in metres.
 
         Parameters
@@ -563,11 +563,11 @@ class PassBench:
         ImpossibleError
             The points have no position on the ground.
         """
-        places = {}
+        positions = {}
         for name, raw in self.readings.images.items():
             part = raw if most is None else raw.taken(spread(len(raw.line), most))
-            places[name] = self._ground(name, reading, part, _PerturbedPlatform(self.path(reading.platform)))[0]
-        return places
+            positions[name] = self._ground(name, reading, part, _PerturbedPlatform(self.path(reading.platform)))[0]
+        return positions
 
     def residuals(self, reading: PassConventions, most: int | None = None) -> np.ndarray:
         """Return the residuals of the image points of all lines, east and north, (n, 2) for n points, in metres.
@@ -585,7 +585,7 @@ class PassBench:
             The points have no position on the ground.
         """
         known, residuals = self.readings.ground.points.itrs, []
-        for name, at in self.places(reading, most).items():
+        for name, at in self.positions(reading, most).items():
             point = self.readings.images[name].point
             residuals.append(_plan(known[point[spread(len(point), most or len(point))]], at))
         return np.concatenate(residuals)
@@ -602,7 +602,7 @@ class PassBench:
             base = steps[0]
             here = _plan(itrs, base)
             slope = [(_plan(itrs, step) - here) for step in steps[1:]]
-            rotation = np.stack(slope[:3], axis=-1) / _TURN * size.attitude
+            rotation = np.stack(slope[:3], axis=-1) / _ROTATION * size.attitude
             shift = np.stack(slope[3:6], axis=-1) / _SHIFT * size.position
             delay = slope[6] / _DELAY
             line, pixel, rise = delay * line_time[:, None], slope[7] / pixel_step[:, None], slope[8] / _RISE
@@ -639,7 +639,7 @@ class PassBench:
         """
         n, pixels = len(raw.line), self.cameras[name].pixels
         rotation, shift = np.broadcast_to(np.eye(3), (10, n, 3, 3)).copy(), np.zeros((10, n, 3))
-        rotation[1:4] = rotation_matrix(_TURN * np.eye(3))[:, None]
+        rotation[1:4] = rotation_matrix(_ROTATION * np.eye(3))[:, None]
         shift[4:7] = _SHIFT * np.eye(3)[:, None]
         delay, step, rise = np.zeros((10, n)), np.zeros((10, n)), np.zeros((10, n))
         direction = np.where(pixel_of(reading, raw, pixels) + 1.0 <= pixels - 0.5, 1.0, -1.0)

@@ -43,8 +43,8 @@ def _over(
 
 ACCURACY: Record[AccuracyMap] = Record(
     "Errors on the ground of points over a scene, by the uncertainty of camera, orbit and attitude.",
-    Quantity("height_m", lambda found: found.height, "height of the ground above the ellipsoid"),
-    Quantity("points", lambda found: int(np.sum(found.valid)), "number of points of the grid"),
+    Quantity("height_m", lambda heights: heights.height, "height of the ground above the ellipsoid"),
+    Quantity("points", lambda heights: int(np.sum(heights.valid)), "number of points of the grid"),
     Quantity("ce90_median_m", _over(lambda f: f.ce90, np.median), "90% horizontal error", "CE90 median", 3),
     Quantity("ce90_largest_m", _over(lambda f: f.ce90, np.max), "largest 90% horizontal error", "CE90 largest", 3),
     Quantity("le90_median_m", _over(lambda f: f.le90, np.median), "90% vertical error", "LE90 median", 3),
@@ -179,10 +179,10 @@ def control_section(control: Mapping[str, ControlledPolynomial]) -> Section:
 def _map_section(maps: Mapping[str, AccuracyMap]) -> Section:
     points: list[tuple[Cell, ...]] = []
     for name, accuracy in maps.items():
-        places = (accuracy.line, accuracy.pixel, np.degrees(accuracy.longitude), np.degrees(accuracy.latitude))
+        coordinates = (accuracy.line, accuracy.pixel, np.degrees(accuracy.longitude), np.degrees(accuracy.latitude))
         height = np.full_like(accuracy.line, accuracy.height)
         sigma = np.sqrt(np.einsum("nii->ni", accuracy.covariance))
-        columns = np.stack([*places, height, accuracy.ce90, accuracy.le90, *sigma.T], axis=-1)[accuracy.valid]
+        columns = np.stack([*coordinates, height, accuracy.ce90, accuracy.le90, *sigma.T], axis=-1)[accuracy.valid]
         points += [(_map_title(name), *row) for row in columns.tolist()]
     table = ACCURACY.table(
         "accuracy",

@@ -238,7 +238,7 @@ def single_accuracy(
         No line of sight meets the Earth.
     """
     line, pixel = _grid(sensor, first_pixel, sensor.camera.pixels if pixels is None else pixels)
-    longitude, latitude, level = _places(sensor, line, pixel, height)
+    longitude, latitude, level = _ground_positions(sensor, line, pixel, height)
     derivatives = _derivatives(sensor, line, pixel, height, level[:, :2])
     constant, random = np.zeros((2, len(line), 3, 3))
     constant[:, :2, :2] = _propagate(derivatives.platform, uncertainty.platform) + _propagate(
@@ -281,7 +281,7 @@ def intersected_accuracy(
         raise ValueError("an intersection needs two lines or more")
     first = next(iter(sensors.values()))
     line, pixel = _grid(first, first_pixel, first.camera.pixels if pixels is None else pixels)
-    longitude, latitude, level = _places(first, line, pixel, height)
+    longitude, latitude, level = _ground_positions(first, line, pixel, height)
     ground = first.ground(line, pixel, height)
     count = len(line)
     weight = np.linalg.inv(uncertainty.image if np.any(uncertainty.image) else np.eye(2))
@@ -319,7 +319,7 @@ def intersected_accuracy(
     return AccuracyMap(line, pixel, longitude + mask, latitude + mask, height, constant, random, none, _GRID)
 
 
-def _places(sensor: Sensor, line: Array, pixel: Array, height: float) -> tuple[Array, Array, Array]:
+def _ground_positions(sensor: Sensor, line: Array, pixel: Array, height: float) -> tuple[Array, Array, Array]:
     """Return longitude and latitude (N,), in radians, that N pixels see, and east-north-up axes there (N, 3, 3)."""
     ground = sensor.ground(line, pixel, height)
     if not np.any(np.isfinite(ground)):

@@ -64,8 +64,8 @@ def with_quality(run: Export, uncertainty: CameraUncertainty | None, points: Con
         lines[name] = replace(lines[name], polynomial=controlled.after)
     maps: Mapping[str, AccuracyMap] = {}
     if uncertainty is not None:
-        places = {n: (x.window.sensor, x.window.first_pixel, x.window.pixels) for n, x in lines.items()}
-        maps = accuracy_maps(places, uncertainty, run.heights[1])
+        windows = {n: (x.window.sensor, x.window.first_pixel, x.window.pixels) for n, x in lines.items()}
+        maps = accuracy_maps(windows, uncertainty, run.heights[1])
         lines = {name: _with_errors(line, maps[name], name in control) for name, line in lines.items()}
     return replace(run, lines=FrozenMap(lines), quality=Quality(FrozenMap(maps), FrozenMap(control), products))
 
@@ -128,7 +128,7 @@ def correct_line(
         The points do not determine a correction.
     """
     images = control.read.images
-    rows = next((places for image, places in images.items() if name in (image, Path(image).stem)), None)
+    rows = next((points for image, points in images.items() if name in (image, Path(image).stem)), None)
     if rows is None and alone and len(images) == 1:
         rows = next(iter(images.values()))
     if rows is None:

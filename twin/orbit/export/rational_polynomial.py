@@ -204,12 +204,12 @@ def _from_text(path: Path) -> RationalPolynomial:
 def _from_dimap(root: Element) -> RationalPolynomial:
     if root.tag != "Dimap_Document":
         root.wrong("not a DIMAP file", f"<{root.tag}>", "<Dimap_Document>")
-    form = root.one("Metadata_Identification", "METADATA_FORMAT")
+    form = root.single("Metadata_Identification", "METADATA_FORMAT")
     version = form.attributes.get("version", "").partition(".")[0]
     if version not in _GROUND_MODELS:
         form.wrong("not this format", shown(form.attributes.get("version")), "DIMAP of version 2 or 3")
-    model = root.one("Rational_Function_Model", "Global_RFM")
-    values, validity = model.one(_GROUND_MODELS[version]), model.one("RFM_Validity")
+    model = root.single("Rational_Function_Model", "Global_RFM")
+    values, validity = model.single(_GROUND_MODELS[version]), model.single("RFM_Validity")
     offset, scale = ([validity.number(f"{axis}_{what}") for axis in _AXES] for what in ("OFF", "SCALE"))
     offset[0] -= _FIRST_PIXEL[version]
     offset[1] -= _FIRST_PIXEL[version]

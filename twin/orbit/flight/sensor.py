@@ -56,13 +56,13 @@ class OffsetPlatform:
         Trajectory without the offset.
     shift : (3,) ndarray
         Offset of position in body axes, metres.
-    turn : (3,) ndarray
+    rotation : (3,) ndarray
         Rotation vector of the offset of attitude in body axes, radians.
     """
 
     base: Platform
     shift: np.ndarray
-    turn: np.ndarray
+    rotation: np.ndarray
 
     def position(self, seconds: np.ndarray) -> np.ndarray:
         """Return the shifted positions at N times, (N, 3), in metres."""
@@ -75,7 +75,7 @@ class OffsetPlatform:
 
     def body_to_itrs(self, seconds: np.ndarray) -> np.ndarray:
         """Return the rotated body axes at N times as columns, (N, 3, 3)."""
-        return np.asarray(self.base.body_to_itrs(seconds) @ rotation_matrix(self.turn))
+        return np.asarray(self.base.body_to_itrs(seconds) @ rotation_matrix(self.rotation))
 
 
 @dataclass(frozen=True, eq=False)

@@ -531,8 +531,8 @@ class Trajectory:
         if self.errors is None:
             return position, velocity, inertial
         axes = self.attitude.orbital_to_itrs(position, velocity, inertial)
-        place, speed = (
+        offset, speed = (
             np.einsum("...ij,...j->...i", axes, error(seconds))
             for error in (self.errors.position, self.errors.velocity)
         )
-        return position + place, velocity + speed, inertial + speed
+        return position + offset, velocity + speed, inertial + speed

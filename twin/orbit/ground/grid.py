@@ -178,7 +178,7 @@ class SplineGrid:
     beyond: Beyond = "nothing"
 
     @property
-    def reach(self) -> tuple[float, float, float, float]:
+    def extent(self) -> tuple[float, float, float, float]:
         """Bounds west, east, south and north, in metres, within which a spline without continuation is defined."""
         (rows, columns), (east, north) = self.coefficients.shape, self.first
         # A position needs one B-spline before its cell and two after.
@@ -228,8 +228,8 @@ class SplineGrid:
         rows, columns = self.coefficients.shape
         sides = ((east, columns, derivative[0]), (north, rows, derivative[1]))
         along, across = (
-            self._weights((place - first) / step, count, order) / step**order
-            for (place, count, order), first, step in zip(sides, self.first, self.spacing, strict=True)
+            self._weights((coordinate - first) / step, count, order) / step**order
+            for (coordinate, count, order), first, step in zip(sides, self.first, self.spacing, strict=True)
         )
         return np.asarray((along @ (across @ self.coefficients).T).T)
 
@@ -260,7 +260,7 @@ class SplineGrid:
 
     def _require_inside(self, east: np.ndarray, north: np.ndarray) -> None:
         """Raise UnphysicalError if positions lie outside the grid of a spline without continuation."""
-        west_end, east_end, south_end, north_end = self.reach
+        west_end, east_end, south_end, north_end = self.extent
         low, high = (np.min(east), np.min(north)), (np.max(east), np.max(north))
         if not (low[0] >= west_end and high[0] <= east_end and low[1] >= south_end and high[1] <= north_end):
             raise UnphysicalError(

@@ -106,7 +106,7 @@ def reflectance(extent: Extent, spec: TextureSpec, seed: np.random.SeedSequence,
         Share of the agricultural fields, 0 to 1, whose reflectance differs from that for `changed` = 0; which fields,
         and how, depends on the same seed.
     """
-    wild, plots, mask, ways = (stream(seed, k) for k in range(4))
+    wild, plots, mask, roads = (stream(seed, k) for k in range(4))
     east, north = extent.axes(spec.spacing, _SPARE)
     shape = (len(north), len(east))
     longest = max(0.5 * extent.side, 2.0 * spec.parcel_size)
@@ -119,7 +119,7 @@ def reflectance(extent: Extent, spec: TextureSpec, seed: np.random.SeedSequence,
         # A field is uniform, with a little of the soil's pattern.
         relative[covered] = 0.97 * fields[covered] + 0.25 * relative[covered]
     level = spec.mean * (1.0 + spec.contrast * relative)
-    _draw_roads(level, extent, spec, (east[0], north[0]), ways)
+    _draw_roads(level, extent, spec, (east[0], north[0]), roads)
     np.clip(level, _DARKEST, _BRIGHTEST, out=level)
     return SplineGrid(level, (spec.spacing, spec.spacing), (float(east[0]), float(north[0])))
 
@@ -180,8 +180,8 @@ def _fields(
             old, new, change = random.standard_normal(), random.standard_normal(), random.random()
             corners = _LANE * np.array([[west, south], [east, south], [east, north], [west, north]])
             corners += (1.0 - _LANE) * 0.5 * np.array([west + east, south + north])
-            place = (corners @ axes.T + middle - first) / spec.spacing
-            points = np.rint(place * 2**_SHIFT_BITS).astype(np.int32)
+            corner_pixels = (corners @ axes.T + middle - first) / spec.spacing
+            points = np.rint(corner_pixels * 2**_SHIFT_BITS).astype(np.int32)
             value = float(np.clip(new if change < changed else old, -2.5, 2.5))
             cv2.fillConvexPoly(fields, points, value, shift=_SHIFT_BITS)
             cv2.fillConvexPoly(covered, points, 1, shift=_SHIFT_BITS)
@@ -226,9 +226,9 @@ def _draw_roads(
                 random.normal(0.0, 0.12 * step, count).cumsum()
             )
             along = step * (np.arange(count) - 1)
-            place = np.stack([path, along] if axis == 0 else [along, path], axis=-1)
-            place = (place + np.array([extent.west - first[0], extent.south - first[1]])) / spec.spacing
-            points = np.rint(place * 2**_SHIFT_BITS).astype(np.int32)
+            path_pixels = np.stack([path, along] if axis == 0 else [along, path], axis=-1)
+            path_pixels = (path_pixels + np.array([extent.west - first[0], extent.south - first[1]])) / spec.spacing
+            points = np.rint(path_pixels * 2**_SHIFT_BITS).astype(np.int32)
             thickness = max(1, round(_ROAD_WIDTH / spec.spacing))
             cv2.polylines(level, [points], False, value, thickness=thickness, shift=_SHIFT_BITS)
 

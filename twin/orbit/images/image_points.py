@@ -130,13 +130,13 @@ class ReferenceHeights:
 
     def __call__(self, east: np.ndarray, north: np.ndarray) -> np.ndarray:
         """Return heights at positions, in metres; NaN outside the grid or where one of four neighbours is missing."""
-        place = np.stack(self.raster.row_column(east, north))
-        height = map_coordinates(self.coefficients, place, order=3, mode="mirror", prefilter=False)
-        last = np.array(self.coefficients.shape).reshape(2, *(1,) * (place.ndim - 1)) - 1
-        known = np.all((place >= 0.0) & (place <= last), axis=0)
+        pixels = np.stack(self.raster.row_column(east, north))
+        height = map_coordinates(self.coefficients, pixels, order=3, mode="mirror", prefilter=False)
+        last = np.array(self.coefficients.shape).reshape(2, *(1,) * (pixels.ndim - 1)) - 1
+        known = np.all((pixels >= 0.0) & (pixels <= last), axis=0)
         valid = self.raster.valid
         if valid is not None:
-            cell = np.clip(np.floor(np.nan_to_num(place)).astype(np.intp), 0, np.maximum(last - 1, 0))
+            cell = np.clip(np.floor(np.nan_to_num(pixels)).astype(np.intp), 0, np.maximum(last - 1, 0))
             for down, across in ((0, 0), (0, 1), (1, 0), (1, 1)):
                 known &= valid[np.minimum(cell[0] + down, last[0]), np.minimum(cell[1] + across, last[1])]
         return np.asarray(np.where(known, height, np.nan))
@@ -154,14 +154,14 @@ def predicted(image: LineFrame, points: np.ndarray) -> np.ndarray:
     return np.stack([line - image.window.first_line, pixel - image.window.first_pixel], axis=-1)
 
 
-def in_frame(image: LineFrame, place: np.ndarray, border: float) -> np.ndarray:
+def in_frame(image: LineFrame, position: np.ndarray, border: float) -> np.ndarray:
     """Return a mask of positions (..., 2) that lie at least `border` pixels inside a frame's edge; False for NaN."""
     last = np.array(image.frame.shape) - 1.0 - border
-    return np.asarray(np.all((place >= border) & (place <= last), axis=-1))
+    return np.asarray(np.all((position >= border) & (position <= last), axis=-1))
 
 
 def _ground_of_samples(
-    image: LineFrame, frame: GroundFrame, heights: ReferenceHeights, points: np.ndarray, place: np.ndarray, side: int
+    image: LineFrame, frame: GroundFrame, heights: ReferenceHeights, points: np.ndarray, position: np.ndarray, side: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return east, north and height, in metres, of the ground under n templates' pixels, (n, side, side) each.
 
@@ -176,14 +176,14 @@ def _ground_of_samples(
     points : (n, 3) ndarray
         Ground points of the templates' middles according to the measured sensor, ITRS, metres. Their height is used,
         and reference heights enter only as differences from those at the points.
-    place : (n, 2) ndarray
+    position : (n, 2) ndarray
         Rows and columns in the frame.
     side : int
         Side of a template, pixels.
     """
     east, north, height = (v[:, None, None] for v in frame.local(points))
     half = side // 2
-    row, column = image.image_point(place[:, 0], place[:, 1])
+    row, column = image.image_point(position[:, 0], position[:, 1])
     offsets = [(-half, 0, 0.0), (half, 0, 0.0), (0, -half, 0.0), (0, half, 0.0), (0, 0, _STEP)]
     known = image.measured
     ends = []
@@ -224,7 +224,7 @@ def _templates_of_image(
     frame: GroundFrame,
     samples: tuple[np.ndarray, np.ndarray, np.ndarray],
     points: np.ndarray,
-    place: np.ndarray,
+    position: np.ndarray,
 ) -> np.ndarray:
     """Return n templates of k x k pixels, (n, k, k), sampled from another line's image.
 
@@ -238,12 +238,12 @@ def _templates_of_image(
         East, north and height of the ground under the templates' pixels, from `_ground_of_samples`.
     points : (n, 3) ndarray
         Ground points of the templates' middles, ITRS, metres.
-    place : (n, 2) ndarray
+    position : (n, 2) ndarray
         Row and column of the points in the other image.
     """
     centre = np.stack(frame.local(points))
     base = predicted(source, points)
-    at = np.broadcast_to(place.T[:, :, None, None], (2, *samples[0].shape))
+    at = np.broadcast_to(position.T[:, :, None, None], (2, *samples[0].shape))
     for k, sample in enumerate(samples):
         shifted = centre.copy()
         shifted[k] += _STEP
@@ -260,7 +260,7 @@ SOURCE = 101
 """Status of a tie point in the frame in which it was chosen, where its position is exact by definition."""
 _MASK = 16
 """Step, in pixels of the orthophoto, of the grid on which it is tested whether every line sees the ground."""
-_GROUND_TURNS = 12
+_GROUND_ITERATIONS = 12
 """Number of iterations that intersect a line of sight with the ground."""
 _RISE = 10.0
 """Height difference over which the image displacement due to height is treated as linear, in metres."""
@@ -283,7 +283,7 @@ class MatchedLine:
     ----------
     predicted : (n, 2) ndarray for n points
         Row and column of the points in the frame, predicted by the measured sensor.
-    place : (n, 2) ndarray
+    position : (n, 2) ndarray
         Measured row and column; NaN where matching failed.
     covariance : (n, 2, 2) ndarray
         Covariance of the measured positions, px^2.
@@ -302,7 +302,7 @@ class MatchedLine:
     """
 
     predicted: np.ndarray
-    place: np.ndarray
+    position: np.ndarray
     covariance: np.ndarray
     correlation: np.ndarray
     status: np.ndarray
@@ -324,12 +324,12 @@ class MatchedLine:
     @property
     def image(self) -> np.ndarray:
         """Measured line and pixel of n points in the whole image, (n, 2)."""
-        return self.place + np.array(self.first)
+        return self.position + np.array(self.first)
 
     @property
     def median_shift(self) -> np.ndarray:
         """Median displacement of the accepted points from predicted to measured, in lines and pixels, (2,)."""
-        return np.asarray(np.median((self.place - self.predicted)[self.accepted], axis=0))
+        return np.asarray(np.median((self.position - self.predicted)[self.accepted], axis=0))
 
     @property
     def median_sigma(self) -> np.ndarray:
@@ -355,11 +355,11 @@ class MatchedLine:
         count = Counter(int(code) for code in self.status[~self.accepted])
         return {status_text(code): number for code, number in count.most_common()}
 
-    def displacement(self, place: np.ndarray, height: np.ndarray) -> np.ndarray:
+    def displacement(self, position: np.ndarray, height: np.ndarray) -> np.ndarray:
         """Return the smooth displacement from predicted to measured at n positions (n, 2) and heights (n,), (n, 2)."""
         if self.displacement_field is None:
-            return np.zeros_like(place)
-        return self.displacement_field(place, None if self.displacement_field.heights is None else height)
+            return np.zeros_like(position)
+        return self.displacement_field(position, None if self.displacement_field.heights is None else height)
 
 
 @dataclass(frozen=True, eq=False)
@@ -496,25 +496,25 @@ def tie_points(
     _require_room(patch, spec)
     heights = ReferenceHeights.of(patch.control.dem)
     image = patch.images[source]
-    place = distinct_points(image.frame, spec.tie, spacing=max(0.5 * spec.template, 1.0), border=border)
-    ground = _ground_of_looks(patch, image, heights, place, control.lines[source] if control else None)
+    position = distinct_points(image.frame, spec.tie, spacing=max(0.5 * spec.template, 1.0), border=border)
+    ground = _ground_of_looks(patch, image, heights, position, control.lines[source] if control else None)
     seen = [in_frame(other, predicted(other, ground), border) for other in patch.images.values() if other is not image]
     good = np.all([np.isfinite(ground).all(axis=1), *seen], axis=0)
-    place, ground = place[good], ground[good]
-    if not len(place):
+    position, ground = position[good], ground[good]
+    if not len(position):
         raise PointsError(f"{source}: no distinct point is seen by every line {border} pixels from the frames' borders")
     east, north, height = patch.frame.local(ground)
-    none = np.zeros(len(place))
+    none = np.zeros(len(position))
     lines = {
         source: MatchedLine(
-            place,
-            place,
-            np.zeros((len(place), 2, 2)),
+            position,
+            position,
+            np.zeros((len(position), 2, 2)),
             none + 1.0,
-            np.full(len(place), SOURCE),
+            np.full(len(position), SOURCE),
             (image.window.first_line, image.window.first_pixel),
             0.0,
-            f"{len(place)} points chosen",
+            f"{len(position)} points chosen",
         )
     }
     for name, other in patch.images.items():
@@ -522,7 +522,7 @@ def tie_points(
             continue
         at = predicted(other, ground)
         samples = _ground_of_samples(other, patch.frame, heights, ground, at, spec.template)
-        patterns = _templates_of_image(image, patch.frame, samples, ground, place)
+        patterns = _templates_of_image(image, patch.frame, samples, ground, position)
         rise = _rise(patch, other, ground, at)
         if control:
             at = at + control.lines[name].displacement(at, height)
@@ -560,34 +560,36 @@ def _distinct_map(
     scale = float(np.mean([np.mean(im.sample) for im in patch.images.values()])) / photo.spacing
     (top, bottom), (left, right) = ((int(v.min()), int(v.max())) for v in np.nonzero(seen))
     inside = seen[top : bottom + 1, left : right + 1]
-    cut = tuple(slice(a * _MASK, b * _MASK + 1) for a, b in ((top, bottom), (left, right)))
-    grey = gaussian_filter(photo.values[cut].astype(np.float32), SOFTENING * scale)
+    window = tuple(slice(a * _MASK, b * _MASK + 1) for a, b in ((top, bottom), (left, right)))
+    grey = gaussian_filter(photo.values[window].astype(np.float32), SOFTENING * scale)
     shape = [s / t for s, t in zip(grey.shape, inside.shape, strict=True)]
     mask = zoom(inside, shape, order=0, grid_mode=True, mode="nearest")
     grey[~mask] = np.nan
     share = max(float(mask.mean()), 0.05)
-    place = distinct_points(grey, int(np.ceil(count / share)), spacing=max(0.5 * spec.template * scale, 1.0), border=0)
-    if not len(place):
+    position = distinct_points(
+        grey, int(np.ceil(count / share)), spacing=max(0.5 * spec.template * scale, 1.0), border=0
+    )
+    if not len(position):
         raise PointsError("the orthophoto has no distinct points that every line sees")
-    found_east, found_north = photo.east_north(place[:, 0] + top * _MASK, place[:, 1] + left * _MASK)
-    ground = patch.frame.itrs(found_east, found_north, heights(found_east, found_north))
+    distinct_east, distinct_north = photo.east_north(position[:, 0] + top * _MASK, position[:, 1] + left * _MASK)
+    ground = patch.frame.itrs(distinct_east, distinct_north, heights(distinct_east, distinct_north))
     good = np.all([in_frame(im, predicted(im, ground), border) for im in patch.images.values()], axis=0)
-    return found_east[good][:count], found_north[good][:count]
+    return distinct_east[good][:count], distinct_north[good][:count]
 
 
 def _ground_of_looks(
-    patch: ImagedGround, image: LineFrame, heights: ReferenceHeights, place: np.ndarray, known: MatchedLine | None
+    patch: ImagedGround, image: LineFrame, heights: ReferenceHeights, position: np.ndarray, known: MatchedLine | None
 ) -> np.ndarray:
     """Intersect the measured sensor's lines of sight of n points with the reference heights, (n, 3), ITRS, in m.
 
     Points outside the reference elevation model are NaN. `known` are matches whose displacements correct the measured
     sensor; None for no correction.
     """
-    height = np.full(len(place), heights.mean)
-    at = place
-    for _ in range(_GROUND_TURNS):
+    height = np.full(len(position), heights.mean)
+    at = position
+    for _ in range(_GROUND_ITERATIONS):
         if known is not None:
-            at = place - known.displacement(at, height)
+            at = position - known.displacement(at, height)
         points = image.measured.ground(*image.image_point(at[:, 0], at[:, 1]), height)
         ground_height = heights(*patch.frame.local(points)[:2])
         height = np.where(np.isfinite(ground_height), ground_height, height)
@@ -618,10 +620,10 @@ def _matched(
     degree = _degree(int(good.sum()))
     if degree is None:
         raise PointsError(f"{name}: too few matches for a consensus: {match.text}")
-    place = np.where(good[:, None], match.position, np.nan)
+    position = np.where(good[:, None], match.position, np.nan)
     agreed = consensus(
         at,
-        place,
+        position,
         # Errors of reference heights and a swinging attitude do not make a match wrong.
         covariance=match.covariance
         + spec.height_sigma**2 * rise[:, :, None] * rise[:, None, :]

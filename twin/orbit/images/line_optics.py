@@ -244,10 +244,10 @@ class LineOptics:
         count = fft.next_fast_len(4 * half)
         frequency = fft.fftfreq(count, 1.0 / oversampling)
         values = fft.fftshift(fft.ifft2(self.transfer(frequency[None, :], frequency[:, None], motion)).real)
-        cut = slice(count // 2 - half, count // 2 + half + 1)
-        place = np.abs(np.arange(-half, half + 1)) / half
-        fade = 0.5 + 0.5 * np.cos(np.pi * np.clip((place - _TAPER) / (1.0 - _TAPER), 0.0, 1.0))
-        spread = values[cut, cut] * fade[:, None] * fade
+        middle = slice(count // 2 - half, count // 2 + half + 1)
+        distance = np.abs(np.arange(-half, half + 1)) / half
+        fade = 0.5 + 0.5 * np.cos(np.pi * np.clip((distance - _TAPER) / (1.0 - _TAPER), 0.0, 1.0))
+        spread = values[middle, middle] * fade[:, None] * fade
         return np.asarray(spread / spread.sum())
 
     def _lens(self, fx: np.ndarray, fy: np.ndarray) -> np.ndarray:

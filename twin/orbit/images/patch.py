@@ -143,7 +143,7 @@ class Patch(ImagedGround):
 
 def fly_patch(
     lines: Mapping[str, ImagedLine],
-    place: tuple[float, float],
+    position: tuple[float, float],
     size: tuple[int, int],
     ground: GroundSpec,
     control: ControlSpec,
@@ -159,7 +159,7 @@ def fly_patch(
     ----------
     lines : mapping of str to ImagedLine
         Name -> line that records images.
-    place : tuple of float
+    position : tuple of float
         Longitude and latitude of the patch's middle, radians.
     size : tuple of int
         Lines and pixels of every window.
@@ -181,7 +181,7 @@ def fly_patch(
         the ground or the memory.
     """
     for_terrain, for_ground, for_control, for_frames = (stream(seed, k) for k in range(4))
-    frame = GroundFrame(*place)
+    frame = GroundFrame(*position)
     guess = {name: window_of(name, line.sensor, frame, ground.terrain.height, size) for name, line in lines.items()}
     side = max(_side(line.sensor, guess[name], frame, ground.terrain.height) for name, line in lines.items())
     if side > LARGEST_GROUND:
@@ -408,8 +408,8 @@ def true_ground(patch: Patch, points: MatchedPoints) -> np.ndarray:
         raise ValueError(f"points are of kind map or tie, not {points.kind!r}")
     source = points.source
     assert source is not None
-    place = points.lines[source].place
-    return patch.true_point(source, place[:, 0], place[:, 1])
+    position = points.lines[source].position
+    return patch.true_point(source, position[:, 0], position[:, 1])
 
 
 def judged(patch: Patch, points: MatchedPoints) -> Mapping[str, LineComparison]:

@@ -177,10 +177,10 @@ class LookMap:
         c = self._basis(2, height, _HEIGHTS)
         return np.stack([np.einsum("hij,nh,ni,nj->n", v, c, a, b, optimize=True) for v in (self.east, self.north)])
 
-    def _basis(self, axis: int, place: np.ndarray, count: int) -> np.ndarray:
+    def _basis(self, axis: int, coordinate: np.ndarray, count: int) -> np.ndarray:
         """Return the first `count` Chebyshev polynomials along an axis at positions (...), (..., count)."""
         first, last = self.span[axis]
-        return chebyshev.chebvander((2.0 * np.asarray(place) - first - last) / (last - first), count - 1)
+        return chebyshev.chebvander((2.0 * np.asarray(coordinate) - first - last) / (last - first), count - 1)
 
 
 def _nodes(ends: np.ndarray, count: int) -> np.ndarray:
@@ -329,9 +329,9 @@ def look_map(sensor: Sensor, frame: GroundFrame, terrain: Terrain, window: Windo
             f"{window.first_pixel} does not lie {BORDER} inside the image of {sensor.lines} lines and "
             f"{sensor.camera.pixels} pixels"
         )
-    reach = BORDER
-    lines = window.first_line - reach, window.first_line + window.lines - 1 + reach
-    pixels = window.first_pixel - reach, window.first_pixel + window.pixels - 1 + reach
+    border = BORDER
+    lines = window.first_line - border, window.first_line + window.lines - 1 + border
+    pixels = window.first_pixel - border, window.first_pixel + window.pixels - 1 + border
     return LookMap.prepare(sensor, frame, terrain, lines, pixels)
 
 
@@ -469,13 +469,13 @@ def _samples(looks: LookMap, window: Window, oversampling: int, fine: int) -> tu
     For each pixel, `fine` positions along each side are computed on the terrain, and all `oversampling` positions are
     interpolated between them by cubics.
     """
-    reach = MARGIN + _NEAR
-    lines = np.arange((window.lines + 2 * reach - 1) * fine + 1) / fine + (window.first_line - reach)
-    pixels = np.arange((window.pixels + 2 * reach - 1) * fine + 1) / fine + (window.first_pixel - reach)
+    border = MARGIN + _NEAR
+    lines = np.arange((window.lines + 2 * border - 1) * fine + 1) / fine + (window.first_line - border)
+    pixels = np.arange((window.pixels + 2 * border - 1) * fine + 1) / fine + (window.first_pixel - border)
     east, north, _ = looks.ground(lines, pixels)
-    cut = slice(_NEAR * fine, -_NEAR * fine)
+    inner = slice(_NEAR * fine, -_NEAR * fine)
     if fine == oversampling:
-        return east[cut, cut], north[cut, cut]
+        return east[inner, inner], north[inner, inner]
     # With samples at pixels only, interpolation needs one more at either end.
     out = [_spread(_spread(v[1:-1, 1:-1], oversampling, 0), oversampling, 1) for v in (east, north)]
     return out[0], out[1]
@@ -495,10 +495,10 @@ def _spread(values: np.ndarray, factor: int, axis: int) -> np.ndarray:
             -(t + 1.0) * t * (t - 2.0) / 2.0,
             (t + 1.0) * t * (t - 1.0) / 6.0,
         )
-        place = out[k::factor]
-        np.multiply(v[:count], weight[0], out=place)
+        row = out[k::factor]
+        np.multiply(v[:count], weight[0], out=row)
         for j in (1, 2, 3):
-            place += weight[j] * v[j : j + count]
+            row += weight[j] * v[j : j + count]
     return np.moveaxis(out, 0, axis)
 
 
@@ -521,7 +521,7 @@ def _interpolation_error(sensor: Sensor, looks: LookMap, window: Window, oversam
     The points on the terrain are imaged by the rigorous sensor and compared with the samples' image coordinates.
     """
     random, size = np.random.default_rng(1), 5
-    taken, places = [], []
+    taken, expected_parts = [], []
     for _ in range(_CHECKS // size**2):
         line = window.first_line + int(random.integers(max(window.lines - size, 1)))
         pixel = window.first_pixel + int(random.integers(max(window.pixels - size, 1)))
@@ -533,7 +533,7 @@ def _interpolation_error(sensor: Sensor, looks: LookMap, window: Window, oversam
             lines, pixels = (v[1] + np.arange(len(east)) / oversampling for v in (lines, pixels))
         index = random.integers(0, len(lines), (2, size**2))
         taken.append(np.stack([lines[index[0]], pixels[index[1]]]))
-        places.append(np.stack([east[index[0], index[1]], north[index[0], index[1]]]))
-    (east, north), expected = np.concatenate(places, axis=1), np.concatenate(taken, axis=1)
+        expected_parts.append(np.stack([east[index[0], index[1]], north[index[0], index[1]]]))
+    (east, north), expected = np.concatenate(expected_parts, axis=1), np.concatenate(taken, axis=1)
     imaged = sensor.image(looks.frame.itrs(east, north, looks.terrain.height(east, north)))
     return float(np.max(np.hypot(imaged[0] - expected[0], imaged[1] - expected[1])))

@@ -94,11 +94,13 @@ def _transfer_figure(run: Simulation) -> Figure:
     name, image = min(run.patch.images.items(), key=lambda item: item[1].motion.advance)
     optics = run.lines[name].optics
     zero = np.zeros_like(frequency)
-    for axes, direction, place in zip(panels, ("line", "track"), ((frequency, zero), (zero, frequency)), strict=True):
-        for part, values in optics.factors(*place, image.motion).items():
+    for axes, direction, frequencies in zip(
+        panels, ("line", "track"), ((frequency, zero), (zero, frequency)), strict=True
+    ):
+        for part, values in optics.factors(*frequencies, image.motion).items():
             if np.ptp(values) > 1e-6:
                 axes.plot(frequency, _modulus(values), color=_PARTS[part], lw=1.0, label=_NAMES[part])
-        axes.plot(frequency, _modulus(optics.transfer(*place, image.motion)), color=INK, lw=1.8, label="all")
+        axes.plot(frequency, _modulus(optics.transfer(*frequencies, image.motion)), color=INK, lw=1.8, label="all")
         step = "pixel" if direction == "line" else "line"
         axes.set(title=f"Along the {direction}, {name}", xlabel=f"cycles per {step}", ylim=(0.0, 1.03), xlim=(0.0, 0.5))
         axes.legend(loc="lower left")
@@ -216,7 +218,7 @@ def _data(run: Simulation) -> Section:
 def simulation_report(run: Simulation) -> Report:
     """Return the report of a simulated pass over a patch: images, control, measured points and sharpness."""
     patch = run.spec.patch
-    longitude, latitude = np.degrees(run.place)
+    longitude, latitude = np.degrees(run.position)
     images = run.patch.images
     low = min(images, key=lambda name: min(images[name].nyquist))
     full = [name for name, image in images.items() if image.saturated]

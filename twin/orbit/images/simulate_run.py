@@ -116,7 +116,7 @@ class Simulation(SimulatedFlight):
         Seed of all random numbers.
     lines : mapping of str to ImagedLine
         Rendered lines, by name.
-    place : tuple of float
+    position : tuple of float
         Longitude and latitude of the patch's middle, radians.
     patch : Patch
         Images and control.
@@ -127,7 +127,7 @@ class Simulation(SimulatedFlight):
     setup: SimulateSetup
     seed: int
     lines: Mapping[str, ImagedLine]
-    place: tuple[float, float]
+    position: tuple[float, float]
     patch: Patch
     points: PatchPoints | None
 
@@ -179,7 +179,7 @@ def run_simulation(setup: SimulateSetup, backend: Backend | None, seed: int, adv
     optics = optics_of(setup.camera, spec.lines, spec.line_time, setup.detectors)
     lines = imaged_lines(flight.sensors, flight.users, optics, stream(root, 1))
     looking = _sensor(line_cameras(flight.truth)[spec.patch.line], flight.trajectory, flight.earth, spec)
-    place = _place(looking, spec)
+    position = _patch_position(looking, spec)
     size, parts = (spec.patch.lines, spec.patch.pixels), len(lines) + 1
 
     def imaged(count: int) -> None:
@@ -188,7 +188,7 @@ def run_simulation(setup: SimulateSetup, backend: Backend | None, seed: int, adv
     imaged(0)
     try:
         done = fly_patch(
-            lines, place, size, spec.ground, spec.control, stream(root, 2), spec.oversampling, advance=imaged
+            lines, position, size, spec.ground, spec.control, stream(root, 2), spec.oversampling, advance=imaged
         )
     except PatchError as error:
         key, remedy = _REMEDIES[error.part]
@@ -196,7 +196,7 @@ def run_simulation(setup: SimulateSetup, backend: Backend | None, seed: int, adv
     points = _points(done, spec)
     imaged(parts)
     return Simulation(
-        **vars(flight), setup=setup, seed=seed, lines=FrozenMap(lines), place=place, patch=done, points=points
+        **vars(flight), setup=setup, seed=seed, lines=FrozenMap(lines), position=position, patch=done, points=points
     )
 
 
@@ -217,7 +217,7 @@ def _sensor(camera: LineCamera, trajectory: Trajectory, earth: Earth, spec: Orbi
     return Sensor(camera, trajectory, earth, spec.line_time, trajectory.first + 0.5 * spec.line_time, lines, effects)
 
 
-def _place(sensor: Sensor, spec: OrbitSimulateSpec) -> tuple[float, float]:
+def _patch_position(sensor: Sensor, spec: OrbitSimulateSpec) -> tuple[float, float]:
     """Return longitude and latitude of the patch's middle, in radians."""
     line = (spec.patch.time - sensor.first_line_time) / sensor.line_time
     line = float(np.clip(line, -0.5, sensor.lines - 0.5))
@@ -302,7 +302,7 @@ GEOREFERENCE: Record[Raster] = Record(
 MATCHED: Record[MatchedLine] = Record(
     "Points of one kind in one line. Shifts, measured minus predicted, and sigmas of the fit, are medians of "
     "the accepted points.",
-    Quantity("found", lambda line: np.isfinite(line.place[:, 0]).sum(), "points for which the fit gave a position"),
+    Quantity("found", lambda line: np.isfinite(line.position[:, 0]).sum(), "points for which the fit gave a position"),
     Quantity("matched", lambda line: line.matched.sum(), "of these, points that passed the thresholds of the matching"),
     Quantity("accepted", lambda line: line.accepted.sum(), "of these, points that agree with their neighbours"),
     Quantity("rejected_by_consensus", lambda line: (line.status == CONSENSUS).sum(), "contradicted by neighbours"),
@@ -323,8 +323,8 @@ SIMULATE: Record[Simulation] = Record(
     "simulate.json. Quantities that the user of the images may know.",
     Quantity("seed", lambda run: run.seed, "seed of all random numbers"),
     Quantity("epoch_utc", lambda run: str(run.spec.orbit.epoch), "zero of the times"),
-    Quantity("longitude_deg", lambda run: run.place[0], "longitude of the patch's middle"),
-    Quantity("latitude_deg", lambda run: run.place[1], "latitude of the patch's middle"),
+    Quantity("longitude_deg", lambda run: run.position[0], "longitude of the patch's middle"),
+    Quantity("latitude_deg", lambda run: run.position[1], "latitude of the patch's middle"),
     Quantity("lines", lambda run: run.patch.images, "image of each line", record=LINE),
     Quantity("orthophoto", lambda run: run.patch.control.orthophoto, "orthophoto", record=GEOREFERENCE),
     Quantity("dem", lambda run: run.patch.control.dem, "georeference of the elevation model", record=GEOREFERENCE),
@@ -401,12 +401,16 @@ MATCH_COUNTS = {
 COMPARED: Record[LineComparison] = Record(
     "Points of one kind in one line compared with the truth; RMS and mean of those that are not wrong.",
     *(Quantity(key, attrgetter(key), meaning) for key, meaning in MATCH_COUNTS.items()),
-    Quantity("rms_lines_px", lambda one: one.rms[0], "root mean square error along the track", "RMS track"),
-    Quantity("rms_pixels_px", lambda one: one.rms[1], "root mean square error along the line", "RMS line"),
-    Quantity("mean_lines_px", lambda one: one.mean[0], "mean error along the track", "mean track"),
-    Quantity("mean_pixels_px", lambda one: one.mean[1], "mean error along the line", "mean line"),
-    Quantity("chi_square", lambda one: one.chi_square, "of their errors under their covariances", "χ²"),
-    Quantity("degrees_of_freedom", lambda one: one.degrees_of_freedom, "two for each point"),
+    Quantity(
+        "rms_lines_px", lambda comparison: comparison.rms[0], "root mean square error along the track", "RMS track"
+    ),
+    Quantity(
+        "rms_pixels_px", lambda comparison: comparison.rms[1], "root mean square error along the line", "RMS line"
+    ),
+    Quantity("mean_lines_px", lambda comparison: comparison.mean[0], "mean error along the track", "mean track"),
+    Quantity("mean_pixels_px", lambda comparison: comparison.mean[1], "mean error along the line", "mean line"),
+    Quantity("chi_square", lambda comparison: comparison.chi_square, "of their errors under their covariances", "χ²"),
+    Quantity("degrees_of_freedom", lambda comparison: comparison.degrees_of_freedom, "two for each point"),
     Quantity("error_px", _errors, "measured minus true, lines and pixels, of each point"),
 )
 TRUE_POINTS: Record[tuple[Patch, MatchedPoints]] = Record(
@@ -441,7 +445,7 @@ TRUTH: Record[Simulation] = Record(
     "Truth of a pass, unknown to an analysis.",
     Quantity(
         "points",
-        lambda run: run.points and {sort: (run.patch, one) for sort, one in run.points.sorts.items()},
+        lambda run: run.points and {sort: (run.patch, group) for sort, group in run.points.sorts.items()},
         "true ground positions by kind, and the measured points compared with them",
         record=TRUE_POINTS,
     ),

@@ -95,7 +95,7 @@ def _summary(run: JitterRun) -> Table:
     for name, jitter in run.passes.items():
         for line in jitter.oscillations:
             sizes = np.stack([*(v / ARCSEC for v in line.amplitude), line.pixels], axis=-1).ravel()
-            cells = (name, *line.frequency, *sizes.tolist(), float(jitter.result.lines.chance[line.number]))
+            cells = (name, *line.frequency, *sizes.tolist(), float(jitter.result.lines.p_value[line.number]))
             truth: tuple[Cell, ...] = (None,) * (1 + len(axes)) if run.simulated else ()
             if line.truth is not None:
                 truth = (line.truth[0], *(line.truth[1] / ARCSEC).tolist())

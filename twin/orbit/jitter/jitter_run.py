@@ -86,7 +86,7 @@ class PassJitter:
     def next_p_value(self) -> float:
         """p-value of the highest power that remains in the spectrum after the detected oscillations are removed."""
         after = self.result.after
-        return float(after.chance(after.power[after.best]))
+        return float(after.p_value(after.power[after.best]))
 
     def by_axis(self, values: np.ndarray) -> dict[str, float]:
         """Return the values (A,) of the A searched axes as a mapping, name of the axis -> value."""
@@ -384,7 +384,7 @@ LINE: Record[Oscillation] = Record(
     Quantity("amplitude_arcsec_sigma", lambda of: of.jitter.by_axis(of.amplitude[1]), "axis -> standard deviation"),
     Quantity("amplitude_px", lambda of: of.jitter.by_axis(of.pixels), "axis -> amplitude in pixels"),
     Quantity("phase_deg", lambda of: of.jitter.by_axis(of.phase), "axis -> p of sin(2 pi f t + p), t from the epoch"),
-    Quantity("p_value", lambda of: of.jitter.result.lines.chance[of.number], "by noise alone, at any frequency"),
+    Quantity("p_value", lambda of: of.jitter.result.lines.p_value[of.number], "by noise alone, at any frequency"),
     Quantity("in_search", lambda of: of.in_search, "true if the frequency lies within the search"),
     Quantity("aliases_hz", lambda of: list(of.aliases), "other frequencies that explain the observations as well"),
     Quantity("true_frequency_hz", lambda of: of.truth and of.truth[0], "true frequency", where_known=True),
@@ -413,21 +413,23 @@ def _detectable(jitter: PassJitter) -> dict[str, float]:
 
 PASS: Record[PassJitter] = Record(
     "Jitter of one pass.",
-    Quantity("epoch_utc", lambda one: one.measurements.platform.epoch, "zero of the times"),
-    Quantity("lines", lambda one: list(one.sights.lines), "lines in the order in which they see a point"),
-    Quantity("points", lambda one: one.sights.points, "number of points seen by two lines or more"),
-    Quantity("share_used", lambda one: np.mean(one.result.used), "share of observations used, not wrong matches"),
+    Quantity("epoch_utc", lambda jitter: jitter.measurements.platform.epoch, "zero of the times"),
+    Quantity("lines", lambda jitter: list(jitter.sights.lines), "lines in the order in which they see a point"),
+    Quantity("points", lambda jitter: jitter.sights.points, "number of points seen by two lines or more"),
+    Quantity("share_used", lambda jitter: np.mean(jitter.result.used), "share of observations used, not wrong matches"),
     Quantity("gap_ms", _gaps, "pair -> median time between the sightings of a point"),
-    Quantity("duration_s", lambda one: one.sights.observations.span, "time from first to last sighting"),
-    Quantity("pixel_arcsec", lambda one: one.sights.pixel, "angle of a pixel along the line"),
-    Quantity("noise_factor", lambda one: one.noise_factors, "line -> remaining noise over its covariances"),
-    Quantity("aliases_sought_to_hz", lambda one: one.result.beyond, "highest frequency of aliases"),
-    Quantity("oscillations", lambda one: one.oscillations, "the strongest first", record=LINE),
-    Quantity("next_p_value", lambda one: one.next_p_value, "p-value of the highest remaining power"),
+    Quantity("duration_s", lambda jitter: jitter.sights.observations.span, "time from first to last sighting"),
+    Quantity("pixel_arcsec", lambda jitter: jitter.sights.pixel, "angle of a pixel along the line"),
+    Quantity("noise_factor", lambda jitter: jitter.noise_factors, "line -> remaining noise over its covariances"),
+    Quantity("aliases_sought_to_hz", lambda jitter: jitter.result.beyond, "highest frequency of aliases"),
+    Quantity("oscillations", lambda jitter: jitter.oscillations, "the strongest first", record=LINE),
+    Quantity("next_p_value", lambda jitter: jitter.next_p_value, "p-value of the highest remaining power"),
     Quantity("detectable_arcsec", _detectable, "axis -> least detectable amplitude, median over frequencies"),
-    Quantity("blind_hz", lambda one: one.result.before.intervals(), "first and last of blind frequencies"),
+    Quantity("blind_hz", lambda jitter: jitter.result.before.intervals(), "first and last of blind frequencies"),
     Quantity("blind_multiples", blind_multiples, "blind frequencies of every pair alone", record=MULTIPLE),
-    Quantity("mtf_at_nyquist", lambda one: transfers(one) or None, "line -> transfer, rms of phases", where_known=True),
+    Quantity(
+        "mtf_at_nyquist", lambda jitter: transfers(jitter) or None, "line -> transfer, rms of phases", where_known=True
+    ),
 )
 JITTER: Record[JitterRun] = Record(
     "Content of jitter.json: jitter detected in points that several lines see one after the other.",

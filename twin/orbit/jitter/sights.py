@@ -136,7 +136,7 @@ def _chebyshev_fit(time: np.ndarray, values: np.ndarray, span: tuple[float, floa
 
 _SPARE = 200
 """Number of image lines before and after the measured ones within which expected positions are searched."""
-_TURN = 1e-5
+_ROTATION = 1e-5
 """Step of the difference quotients with respect to rotation, in radians."""
 _STEP = 10.0
 """Step of the difference quotients with respect to position, in metres."""
@@ -263,7 +263,7 @@ def _lines(
     begin, end = float(np.min(ends)), float(np.max(ends))
     path = TabulatedTrajectory(measurements.platform)
     steady = SteadyPlatform.of(path, max(begin, path.first), min(end, path.last))
-    rotated = [OffsetPlatform(steady, np.zeros(3), _TURN * np.eye(3)[AXES.index(axis)]) for axis in search.axes]
+    rotated = [OffsetPlatform(steady, np.zeros(3), _ROTATION * np.eye(3)[AXES.index(axis)]) for axis in search.axes]
     lines = {}
     for name, row in rows.items():
         sensor = Sensor.of_lines(cameras[name], steady, Earth(), times[name], effects)
@@ -328,22 +328,22 @@ class _Prior:
 def _prior_of(
     measurements: PassMeasurements, lines: Mapping[str, _Line], shared: np.ndarray, search: JitterSearchSpec
 ) -> _Prior:
-    place = np.full((len(measurements.ground), 3), np.nan)
+    position = np.full((len(measurements.ground), 3), np.nan)
     for line in lines.values():
         ground = line.sensor.ground(line.image[:, 0], line.image[:, 1], search.height)
-        empty = np.isnan(place[line.point, 0])
-        place[line.point[empty]] = ground[empty]
+        empty = np.isnan(position[line.point, 0])
+        position[line.point[empty]] = ground[empty]
     tie = measurements.ground.role == "tie"
-    place[~tie] = measurements.ground.itrs[~tie]
-    place, tie = place[shared], tie[shared]
-    if not np.all(np.isfinite(place)):
+    position[~tie] = measurements.ground.itrs[~tie]
+    position, tie = position[shared], tie[shared]
+    if not np.all(np.isfinite(position)):
         raise SightsError("lines of sight miss the Earth")
-    root = np.zeros((len(place), 3, 3))
-    longitude, latitude, _ = Earth().geodetic(place[tie])
+    root = np.zeros((len(position), 3, 3))
+    longitude, latitude, _ = Earth().geodetic(position[tie])
     root[tie, 0] = east_north_up(longitude, latitude)[:, 2] / search.height_sigma
     spread = measurements.ground.covariance[shared[~tie]] + _EXACT**2 * np.eye(3)
     root[~tie] = np.linalg.inv(np.linalg.cholesky(spread))
-    return _Prior(tie, place, root)
+    return _Prior(tie, position, root)
 
 
 def _improved_positions(lines: Mapping[str, _Line], shared: np.ndarray, prior: _Prior) -> np.ndarray:
@@ -398,7 +398,7 @@ def _whitened_observations(
         positions = ground[which]
         difference, slope = _residual_and_slope(line, positions)
         expected = line.image - difference
-        rotations = [(np.stack(s.image(positions), axis=-1) - expected) / _TURN for s in line.axes]
+        rotations = [(np.stack(s.image(positions), axis=-1) - expected) / _ROTATION for s in line.axes]
         good = np.all(np.isfinite(difference), axis=1) & (
             np.max(np.abs(np.nan_to_num(difference, nan=np.inf)), axis=1) < _FAR
         )

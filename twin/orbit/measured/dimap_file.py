@@ -182,8 +182,8 @@ class DimapPass:
         second[0], second[-1] = min(second[0], start - self.line_time), max(second[-1], start + span + self.line_time)
         day = np.floor(second / _DAY)
         clock = Readings(self.attitude.day + day.astype(np.int64), second - _DAY * day)
-        turns = self.attitude.at(second)
-        return AttitudeReadings(self.file, clock, turns, None, "ITRS", "UTC", "first", "body_to_frame")
+        quaternion = self.attitude.at(second)
+        return AttitudeReadings(self.file, clock, quaternion, None, "ITRS", "UTC", "first", "body_to_frame")
 
     def spanning_orbit(self) -> OrbitReadings:
         """Return the orbit's readings, extrapolated by one at each end where the image extends slightly beyond them.
@@ -202,13 +202,13 @@ class DimapPass:
                 problem = f"the image {'begins before' if end == 0 else 'ends after'} the ephemeris"
                 found, allowed = f"by {abs(step):.6g} s", f"{_NEAR:g} s at most"
                 raise InputError(Issue(problem, self.file, None, ("Ephemeris",), found, allowed))
-            other, place = (1, 0) if end == 0 else (-2, len(time))
+            other, index = (1, 0) if end == 0 else (-2, len(time))
             rate = (velocity[end] - velocity[other]) / (time[end] - time[other])
             # Velocities a few milliseconds apart are too noisy for an acceleration.
             rate = rate if abs(time[end] - time[other]) > 0.5 else -_GRAVITY * position[end] / _norm(position[end]) ** 3
-            position = np.insert(position, place, position[end] + velocity[end] * step + 0.5 * rate * step**2, axis=0)
-            velocity = np.insert(velocity, place, velocity[end] + rate * step, axis=0)
-            time = np.insert(time, place, at)
+            position = np.insert(position, index, position[end] + velocity[end] * step + 0.5 * rate * step**2, axis=0)
+            velocity = np.insert(velocity, index, velocity[end] + rate * step, axis=0)
+            time = np.insert(time, index, at)
         return OrbitReadings(self.file, self._clock(time), position, velocity, "ITRS", "UTC")
 
     def _spanning_samples(self, attitude: AttitudeReadings) -> AttitudeReadings:
@@ -220,9 +220,11 @@ class DimapPass:
         if not more:
             return attitude
         # This is the interpolation of the samples everywhere else.
-        turns = CubicSpline(time, continuous_quaternions(attitude.quaternion))(np.array(more))
+        more_quaternions = CubicSpline(time, continuous_quaternions(attitude.quaternion))(np.array(more))
         order = np.argsort(times := np.concatenate([time, more]))
-        quaternion = np.concatenate([attitude.quaternion, turns / np.linalg.norm(turns, axis=1, keepdims=True)])
+        quaternion = np.concatenate(
+            [attitude.quaternion, more_quaternions / np.linalg.norm(more_quaternions, axis=1, keepdims=True)]
+        )
         return replace(attitude, clock=self._clock(times[order]), quaternion=quaternion[order])
 
     def _ends_beyond(self, time: Array) -> list[tuple[float, int]]:
@@ -283,12 +285,12 @@ def read_dimap(path: str | Path, band: str | None = None) -> DimapPass:
     if model is None:
         allowed = "a product in sensor geometry with Geometric_Data/Refined_Model; of other files only the RPC are read"
         raise InputError(Issue("no rigorous model", str(path), root.line, root.path, profile, allowed))
-    size = root.one("Raster_Data", "Raster_Dimensions")
+    size = root.single("Raster_Data", "Raster_Dimensions")
     lines, pixels = size.whole("NROWS", most=2_000_000), size.whole("NCOLS", most=200_000)
-    first, period = _times(model.one("Time"), lines)
-    orbit, inertial = _orbit(model.one("Ephemeris"), str(path))
-    attitude = _attitude(model.one("Attitudes"), str(path), int(first.day[0]))
-    calibration = model.one("Geometric_Calibration", "Instrument_Calibration")
+    first, period = _times(model.single("Time"), lines)
+    orbit, inertial = _orbit(model.single("Ephemeris"), str(path))
+    attitude = _attitude(model.single("Attitudes"), str(path), int(first.day[0]))
+    calibration = model.single("Geometric_Calibration", "Instrument_Calibration")
     forward, right = _looks(calibration, band)
     title = root.maybe("Dataset_Identification", "DATASET_NAME")
     pitch = model.maybe("Instrument_Configuration", "DETECTOR_SIZE_COL")
@@ -333,13 +335,13 @@ def _identified(root: Element) -> tuple[str, str]:
     if root.tag != "Dimap_Document":
         allowed = "<Dimap_Document>; PHR_Dimap_Document is DIMAP_PHR, of the ground segment of Pléiades"
         root.wrong("not a DIMAP file", f"<{root.tag}>", allowed)
-    identity = root.one("Metadata_Identification")
-    form = identity.one("METADATA_FORMAT")
+    identity = root.single("Metadata_Identification")
+    form = identity.single("METADATA_FORMAT")
     version = form.attributes.get("version", "")
     if form.text != "DIMAP" or version.partition(".")[0] not in _VERSIONS:
         allowed = "DIMAP of version 2 or 3; version 1, of SPOT 1 to 5, has another model"
         form.wrong("unsupported format", shown(f"{form.text} {version}"), allowed)
-    profile = identity.one("METADATA_PROFILE")
+    profile = identity.single("METADATA_PROFILE")
     if profile.text not in PROFILES:
         allowed = f"{names_text(PROFILES)}; of other profiles only the rational polynomials are read"
         profile.wrong("unsupported profile", shown(profile.text), allowed)
@@ -357,9 +359,9 @@ def _moment(element: Element) -> Readings:
 
 def _times(time: Element, lines: int) -> tuple[Readings, float]:
     """Return the exposure time of the first line, as a clock reading, and the line period in seconds."""
-    span = time.one("Time_Range")
-    first, last = _moment(span.one("START")), _moment(span.one("END"))
-    stamp = time.one("Time_Stamp", "LINE_PERIOD")
+    span = time.single("Time_Range")
+    first, last = _moment(span.single("START")), _moment(span.single("END"))
+    stamp = time.single("Time_Stamp", "LINE_PERIOD")
     period = stamp.number(least=1e-6, most=0.1, unit=_PERIOD)
     lasted = float((last.day[0] - first.day[0]) * _DAY + last.second[0] - first.second[0])
     off = abs(lasted - (lines - 1) * period)
@@ -371,7 +373,7 @@ def _times(time: Element, lines: int) -> tuple[Readings, float]:
 
 def _clock(items: list[Element], file: str) -> Readings:
     """Return the times of XML elements as clock readings; raise InputError unless they increase."""
-    moments = [_moment(item.one("TIME")) for item in items]
+    moments = [_moment(item.single("TIME")) for item in items]
     clock = Readings(np.array([m.day[0] for m in moments]), np.array([m.second[0] for m in moments]))
     require_increasing(file, clock, [item.line for item in items])
     return clock
@@ -383,15 +385,15 @@ def _orbit(ephemeris: Element, file: str) -> tuple[OrbitReadings, bool]:
     if len(points) < 4:
         ephemeris.wrong("too few points of the orbit", str(len(points)), "4 or more in Point_List")
     clock, lines = _clock(points, file), [point.line for point in points]
-    position = np.stack([point.one("LOCATION_XYZ").floats(3) for point in points])
-    velocity = np.stack([point.one("VELOCITY_XYZ").floats(3) for point in points])
+    position = np.stack([point.single("LOCATION_XYZ").floats(3) for point in points])
+    velocity = np.stack([point.single("VELOCITY_XYZ").floats(3) for point in points])
     require_orbit(file, position, lines)
     share, inertial = velocity_misfit((clock.day - clock.day[0]) * _DAY + clock.second, position, velocity)
     if inertial:
         velocity = velocity - earth_rotation_velocity(position)
     elif np.median(share) > SPEED_TOLERANCE:
         found = f"they differ by {100.0 * np.median(share):.3g} % in the median"
-        points[0].one("VELOCITY_XYZ").wrong("not the velocity of these positions", found, "Earth-fixed, m/s")
+        points[0].single("VELOCITY_XYZ").wrong("not the velocity of these positions", found, "Earth-fixed, m/s")
     return OrbitReadings(file, clock, position, velocity, "ITRS", "UTC"), inertial
 
 
@@ -413,10 +415,10 @@ def _attitude(attitudes: Element, file: str, day: int) -> AttitudeReadings | Att
     scale = polynomial.number("SCALE", least=1e-6, most=1e6)
     rows = []
     for k in range(4):
-        part = polynomial.one(f"Q{k}")
+        part = polynomial.single(f"Q{k}")
         degree = part.whole("DEGREE", least=0, most=_MOST_TERMS - 1)
         rows.append(np.zeros(_MOST_TERMS))
-        rows[-1][: degree + 1] = part.one("COEFFICIENTS").floats(degree + 1)
+        rows[-1][: degree + 1] = part.single("COEFFICIENTS").floats(degree + 1)
     fitted = AttitudePolynomial(day, offset, scale, np.array(rows))
     # It is normalised where it is used; at the middle of its range it has unit length but for the fit.
     require_unit(file, fitted.coefficients[None, :, 0], [polynomial.line])
@@ -427,7 +429,7 @@ def _looks(calibration: Element, band: str | None) -> tuple[Array, Array]:
     """Return coefficients of the look angles' tangents forward and to the right, ascending powers of the pixel."""
     direct = calibration.all("Polynomial_Look_Angles")
     bands = [*calibration.all("Band_Calibration_List", "Band_Calibration"), *calibration.all("Band_Calibration")]
-    named = {element.words("BAND_ID"): element.one("Polynomial_Look_Angles") for element in bands}
+    named = {element.words("BAND_ID"): element.single("Polynomial_Look_Angles") for element in bands}
     if direct and not named:
         named = {"": direct[0]}
     if band is not None:
@@ -456,7 +458,7 @@ def _tangent(element: Element, name: str, first: int) -> Array:
     """
     terms = [element.number(f"{name}_0", least=-1.0, most=1.0)]
     if name == "XLOS":
-        element.one("XLOS_1")
+        element.single("XLOS_1")
     while element.maybe(f"{name}_{len(terms)}") is not None and len(terms) < _MOST_TERMS:
         terms.append(element.number(f"{name}_{len(terms)}", least=-1.0, most=1.0))
     moved = np.polynomial.Polynomial(terms)(np.polynomial.Polynomial([float(first), 1.0]))

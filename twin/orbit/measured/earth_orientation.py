@@ -116,7 +116,7 @@ class TableRotation:
     epoch: str
     celestial_pole: Any
 
-    def turn(self, seconds: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def orientation_parameters(self, seconds: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return UT1 (...), days, and polar motion and celestial pole offsets (..., 2), radians, at times (...).
 
         UT1 is the second part of a Julian date whose first part is `julian`.
@@ -135,7 +135,7 @@ class TableRotation:
     def matrix(self, seconds: Any) -> np.ndarray:
         """Return the rotation GCRS -> ITRS: x_itrs = matrix @ x_gcrs; (..., 3, 3) for times (...)."""
         t = np.asarray(seconds, dtype=np.float64)
-        ut1, pole, offsets = self.turn(t)
+        ut1, pole, offsets = self.orientation_parameters(t)
         x, y, s = np.moveaxis(self.celestial_pole(t), -1, 0)
         celestial = erfa.c2ixys(x + offsets[..., 0], y + offsets[..., 1], s)
         return np.asarray(erfa.c2tcio(celestial, erfa.era00(self.julian, ut1), self._polar(t, pole)))
@@ -145,7 +145,7 @@ class TableRotation:
 
         It uses Greenwich mean sidereal time of 1982 and polar motion (Vallado et al., AIAA 2006-6753, appendix C).
         """
-        ut1, pole, _ = self.turn(seconds)
+        ut1, pole, _ = self.orientation_parameters(seconds)
         return np.asarray(erfa.pom00(pole[..., 0], pole[..., 1], 0.0) @ _about_z(erfa.gmst82(self.julian, ut1)))
 
     def _polar(self, t: np.ndarray, pole: np.ndarray) -> np.ndarray:
@@ -256,15 +256,15 @@ def _finals(file: str, rows: list[tuple[int, str]]) -> EarthOrientation:
     """
     cells, lines = [], []
     for k, line in rows:
-        cut = [line[a:b].strip() for a, b in _FINALS.values()]
+        columns = [line[a:b].strip() for a, b in _FINALS.values()]
         if len(line) < 68 and len(line) > 15 and line[15:].strip():
             raise InputError(Issue("a truncated line", file, k, (), f"{len(line)} characters", WHAT))
         if len(line) < 15:
             raise InputError(Issue("not a line of this table", file, k, (), repr(line[:40]), WHAT))
         final = [line[a:b].strip() for a, b in _FINAL.values()]
-        cut[1:] = final if all(final) else cut[1:]
-        if all(cut[1:4]):
-            cells.append([text or "0" for text in cut])
+        columns[1:] = final if all(final) else columns[1:]
+        if all(columns[1:4]):
+            cells.append([text or "0" for text in columns])
             lines.append(k)
     table = numbers(file, cells, lines, tuple(_FINALS))
     return _checked(file, lines, table[:, 0], table[:, 3], table[:, 1:3] * ARCSEC, table[:, 4:6] * 1e-3 * ARCSEC)

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from scenes.specs.orbit.measurements import GroundFileSpec
 
 _SIGMAS = ("sigma_east", "sigma_north", "sigma_up")
-_PLACES = (("longitude", "latitude", "height"), ("east", "north", "height"), ("x", "y", "z"))
+_COORDINATE_SETS = (("longitude", "latitude", "height"), ("east", "north", "height"), ("x", "y", "z"))
 _COLUMNS = (
     Column("point", text=True),
     *(Column(name, ANGLE, needed=False) for name in ("longitude", "latitude")),
@@ -60,7 +60,7 @@ class _Rows:
     """Points of a file: names, coordinates in the file's system, sigmas (NaN if not given), roles, line numbers."""
 
     ids: list[str]
-    places: np.ndarray
+    coordinates: np.ndarray
     sigmas: np.ndarray
     roles: list[str]
     lines: Sequence[int | None]
@@ -101,7 +101,7 @@ def read_ground_points(spec: GroundFileSpec, folder: Path) -> GroundFile:
     except Problem as problem:
         raise spec.error(problem, ("crs",)) from None
     try:
-        itrs = datum.itrs(*rows.places.T)
+        itrs = datum.itrs(*rows.coordinates.T)
     except Problem as problem:
         line = rows.lines[int(problem.within[0])] if problem.within else None
         raise InputError(Issue(problem.problem, file, line, (), problem.found, problem.allowed)) from None
@@ -159,16 +159,16 @@ def _role(file: str, role: str, line: int | None, key: tuple[str | int, ...] = (
 def _csv(path: Path, spec: GroundFileSpec) -> _Rows:
     """Read ground points from the rows of a CSV file."""
     table, file = read_table(path, _COLUMNS), str(path)
-    sets = [names for names in _PLACES if all(name in table for name in names)]
-    others = [n for names in _PLACES for n in names if n in table and not (sets and n in sets[0])]
+    sets = [names for names in _COORDINATE_SETS if all(name in table for name in names)]
+    others = [n for names in _COORDINATE_SETS for n in names if n in table and not (sets and n in sets[0])]
     if len(sets) != 1 or others:
-        allowed = "; or ".join(names_text(names) for names in _PLACES)
+        allowed = "; or ".join(names_text(names) for names in _COORDINATE_SETS)
         raise InputError(
             Issue("not one complete set of coordinates", file, None, (), names_text(table.columns), allowed)
         )
-    places = table.stacked(*sets[0])
-    if sets[0] == _PLACES[0]:
-        places[:, :2] = np.degrees(places[:, :2])
+    coordinates = table.stacked(*sets[0])
+    if sets[0] == _COORDINATE_SETS[0]:
+        coordinates[:, :2] = np.degrees(coordinates[:, :2])
     _fits(spec, sets[0])
     lines = [int(v) for v in table.lines]
     have = [name for name in _SIGMAS if name in table]
@@ -182,7 +182,7 @@ def _csv(path: Path, spec: GroundFileSpec) -> _Rows:
     ids = [str(v) for v in table["point"]]
     _unique(file, ids, lines)
     roles = [_role(file, str(r), k) for r, k in zip(table["role"], lines, strict=True)] if "role" in table else []
-    return _Rows(ids, places, sigmas, roles or ["control"] * len(ids), lines)
+    return _Rows(ids, coordinates, sigmas, roles or ["control"] * len(ids), lines)
 
 
 def _fits(spec: GroundFileSpec, names: tuple[str, ...]) -> None:
@@ -193,7 +193,9 @@ def _fits(spec: GroundFileSpec, names: tuple[str, ...]) -> None:
         crs = pyproj.CRS(_required(spec))
     except pyproj.exceptions.CRSError:
         return  # Datum.of reports the error
-    right = _PLACES[0] if crs.is_geographic else _PLACES[2] if crs.is_geocentric else _PLACES[1]
+    right = (
+        _COORDINATE_SETS[0] if crs.is_geographic else _COORDINATE_SETS[2] if crs.is_geocentric else _COORDINATE_SETS[1]
+    )
     if names != right:
         raise spec.error(
             f"columns {names_text(names)} are not coordinates of {crs.name}", ("crs",), allowed=names_text(right)
@@ -210,7 +212,7 @@ def _geojson(path: Path, spec: GroundFileSpec) -> _Rows:
     if "crs" in data and spec.crs is None:
         problem = "a member `crs`, which GeoJSON no longer has"
         raise InputError(Issue(problem, file, None, ("crs",), shown(data["crs"]), "`crs:` in the test's file"))
-    ids, places, sigmas, roles = [], [], [], []
+    ids, coordinates, sigmas, roles = [], [], [], []
     for k, feature in enumerate(features):
         key: tuple[str | int, ...] = ("features", k)
         if not isinstance(feature, dict):
@@ -231,13 +233,13 @@ def _geojson(path: Path, spec: GroundFileSpec) -> _Rows:
             at = (*key, "properties")
             raise InputError(Issue("invalid sigmas", file, None, at, shown(spread), f"{names_text(_SIGMAS)}, metres"))
         ids.append(str(name))
-        places.append([float(v) for v in position])
+        coordinates.append([float(v) for v in position])
         sigmas.append([math.nan if v is None else float(v) for v in spread])
         role = properties.get("role", "control")
         roles.append(_role(file, role if isinstance(role, str) else shown(role), None, (*key, "properties", "role")))
     lines: list[int | None] = [None] * len(ids)
     _unique(file, ids, lines)
-    return _Rows(ids, np.array(places), np.array(sigmas), roles, lines)
+    return _Rows(ids, np.array(coordinates), np.array(sigmas), roles, lines)
 
 
 def _finite(value: Any) -> bool:

@@ -223,10 +223,10 @@ class Geoid:
             raise InputError(Issue("not heights of a geoid", self.raster.file, None, (), found, "metres, within 150 m"))
         known = np.where(valid, values, np.nan).astype(np.float64)
         # Append the first column to a whole circle, otherwise repeat the last one, which then has no weight.
-        return np.pad(known, ((0, 0), (0, 1)), mode="wrap" if self._whole_turn else "edge")
+        return np.pad(known, ((0, 0), (0, 1)), mode="wrap" if self._is_global else "edge")
 
     @property
-    def _whole_turn(self) -> bool:
+    def _is_global(self) -> bool:
         """True where the grid spans all 360 degrees of longitude."""
         step = abs(self.raster.transform[0])
         return abs(self.raster.shape[1] * step - 360.0) < 0.6 * step
@@ -248,7 +248,7 @@ class Geoid:
         """
         lon, lat = np.broadcast_arrays(np.asarray(longitude, float), np.asarray(latitude, float))
         rows, columns = self.raster.shape
-        first, around = self.raster.transform[2], self._whole_turn
+        first, around = self.raster.transform[2], self._is_global
         offset = (lon - first) % 360.0
         row, column = self.raster.row_column_of(first + offset, lat)
         inside = (row >= -1e-6) & (row <= rows - 1.0 + 1e-6)
@@ -357,13 +357,13 @@ class Datum:
         height = z
         if self.geoid is not None:
             height = z + self.geoid(*self.geographic.transform(x, y))
-        places = np.stack(self.forward.transform(x, y, height), axis=-1)
-        good = np.all(np.isfinite(places), axis=-1)
+        positions = np.stack(self.forward.transform(x, y, height), axis=-1)
+        good = np.all(np.isfinite(positions), axis=-1)
         if not np.all(good):
             k = int(np.argmin(np.ravel(good)))
             text = f"{np.ravel(x)[k]:g}, {np.ravel(y)[k]:g}"
             raise Problem(f"not coordinates in {self.crs.name}", text, "coordinates of that system", within=(k,))
-        return places
+        return positions
 
     @property
     def accuracy(self) -> float | None:
@@ -371,13 +371,13 @@ class Datum:
 
         It is None if it is unknown, or before `itrs` is called.
         """
-        stated = self.forward.accuracy
-        if stated < 0.0:
+        accuracy = self.forward.accuracy
+        if accuracy < 0.0:
             try:
-                stated = float(self.forward.get_last_used_operation().accuracy)
+                accuracy = float(self.forward.get_last_used_operation().accuracy)
             except ProjError:
                 return None
-        return stated if stated >= 0.0 else None
+        return accuracy if accuracy >= 0.0 else None
 
 
 def _to_itrs(crs: pyproj.CRS) -> pyproj.Transformer:
@@ -548,8 +548,8 @@ class UserMap:
         if not good.any():
             raise InputError(Issue("the images lie outside the coordinate system of this map", self.raster.file))
         bounds = []
-        for place, count in ((row[good], self.raster.shape[0]), (column[good], self.raster.shape[1])):
-            low, high = int(max(np.floor(place.min()) - 2, 0)), int(min(np.ceil(place.max()) + 3, count))
+        for coordinate, count in ((row[good], self.raster.shape[0]), (column[good], self.raster.shape[1])):
+            low, high = int(max(np.floor(coordinate.min()) - 2, 0)), int(min(np.ceil(coordinate.max()) + 3, count))
             if high - low < 4:
                 lon, lat = np.degrees((frame.longitude, frame.latitude))
                 found = f"images near {lat:.4f} deg N, {lon:.4f} deg E"

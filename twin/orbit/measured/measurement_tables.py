@@ -42,21 +42,21 @@ _FAR, _FAST, _LATE, _MANY = 1e9, 1e5, 1e10, 1e9
 their squares do not overflow.
 """
 _TIME = Column("time", TIME, least=-_LATE, most=_LATE)
-_PLACE = tuple(Column(axis, LENGTH, least=-_FAR, most=_FAR) for axis in "xyz")
+_POSITION = tuple(Column(axis, LENGTH, least=-_FAR, most=_FAR) for axis in "xyz")
 _SPEED = tuple(Column(f"v{axis}", SPEED, needed=False, least=-_FAST, most=_FAST) for axis in "xyz")
 _QUATERNION = tuple(Column(f"q{k}", least=-1.001, most=1.001) for k in range(1, 5))
 _LARGE = 1e6
 """Largest accepted sigma of a ground coordinate, in metres."""
 _CORRELATIONS = ("correlation_xy", "correlation_xz", "correlation_yz")
 COLUMNS: Mapping[str, tuple[Column, ...]] = {
-    "platform": (_TIME, *_PLACE, *_SPEED, *_QUATERNION),
-    "orbit": (_TIME, *_PLACE, *_SPEED),
+    "platform": (_TIME, *_POSITION, *_SPEED, *_QUATERNION),
+    "orbit": (_TIME, *_POSITION, *_SPEED),
     "attitude": (_TIME, *_QUATERNION),
     "lines": (Column("camera", text=True), Column("line", least=-_MANY, most=_MANY), _TIME),
     "ground": (
         Column("point", text=True),
         Column("role", text=True),
-        *_PLACE,
+        *_POSITION,
         Column("sigma", LENGTH, needed=False, least=0.0, most=_LARGE),
         *(Column(f"{axis}_sigma", LENGTH, needed=False, least=0.0, most=_LARGE) for axis in ("plan", "height", *"xyz")),
         *(Column(name, needed=False, least=-1.0, most=1.0) for name in _CORRELATIONS),
@@ -250,18 +250,18 @@ def ground_of(table: Table) -> GroundPoints:
     """
     _once(table, "point")
     require_known(table, "role", ("control", "check"))
-    place = table.stacked("x", "y", "z")
-    radius = np.linalg.norm(place, axis=1)
+    position = table.stacked("x", "y", "z")
+    radius = np.linalg.norm(position, axis=1)
     with np.errstate(divide="ignore", invalid="ignore"):
-        height = radius - radius / np.linalg.norm(place / _EARTH_AXES, axis=1)
+        height = radius - radius / np.linalg.norm(position / _EARTH_AXES, axis=1)
     for row in np.flatnonzero(~(np.abs(height) < MOST_HEIGHT))[:1]:
         found = f"{height[row] / 1e3:.6g} km above the ellipsoid"
         allowed = "Earth-centred, Earth-fixed coordinates of the ground, not geodetic ones; and is the unit right?"
         raise table.error(int(row), "x", "not a position on the ground", found, allowed)
-    return GroundPoints.of(table["point"], place, _covariance(table, place), table["role"])
+    return GroundPoints.of(table["point"], position, _covariance(table, position), table["role"])
 
 
-def _covariance(table: Table, place: Array) -> Array:
+def _covariance(table: Table, position: Array) -> Array:
     """Return the covariances of n points in axes of the ITRS, (n, 3, 3), in m^2."""
     sets = [names for names in _SIGMAS if any(name in table for name in names)]
     allowed = "or ".join(", ".join(f"{name} [m]" for name in names) + " " for names in _SIGMAS).strip()
@@ -282,7 +282,7 @@ def _covariance(table: Table, place: Array) -> Array:
     if sets[0] == ("sigma",):
         return np.asarray(table["sigma"][:, None, None] ** 2 * np.eye(3))
     if sets[0] == _SIGMAS[1]:
-        return level_covariance(place, *(table[name] for name in sets[0]))
+        return level_covariance(position, *(table[name] for name in sets[0]))
     sigma = table.stacked(*sets[0])
     like = np.broadcast_to(np.eye(3), (len(table), 3, 3)).copy()
     for name, (i, j) in zip(_CORRELATIONS, ((0, 1), (0, 2), (1, 2)), strict=True):
@@ -511,7 +511,7 @@ _FALL, _JUMP = 12.0, 0.05
 """Largest accepted acceleration of a satellite, in m/s^2, and largest change of velocity that the noise of readings may
 cause, as a share of the speed.
 """
-_LEAST_TURN, _FASTEST_TURN = np.radians(2.0), np.radians(10.0)
+_LEAST_ROTATION, _FASTEST_ROTATION = np.radians(2.0), np.radians(10.0)
 """Limit of the rotation between two readings: a constant, in radians, plus a rate, in radians per second, which is
 higher than that of agile satellites.
 """
@@ -538,23 +538,23 @@ def platform_of(epoch: str, orbit: Table, attitude: Table, conventions: Conventi
         positions, or a quaternion is not of unit length.
     """
     order, looks = _rising(orbit), _rising(attitude)
-    time, place = orbit["time"][order], orbit.stacked("x", "y", "z")[order]
-    radius = np.linalg.norm(place, axis=1)
+    time, position = orbit["time"][order], orbit.stacked("x", "y", "z")[order]
+    radius = np.linalg.norm(position, axis=1)
     for k in np.flatnonzero((radius < _LEAST_RADIUS) | (radius > _MOST_RADIUS))[:1]:
         found = f"{radius[k] / 1e3:.6g} km from the Earth's centre"
         allowed = f"{_LEAST_RADIUS / 1e3:g} to {_MOST_RADIUS / 1e3:g} km; is the unit in the head right?"
         raise orbit.error(int(order[k]), "x", "not a satellite position", found, allowed)
-    _check_jumps(orbit, order, time, place)
+    _check_jumps(orbit, order, time, position)
     speed = None
-    given = [name for name in ("vx", "vy", "vz") if name in orbit]
-    if given:
+    columns = [name for name in ("vx", "vy", "vz") if name in orbit]
+    if columns:
         missing = [name for name in ("vx", "vy", "vz") if name not in orbit]
         if missing:
             raise InputError(
-                Issue(f"no column {missing[0]!r}", orbit.file, found=names_text(given), allowed="all three or none")
+                Issue(f"no column {missing[0]!r}", orbit.file, found=names_text(columns), allowed="all three or none")
             )
         speed = orbit.stacked("vx", "vy", "vz")[order]
-        _check_velocity(orbit, order, time, place, speed)
+        _check_velocity(orbit, order, time, position, speed)
     numbers = attitude.stacked("q1", "q2", "q3", "q4")[looks]
     norm = np.linalg.norm(numbers, axis=1)
     for k in np.flatnonzero(np.abs(norm - 1.0) > _UNIT_TOLERANCE)[:1]:
@@ -562,8 +562,8 @@ def platform_of(epoch: str, orbit: Table, attitude: Table, conventions: Conventi
             int(looks[k]), "q1", "not a unit quaternion", f"a norm of {norm[k]:.6g}", "four numbers of norm 1"
         )
     quaternion = _quaternions_of(numbers, conventions)
-    _check_turns(attitude, looks, quaternion)
-    return PlatformTable.of(epoch, time, place, speed, attitude["time"][looks], quaternion)
+    _check_rotations(attitude, looks, quaternion)
+    return PlatformTable.of(epoch, time, position, speed, attitude["time"][looks], quaternion)
 
 
 def _quaternions_of(numbers: Array, conventions: ConventionsSpec) -> Array:
@@ -599,11 +599,11 @@ def _rising(table: Table) -> NDArray[np.intp]:
     return np.asarray(order, np.intp)
 
 
-def _check_jumps(table: Table, order: NDArray[np.intp], time: Array, place: Array) -> None:
+def _check_jumps(table: Table, order: NDArray[np.intp], time: Array, position: Array) -> None:
     """Raise InputError for a position that is impossible on an orbit through its neighbours in time."""
     step = np.diff(time)
     with np.errstate(over="ignore", invalid="ignore"):  # times can almost coincide
-        rate = np.diff(place, axis=0) / step[:, None]
+        rate = np.diff(position, axis=0) / step[:, None]
         change = np.linalg.norm(np.diff(rate, axis=0), axis=1)
         speed = np.median(np.linalg.norm(rate, axis=1))
         jump = ~(change <= _FALL * (step[1:] + step[:-1]) + _JUMP * speed)
@@ -612,18 +612,18 @@ def _check_jumps(table: Table, order: NDArray[np.intp], time: Array, place: Arra
         raise table.error(int(order[k + 1]), "x", "a jump of the orbit", found, f"{allowed}; leave out wrong readings")
 
 
-def _check_turns(table: Table, order: NDArray[np.intp], quaternion: Array) -> None:
+def _check_rotations(table: Table, order: NDArray[np.intp], quaternion: Array) -> None:
     """Raise InputError for a rotation between two readings that is too fast for a satellite."""
     step = np.diff(table["time"][order])
     rotation = 2.0 * np.arccos(np.clip(np.abs(np.sum(quaternion[1:] * quaternion[:-1], axis=1)), 0.0, 1.0))
-    for k in np.flatnonzero(rotation > _LEAST_TURN + _FASTEST_TURN * step)[:1]:
+    for k in np.flatnonzero(rotation > _LEAST_ROTATION + _FASTEST_ROTATION * step)[:1]:
         found = f"{np.degrees(rotation[k]):.4g} deg in {step[k]:.4g} s"
         raise table.error(int(order[k + 1]), "q1", "a jump of the attitude", found, "leave out wrong readings")
 
 
-def _check_velocity(table: Table, order: NDArray[np.intp], time: Array, place: Array, speed: Array) -> None:
+def _check_velocity(table: Table, order: NDArray[np.intp], time: Array, position: Array, speed: Array) -> None:
     """Raise InputError unless the velocity is the rate of change of the positions."""
-    far, inertial = velocity_misfit(time, place, speed)
+    far, inertial = velocity_misfit(time, position, speed)
     if np.median(far) > SPEED_TOLERANCE:
         row = int(order[int(np.argsort(far)[len(far) // 2])])
         found = f"they differ by {100.0 * np.median(far):.3g} % in the median"

@@ -27,7 +27,7 @@ from twin.orbit.measured.xml_file import numbers, parsed_xml, readings, require_
 
 Frame = Literal["ITRS", "GCRS", "EME2000", "TEME"]
 Scalar = Literal["last", "first"]
-Turns = Literal["body_to_frame", "frame_to_body"]
+RotationDirection = Literal["body_to_frame", "frame_to_body"]
 FRAMES: tuple[str, ...] = get_args(Frame)
 """Names of the reference frames that can be read."""
 
@@ -122,12 +122,12 @@ class AttitudeReadings:
     frame: str | None = None
     scale: str | None = None
     scalar: Scalar | None = None
-    turns: Turns | None = None
+    turns: RotationDirection | None = None
 
     def taken(self, part: slice) -> AttitudeReadings:
         """Return the attitude readings that a slice of their indices selects."""
-        turns, angles = (None if values is None else values[part] for values in (self.quaternion, self.angles))
-        return replace(self, clock=self.clock.taken(part), quaternion=turns, angles=angles)
+        quaternion, angles = (None if values is None else values[part] for values in (self.quaternion, self.angles))
+        return replace(self, clock=self.clock.taken(part), quaternion=quaternion, angles=angles)
 
 
 def known_frame(name: str, file: str, line: int | None = None, key: str = "REF_FRAME") -> str:
@@ -181,7 +181,7 @@ those relative to the Earth.
 """
 
 
-def velocity_misfit(time: Array, place: Array, speed: Array) -> tuple[Array, bool]:
+def velocity_misfit(time: Array, position: Array, speed: Array) -> tuple[Array, bool]:
     """Return the misfit of velocities to Earth-fixed positions, and whether the velocities are inertial.
 
     Inertial velocities are larger by omega x P, with the Earth's rotation vector omega and the position P.
@@ -190,7 +190,7 @@ def velocity_misfit(time: Array, place: Array, speed: Array) -> tuple[Array, boo
     ----------
     time : (N,) ndarray for N readings
         Times, seconds.
-    place : (N, 3) ndarray
+    position : (N, 3) ndarray
         Positions in the ITRS, metres.
     speed : (N, 3) ndarray
         Velocities in axes of the ITRS, m/s.
@@ -201,11 +201,11 @@ def velocity_misfit(time: Array, place: Array, speed: Array) -> tuple[Array, boo
         Relative differences between velocities and rates of change of positions, and True if the velocities fit only
         after subtraction of omega x P.
     """
-    rate = np.diff(place, axis=0) / np.diff(time)[:, None]
+    rate = np.diff(position, axis=0) / np.diff(time)[:, None]
     # Across a long step the chord is shorter than the arc and lies to its side, which is not an error of the velocity.
     earth_fixed, inertial = (
         np.linalg.norm(rate - 0.5 * (v[1:] + v[:-1]), axis=1) / np.linalg.norm(rate, axis=1).clip(1.0)
-        for v in (speed, speed - earth_rotation_velocity(place))
+        for v in (speed, speed - earth_rotation_velocity(position))
     )
     return earth_fixed, bool(np.median(earth_fixed) > SPEED_TOLERANCE >= np.median(inertial))
 
@@ -309,11 +309,13 @@ def read_aem(path: str | Path, satellite: str | None = None) -> AttitudeReadings
         allowed = "SC_BODY or another frame of the spacecraft, SC_..., and a reference frame"
         raise InputError(Issue(problem, file, frames["REF_FRAME_A"][1], ("REF_FRAME_A",), found, allowed))
     reference, at = frames["REF_FRAME_A" if body[0] == "REF_FRAME_B" else "REF_FRAME_B"]
-    direction, turn_line = _same(file, segments, "ATTITUDE_DIR", "A2B")
+    direction, direction_line = _same(file, segments, "ATTITUDE_DIR", "A2B")
     if direction.upper() not in ("A2B", "B2A"):
-        raise InputError(Issue("unknown direction", file, turn_line, ("ATTITUDE_DIR",), shown(direction), "A2B, B2A"))
+        raise InputError(
+            Issue("unknown direction", file, direction_line, ("ATTITUDE_DIR",), shown(direction), "A2B, B2A")
+        )
     to_body = (direction.upper() == "A2B") == (body[0] == "REF_FRAME_B")
-    turns: Turns = "body_to_frame" if to_body else "frame_to_body"
+    rotation_direction: RotationDirection = "body_to_frame" if to_body else "frame_to_body"
     first, type_line = _same(file, segments, "QUATERNION_TYPE", "LAST")
     if first.upper() not in ("FIRST", "LAST"):
         raise InputError(Issue("unknown type", file, type_line, ("QUATERNION_TYPE",), shown(first), "FIRST, LAST"))
@@ -326,17 +328,17 @@ def read_aem(path: str | Path, satellite: str | None = None) -> AttitudeReadings
     clock = readings(file, [row[0] for row in rows], lines)
     require_increasing(file, clock, lines)
     frame = known_frame(reference, file, at, "REF_FRAME_A")
-    return AttitudeReadings(file, clock, quaternion, None, frame, _scale(file, segments), scalar, turns)
+    return AttitudeReadings(file, clock, quaternion, None, frame, _scale(file, segments), scalar, rotation_direction)
 
 
 def _segments(path: str | Path, kind: str) -> list[_Segment]:
     """Return the segments of a message that hold data."""
     file, lines = str(path), text_lines(path, f"a CCSDS {kind}")
     xml = any(line.lstrip().startswith("<") for line in lines[:20])
-    found = list(_from_xml(file, "\n".join(lines), kind) if xml else _from_text(file, lines, kind))
-    if not any(segment.rows for segment in found):
+    segments = list(_from_xml(file, "\n".join(lines), kind) if xml else _from_text(file, lines, kind))
+    if not any(segment.rows for segment in segments):
         raise InputError(Issue("no data", file, None, (), None, f"segments of a CCSDS {kind} with lines of data"))
-    return [segment for segment in found if segment.rows]
+    return [segment for segment in segments if segment.rows]
 
 
 def _from_text(file: str, lines: list[str], kind: str) -> Iterator[_Segment]:
@@ -377,7 +379,7 @@ def _from_text(file: str, lines: list[str], kind: str) -> Iterator[_Segment]:
 
 _STATE = ("EPOCH", "X", "Y", "Z", "X_DOT", "Y_DOT", "Z_DOT")
 """Names of the elements of a state vector (position and velocity) in XML."""
-_TURN = {"LAST": ("EPOCH", "Q1", "Q2", "Q3", "QC"), "FIRST": ("EPOCH", "QC", "Q1", "Q2", "Q3")}
+_QUATERNION_COLUMNS = {"LAST": ("EPOCH", "Q1", "Q2", "Q3", "QC"), "FIRST": ("EPOCH", "QC", "Q1", "Q2", "Q3")}
 """Names of the elements of an attitude state in XML, by QUATERNION_TYPE (position of the scalar)."""
 
 
@@ -389,7 +391,9 @@ def _from_xml(file: str, text: str, kind: str) -> Iterator[_Segment]:
         for meta in element.iter("metadata"):
             segment.keys |= {item.tag: (item.text, item.line) for item in meta.children}
         heads = (
-            _STATE if kind == "OEM" else _TURN[segment.keys.get("QUATERNION_TYPE", ("LAST", 1))[0].upper() or "LAST"]
+            _STATE
+            if kind == "OEM"
+            else _QUATERNION_COLUMNS[segment.keys.get("QUATERNION_TYPE", ("LAST", 1))[0].upper() or "LAST"]
         )
         for state in (*element.iter("stateVector"), *element.iter("attitudeState")):
             cells = {item.tag: item.text for item in state.below()}
@@ -414,15 +418,15 @@ def _chosen(file: str, segments: list[_Segment], satellite: str | None) -> list[
             found = names_text(names)
             raise InputError(Issue("the satellite is not specified", file, None, ("satellite",), found, "one of them"))
         return segments
-    found_segments = [
+    segments_of_object = [
         s for s in segments if satellite in (s.keys.get(k, ("",))[0] for k in ("OBJECT_ID", "OBJECT_NAME"))
     ]
-    if not found_segments:
+    if not segments_of_object:
         suggestion = nearest(satellite, allowed)
         raise InputError(
             Issue("no such satellite", file, None, ("satellite",), satellite, names_text(allowed), suggestion)
         )
-    return found_segments
+    return segments_of_object
 
 
 def _same(file: str, segments: list[_Segment], key: str, usual: str | None = None) -> tuple[str, int]:
@@ -455,7 +459,7 @@ def _parts(file: str, segments: list[_Segment]) -> tuple[Segment, ...]:
     No interpolation is allowed from one to the next, because they meet at discontinuities such as manoeuvres, and no
     use outside of USEABLE_START_TIME and USEABLE_STOP_TIME (502.0-B, 5.2.4).
     """
-    found, first = [], 0
+    parts, first = [], 0
     for segment in segments:
         count = len(segment.rows)
         ends = [segment.keys.get(f"USEABLE_{end}_TIME", segment.keys.get(f"{end}_TIME")) for end in ("START", "STOP")]
@@ -464,9 +468,9 @@ def _parts(file: str, segments: list[_Segment]) -> tuple[Segment, ...]:
             texts = [segment.rows[k][0] if limit is None else limit[0] for k, limit in zip((0, -1), ends, strict=True)]
             where = [segment.lines[k] if limit is None else limit[1] for k, limit in zip((0, -1), ends, strict=True)]
             usable = readings(file, texts, where)
-        found.append(Segment(first, first + count - 1, usable))
+        parts.append(Segment(first, first + count - 1, usable))
         first += count
-    return tuple(found)
+    return tuple(parts)
 
 
 def _joined(segments: list[_Segment]) -> tuple[list[list[str]], list[int]]:
@@ -511,7 +515,7 @@ def read_sp3(path: str | Path, satellite: str | None = None) -> OrbitReadings:
     scale = _sp3_scale(file, lines, old)
     system = head[46:51].strip()
     frame = known_frame(system, file, 1, "coordinate system") if system not in ("", "UNDEF") else None
-    texts, places, rows, speeds, speed_rows = [], [], [], [], []
+    texts, position_cells, rows, speeds, speed_rows = [], [], [], [], []
     epoch: str | None = None
     ended = used = False
     epochs = 0
@@ -526,7 +530,7 @@ def read_sp3(path: str | Path, satellite: str | None = None) -> OrbitReadings:
                 used = any(c.strip(" 0.-") for c in cells) or not all(c.strip() for c in cells)
             if mark == "P" and used:
                 texts.append(epoch)
-                places.append(cells)
+                position_cells.append(cells)
                 rows.append(k + 1)
             elif mark == "V" and used:
                 speeds.append(cells)
@@ -534,16 +538,16 @@ def read_sp3(path: str | Path, satellite: str | None = None) -> OrbitReadings:
         elif line.startswith("EOF"):
             ended = True
             break
-    stated = head[32:39].strip()
-    if not ended and not (stated.isdigit() and int(stated) == epochs and used):
-        found = f"{epochs} of {stated} epochs" if stated.isdigit() else None
+    epoch_count = head[32:39].strip()
+    if not ended and not (epoch_count.isdigit() and int(epoch_count) == epochs and used):
+        found = f"{epochs} of {epoch_count} epochs" if epoch_count.isdigit() else None
         allowed = "EOF as the last line, or all epochs of the header"
         raise InputError(Issue("the file ends early", file, len(lines), (), found, allowed))
     if len(rows) < 2:
         raise InputError(Issue(f"fewer than two positions of {which}", file, None, (), str(len(rows)), "two or more"))
     clock = readings(file, texts, rows)
     require_increasing(file, clock, rows)
-    position = 1e3 * numbers(file, places, rows, ("x", "y", "z"))
+    position = 1e3 * numbers(file, position_cells, rows, ("x", "y", "z"))
     require_orbit(file, position, rows)
     velocity = None
     if speeds:

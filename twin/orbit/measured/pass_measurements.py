@@ -66,10 +66,10 @@ class GroundPoints:
             Shapes do not match, a name occurs twice, a role is unknown, coordinates of control or check points are not
             finite, or a covariance is not symmetric and positive semidefinite.
         """
-        names, places = np.array(ids, dtype=object), np.array(itrs, np.float64)
+        names, coordinates = np.array(ids, dtype=object), np.array(itrs, np.float64)
         n = len(names)
-        if names.ndim != 1 or places.shape != (n, 3):
-            raise ValueError(f"ground points: {n} names and coordinates {places.shape}, not ({n}, 3)")
+        if names.ndim != 1 or coordinates.shape != (n, 3):
+            raise ValueError(f"ground points: {n} names and coordinates {coordinates.shape}, not ({n}, 3)")
         if len(set(names.tolist())) != n:
             raise ValueError("ground points: a name occurs twice")
         spread = np.array(np.broadcast_to(np.asarray(covariance, np.float64), (n, 3, 3)))
@@ -77,12 +77,12 @@ class GroundPoints:
         if not set(sorts.tolist()) <= set(ROLES):
             raise ValueError(f"ground points: roles are {', '.join(ROLES)}")
         known = sorts != "tie"
-        if not (np.all(np.isfinite(places[known])) and np.all(np.isfinite(spread))):
+        if not (np.all(np.isfinite(coordinates[known])) and np.all(np.isfinite(spread))):
             raise ValueError("ground points: a coordinate or covariance is not finite")
         scale = np.trace(spread, axis1=1, axis2=2)[:, None]
         if np.any(np.linalg.eigvalsh(spread) < -1e-9 * scale) or not np.allclose(spread, spread.swapaxes(1, 2)):
             raise ValueError("ground points: a covariance is not symmetric and positive semidefinite")
-        return cls(names, places, spread, sorts)
+        return cls(names, coordinates, spread, sorts)
 
     def __len__(self) -> int:
         return len(self.ids)
@@ -172,18 +172,18 @@ _APART = 0.01
 """Distance of two ground points, in metres, below which they count as the same: images from orbit do not resolve it."""
 
 
-def duplicates(ids: NDArray[np.object_], places: Array) -> str:
+def duplicates(ids: NDArray[np.object_], coordinates: Array) -> str:
     """Return a warning about points that have the same coordinates under two names; empty where there are none.
 
     Parameters
     ----------
     ids : (n,) ndarray of object for n points
         Names.
-    places : (n, 3) ndarray
+    coordinates : (n, 3) ndarray
         Coordinates, ITRS, metres; NaN where unknown.
     """
-    known = np.flatnonzero(np.all(np.isfinite(places), axis=1))
-    pairs = sorted(cKDTree(places[known]).query_pairs(_APART))
+    known = np.flatnonzero(np.all(np.isfinite(coordinates), axis=1))
+    pairs = sorted(cKDTree(coordinates[known]).query_pairs(_APART))
     if not pairs:
         return ""
     names = listed([f"{ids[known[a]]} = {ids[known[b]]}" for a, b in pairs])

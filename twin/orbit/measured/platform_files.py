@@ -47,7 +47,7 @@ _CLOCK = (Column("time", TIME, needed=False), Column("date_time", text=True, nee
 _NAMED = ("qx", "qy", "qz", "qw")
 _PLACED = ("q1", "q2", "q3", "q4")
 _ANGLES = ("roll", "pitch", "yaw")
-_TURN = (
+_ATTITUDE_COLUMNS = (
     *(Column(name, needed=False) for name in (*_NAMED, *_PLACED)),
     *(Column(name, ANGLE, needed=False) for name in _ANGLES),
 )
@@ -131,25 +131,27 @@ def read_platform(spec: PlatformFilesSpec, folder: Path) -> tuple[PlatformReadin
     orbit, attitude = _orbit(spec.orbit, folder), _attitude(spec.attitude, folder)
     quaternions = attitude.quaternion is not None
     spec_of = spec.attitude
-    frame = _stated(spec_of, "frame", spec_of.frame, attitude.frame, "the reference frame of the attitude")
+    frame = _of_file_or_test(spec_of, "frame", spec_of.frame, attitude.frame, "the reference frame of the attitude")
     if frame == "orbital" and (spec_of.nadir is None or spec_of.steering is None):
         problem = "the orbital frame is not specified"
         raise spec_of.error(problem, (), allowed="nadir: geodetic or geocentric, and steering: none or yaw")
     conventions = Conventions(
-        _stated(spec.orbit, "frame", spec.orbit.frame, orbit.frame, "the frame of the positions"),
-        _stated(spec.orbit, "time_scale", spec.orbit.time_scale, orbit.scale, "the time scale of the orbit"),
+        _of_file_or_test(spec.orbit, "frame", spec.orbit.frame, orbit.frame, "the frame of the positions"),
+        _of_file_or_test(spec.orbit, "time_scale", spec.orbit.time_scale, orbit.scale, "the time scale of the orbit"),
         frame,
-        _stated(spec_of, "time_scale", spec_of.time_scale, attitude.scale, "the time scale of the attitude"),
+        _of_file_or_test(spec_of, "time_scale", spec_of.time_scale, attitude.scale, "the time scale of the attitude"),
         spec.orbit.offset,
         spec_of.offset,
-        _stated(spec_of, "scalar", spec_of.scalar, attitude.scalar, "the position of the scalar")
+        _of_file_or_test(spec_of, "scalar", spec_of.scalar, attitude.scalar, "the position of the scalar")
         if quaternions
         else "last",
-        _stated(spec_of, "turns", spec_of.turns, attitude.turns, "the direction of the rotation")
+        _of_file_or_test(spec_of, "turns", spec_of.turns, attitude.turns, "the direction of the rotation")
         if quaternions
         else "body_to_frame",
         spec_of.body_axes,
-        "xyz" if quaternions else _stated(spec_of, "sequence", spec_of.sequence, None, "the sequence of the angles"),
+        "xyz"
+        if quaternions
+        else _of_file_or_test(spec_of, "sequence", spec_of.sequence, None, "the sequence of the angles"),
         Attitude(spec_of.nadir != "geocentric", spec_of.steering == "yaw"),
     )
     if conventions.orbit_frame == "ITRS":
@@ -178,11 +180,11 @@ def platform_table(readings: PlatformReadings, conventions: Conventions, epoch: 
     orbit, attitude = readings.orbit, readings.attitude
     usable: Instants | None = None
     if orbit.segments:
-        orbit, usable = _one_segment(readings, conventions)
+        orbit, usable = _single_segment(readings, conventions)
     fixes = _instants(orbit.file, orbit.clock, conventions.orbit_scale, conventions.orbit_offset)
     looks = _instants(attitude.file, attitude.clock, conventions.attitude_scale, conventions.attitude_offset)
     epoch = epoch or epoch_before(fixes)
-    time, turn_time = fixes.since(epoch), looks.since(epoch)
+    time, attitude_time = fixes.since(epoch), looks.since(epoch)
     inertial = {conventions.orbit_frame, conventions.attitude_frame} - {"ITRS", "orbital"}
     rotation = None
     if inertial:
@@ -190,7 +192,7 @@ def platform_table(readings: PlatformReadings, conventions: Conventions, epoch: 
             what = f"{' and '.join(sorted(inertial))} without Earth orientation"
             allowed = "`earth_orientation:` with a table, or `earth:` with UT1 - UTC and the pole"
             raise InputError(Issue(what, orbit.file, None, (), None, allowed))
-        first, last = min(time[0], turn_time[0]), max(time[-1], turn_time[-1])
+        first, last = min(time[0], attitude_time[0]), max(time[-1], attitude_time[-1])
         rotation = readings.earth.rotation(epoch, float(first), float(last))
     position, velocity = _in_itrs(orbit, conventions.orbit_frame, time, rotation)
     matrix = _body(attitude, conventions)
@@ -199,18 +201,18 @@ def platform_table(readings: PlatformReadings, conventions: Conventions, epoch: 
         flown = TabulatedTrajectory(
             PlatformTable.of(epoch, time, position, velocity, time[[0, -1]], unit), conventions.law
         )
-        known = flown.covers(turn_time)
+        known = flown.covers(attitude_time)
         if np.sum(known) < 2:
-            found = f"{turn_time[0]:.9g} s to {turn_time[-1]:.9g} s, and orbit from {flown.first:.9g} s"
+            found = f"{attitude_time[0]:.9g} s to {attitude_time[-1]:.9g} s, and orbit from {flown.first:.9g} s"
             allowed = "two or more attitude readings within the time span of the orbit, which defines their frame"
             raise InputError(Issue("attitude at times without orbit", attitude.file, None, (), found, allowed))
-        turn_time = turn_time[known]
-        matrix = flown.orbital_to_itrs(turn_time) @ matrix[known]
+        attitude_time = attitude_time[known]
+        matrix = flown.orbital_to_itrs(attitude_time) @ matrix[known]
     elif rotation is not None and conventions.attitude_frame != "ITRS":
-        matrix = to_itrs(conventions.attitude_frame, rotation)(turn_time) @ matrix
+        matrix = to_itrs(conventions.attitude_frame, rotation)(attitude_time) @ matrix
     quaternion = Rotation.from_matrix(matrix).as_quat(canonical=False)
     try:
-        table = PlatformTable.of(epoch, time, position, velocity, turn_time, quaternion)
+        table = PlatformTable.of(epoch, time, position, velocity, attitude_time, quaternion)
     except ValueError as error:
         raise InputError(Issue(str(error), orbit.file)) from None
     between = TabulatedTrajectory(table).interpolation_error
@@ -227,13 +229,13 @@ def platform_table(readings: PlatformReadings, conventions: Conventions, epoch: 
     return replace(table, usable=(float(first), float(last)))
 
 
-def _one_segment(readings: PlatformReadings, conventions: Conventions) -> tuple[OrbitReadings, Instants | None]:
+def _single_segment(readings: PlatformReadings, conventions: Conventions) -> tuple[OrbitReadings, Instants | None]:
     """Return the orbit segment that covers most attitude readings, and the instants between which it may be used."""
     orbit, attitude = readings.orbit, readings.attitude
     looks = _instants(attitude.file, attitude.clock, conventions.attitude_scale, conventions.attitude_offset)
     fixes = _instants(orbit.file, orbit.clock, conventions.orbit_scale, conventions.orbit_offset)
     start = epoch_before(fixes)
-    time, turn_time = fixes.since(start), looks.since(start)
+    time, attitude_time = fixes.since(start), looks.since(start)
     best, best_count, best_usable = orbit.segments[0], -1, None
     for segment in orbit.segments:
         usable = (
@@ -242,7 +244,7 @@ def _one_segment(readings: PlatformReadings, conventions: Conventions) -> tuple[
             else _instants(orbit.file, segment.usable, conventions.orbit_scale, conventions.orbit_offset)
         )
         first, last = (time[segment.first], time[segment.last]) if usable is None else usable.since(start)
-        count = int(np.sum(in_span(turn_time, first, last)))
+        count = int(np.sum(in_span(attitude_time, first, last)))
         if count > best_count:
             best, best_count, best_usable = segment, count, usable
     return replace(orbit.taken(slice(best.first, best.last + 1)), segments=()), best_usable
@@ -294,7 +296,7 @@ def _instants(file: str, clock: Readings, scale: str, offset: float) -> Instants
         raise InputError(problem.at(file)) from None
 
 
-def _stated(spec: Any, key: str, in_spec: str | None, in_file: str | None, what: str) -> str:
+def _of_file_or_test(spec: Any, key: str, in_spec: str | None, in_file: str | None, what: str) -> str:
     """Return the value of a convention; raise InputError if neither test file nor data file gives it or they differ."""
     if in_spec is None and in_file is None:
         raise spec.error(f"{what} is not specified, neither by the file nor here", (key,), allowed=f"`{key}:` here")
@@ -348,7 +350,7 @@ def _attitude(spec: AttitudeFileSpec, folder: Path) -> AttitudeReadings:
         if kind != "AEM":
             raise InputError(Issue("a CCSDS message of another kind", str(path), 1, (), kind, "AEM"))
         return orbit_files.read_aem(path, spec.satellite)
-    table = read_table(path, (*_CLOCK, *_TURN), 2)
+    table = read_table(path, (*_CLOCK, *_ATTITUDE_COLUMNS), 2)
     clock, scale = _clock(table, spec)
     sets = [names for names in (_NAMED, _PLACED, _ANGLES) if any(n in table for n in names)]
     if len(sets) != 1 or not all(name in table for name in sets[0]):

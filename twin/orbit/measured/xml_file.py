@@ -174,7 +174,7 @@ class Element:
             self._wrong("occurs more than once", tags, elements[1].line, f"{len(elements)} of them", "one")
         return elements[0] if elements else None
 
-    def one(self, *tags: str) -> Element:
+    def single(self, *tags: str) -> Element:
         """Return the only element at a path of tags below this element.
 
         Raises
@@ -196,7 +196,7 @@ class Element:
 
     def words(self, *tags: str) -> str:
         """Return the text of the element at a path of tags below this one; raise InputError if missing or empty."""
-        element = self.one(*tags)
+        element = self.single(*tags)
         if not element.text:
             element.wrong("the element is empty", None, "a value")
         return element.text
@@ -239,7 +239,7 @@ class Element:
         InputError
             The element is missing, is not a number, is out of bounds or has an unknown unit.
         """
-        element = self.one(*tags) if tags else self
+        element = self.single(*tags) if tags else self
         value = float(element.floats(1)[0])
         if unit is not None:
             name = element.attributes.get("unit", next(iter(unit)))
@@ -258,7 +258,7 @@ class Element:
         InputError
             The element is missing, is not a whole number or is out of bounds.
         """
-        element = self.one(*tags)
+        element = self.single(*tags)
         value = element.number(least=least, most=most)
         if value != round(value):
             element.wrong("not a whole number", shown(element.text), f"{least} to {most}")

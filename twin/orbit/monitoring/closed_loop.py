@@ -28,7 +28,7 @@ from analysis.monitor.kalman_filter import SeriesFilter
 from analysis.monitor.recovery import MeasuredSpots, Recovery, SpotEvidence, judged_spots
 from analysis.spots.centroid import mean_frames
 from analysis.spots.spot_positions import SpotError
-from analysis.statistics import chance_beyond, limit_of
+from analysis.statistics import limit_of, p_value_of
 from optics.geometry.tree import State, compose
 from optics.numerics.backend import cores, one_blas_thread
 from optics.numerics.number_tree import FrozenMap
@@ -347,7 +347,7 @@ class LoopCourse:
 
         The probability of a false alarm, over all readings, is `FALSE_ALARM`.
         """
-        p_value = chance_beyond(self.chi_square, self.model.prior.spots.shape[0])
+        p_value = p_value_of(self.chi_square, self.model.prior.spots.shape[0])
         beyond = np.flatnonzero(p_value < FALSE_ALARM / len(self.times))
         return int(beyond[0]) if len(beyond) else None
 

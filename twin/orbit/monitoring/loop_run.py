@@ -160,14 +160,14 @@ def imaged_pair(
     if np.count_nonzero(good) < _FEWEST:
         problem = f"line images: only {np.count_nonzero(good)} of {len(good)} points were matched"
         raise BenchError(problem, ("mechanisms", "images"), POINTS_REMEDY)
-    ground = patch.true_point(pair[1], *ties.lines[pair[1]].place[good].T)
+    ground = patch.true_point(pair[1], *ties.lines[pair[1]].position[good].T)
     should = np.stack(true[pair[0]].image(ground), axis=1)
     first_points, second_points = (
         (calibrated[name].corrected(changes[name]), ties.lines[name].image[good]) for name in pair
     )
     first, second = (
-        sightings(users[name], users[name].trajectory, *places.T)
-        for name, (_, places) in zip(pair, (first_points, second_points), strict=True)
+        sightings(users[name], users[name].trajectory, *points.T)
+        for name, (_, points) in zip(pair, (first_points, second_points), strict=True)
     )
     errors = check_errors(intersect_pair(first_points[0], second_points[0], first, second).ground, ground).error
     return ImagedPair(moment, errors, first_points[1] - should, ties.lines[pair[0]].median_sigma, len(good))
@@ -376,8 +376,8 @@ class LoopRun:
         }
 
     def _errors(self, outcome: LoopOutcome) -> dict[str, float]:
-        places = [(name, key) for name in self.model.cameras for key in (*PARAMETERS, "defocus")]
-        quantities = {f"{key} of {name}": rms(outcome.truth[:, self.model.row(name, key)]) for name, key in places}
+        names = [(name, key) for name in self.model.cameras for key in (*PARAMETERS, "defocus")]
+        quantities = {f"{key} of {name}": rms(outcome.truth[:, self.model.row(name, key)]) for name, key in names}
         soft = {f"MTF of {name}": 1.0 - float(mtf.min()) for name, mtf in outcome.mtf.items()}
         return {"angle": rms(outcome.true(outcome.angle)), "height": height_rms(outcome), **quantities, **soft}
 

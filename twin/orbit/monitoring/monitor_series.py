@@ -228,7 +228,7 @@ class MonitorSeries:
         self.reference = experiment.path.expected_photons([reference])
         self._clean_reference = self._reference_spots(experiment.expected_frames(self.reference))
         names = list(experiment.instrument.cameras)
-        self._own = np.concatenate([np.arange(4) + 4 * names.index(name) for name in pair])
+        self._pair_rows = np.concatenate([np.arange(4) + 4 * names.index(name) for name in pair])
 
     @property
     def estimator(self) -> str:
@@ -320,12 +320,12 @@ class MonitorSeries:
         cameras, (before, after) = self.experiment.cameras, measured.positions
         if prior is None:
             all_gains = LeastSquares().gain(Shifts(before, after, measured.covariance, cameras))
-            return np.asarray(all_gains[:, self._own])
+            return np.asarray(all_gains[:, self._pair_rows])
         gains = []
         for k, number in enumerate(numbers):
             single, span = slice(k, k + 1), prior.between(spec.reference_time, spec.times[number])
             shifts = Shifts(before[single], after[single], measured.covariance[single], cameras, span)
-            gains.append(Posterior().gain(shifts)[0, self._own])
+            gains.append(Posterior().gain(shifts)[0, self._pair_rows])
         return np.array(gains)
 
     def readings(self, measured: Measured, numbers: Sequence[int]) -> Readings:
@@ -346,7 +346,7 @@ class MonitorSeries:
             misfits = []
             for gain, number in zip(gains, numbers, strict=True):
                 span = prior.between(self.spec.reference_time, self.spec.times[number])
-                root = (gain @ span.spots - span.parameters[self._own]) @ span.root
+                root = (gain @ span.spots - span.parameters[self._pair_rows]) @ span.root
                 misfits.append(root @ root.T)
             total = noise + np.array(misfits)
         return Readings(self.pair, values, noise, total)
@@ -375,7 +375,7 @@ class MonitorSeries:
                 times,
                 reference=self.spec.reference_time,
             )
-        rows, smoothed = self._own, series.smoothed
+        rows, smoothed = self._pair_rows, series.smoothed
         block = np.ix_(np.arange(len(times)), rows, rows)
         return SmoothedReadings(
             Readings(self.pair, smoothed.values[:, rows], smoothed.noise[block], smoothed.total[block]),

@@ -76,8 +76,8 @@ def _write_report(setup: StudySetup, gradient: Gradient, folder: RunFolder, warn
         "the base's values; the design is not used.",
         f"{int((gradient.method == AD).sum())} of {gradient.method.size} entries are by automatic differentiation "
         "through "
-        f"the trace.{_agreement(gradient)} All other entries are differences. Spots are means of rays, which are the "
-        "energy centroids; estimators are applied to them.",
+        f"the trace.{_difference_text(gradient)} All other entries are differences. Spots are means of rays, which are "
+        "the energy centroids; estimators are applied to them.",
     )
     head, more = verdict(gradient)
     report = Report(
@@ -96,7 +96,7 @@ def _write_report(setup: StudySetup, gradient: Gradient, folder: RunFolder, warn
     )
 
 
-def _agreement(gradient: Gradient) -> str:
+def _difference_text(gradient: Gradient) -> str:
     if gradient.worst is None:
         return ""
     return (

@@ -97,7 +97,7 @@ def _rest(motion: Motion) -> Motion:
     return replace(motion, rotate=nothing, shift=nothing, scale=0.0, figure=FrozenMap({}))
 
 
-SPOT_REACH, SIGHT_REACH = 1.0, 1e-4
+SPOT_RANGE, SIGHT_RANGE = 1.0, 1e-4
 """Steps of the numerical derivatives of the formulas: of spot shifts in px, and of the line of sight in rad.
 
 They are so small that the error after Richardson's extrapolation is below rounding, and so large that rounding is below
@@ -154,11 +154,11 @@ class Chain:
         return np.swapaxes(self.experiment.sight.trace(states), 0, 1)
 
     @cached_property
-    def reach(self) -> float:
+    def sight_range(self) -> float:
         """Step by which lines of sight are rotated for a derivative, in radians; smaller for a narrow field."""
         ends = self.experiment.sight.nominal[:, 0, [0, -1]]
         half = 0.5 * np.linalg.norm(ends[:, 1] - ends[:, 0], axis=-1)
-        return float(min(SIGHT_REACH, SIGHT_SHARE * np.min(half)))
+        return float(min(SIGHT_RANGE, SIGHT_SHARE * np.min(half)))
 
     @cached_property
     def nominal(self) -> np.ndarray:
@@ -208,7 +208,7 @@ class Chain:
         sight : (cameras, points, 3) ndarray
             Derivative of the lines of sight, per unit of the factor.
         """
-        largest = max(np.abs(spots).max(initial=0.0) / SPOT_REACH, np.abs(sight).max() / self.reach)
+        largest = max(np.abs(spots).max(initial=0.0) / SPOT_RANGE, np.abs(sight).max() / self.sight_range)
         step = 1.0 / float(largest) if largest > 0.0 else 1.0
         positions, line = at
         return [
@@ -370,9 +370,7 @@ class GradientFactor:
             tree = self.setup.base
             try:
                 multipliers = ratios(self.spec, tree, np.array([value]), self.unit)
-                out.update(
-                    {place: scaled(number_of(leaf(tree, place)), float(r[0])) for place, r in multipliers.items()}
-                )
+                out.update({key: scaled(number_of(leaf(tree, key)), float(r[0])) for key, r in multipliers.items()})
             except Problem as problem:
                 raise self.setup.error(problem, ("factors", self.name)) from None
         return tuple(out.items())
@@ -381,13 +379,13 @@ class GradientFactor:
 def _in_base(setup: StudySetup, name: str, factor: FactorSpec, unit: str) -> float:
     """Return the factor's value in the base job, in its own unit; 1 for a factor that only scales other values."""
     numbers: list[float] = []
-    for k, place in enumerate(factor.places):
+    for k, key in enumerate(factor.places):
         try:
-            numbers.append(number_at(setup.base, place, unit))
+            numbers.append(number_at(setup.base, key, unit))
             # values that are written in several units agree to rounding
             if abs(numbers[k] - numbers[0]) > 1e-12 * abs(numbers[0]):
                 text = "the places of the factor have different values in the base"
-                raise Problem(text, shown(leaf(setup.base, place)), shown(leaf(setup.base, factor.places[0])))
+                raise Problem(text, shown(leaf(setup.base, key)), shown(leaf(setup.base, factor.places[0])))
         except Problem as problem:
             raise setup.error(problem, ("factors", name, *factor.key_of(k))) from None
     return numbers[0] if numbers else 1.0
@@ -398,7 +396,7 @@ MOVE = 2.0
 
 The CCDs have room for about ten pixels.
 """
-TURN = 1e-4
+ROTATION = 1e-4
 """Rotation of a line of sight, in radians, for which the finite-difference step is chosen where there are no spots.
 
 It corresponds to about ten pixels.
@@ -656,7 +654,7 @@ class _Traced:
         except InputError as error:
             raise self.setup.blamed(error) from None
         for k, factor in enumerate(self.factors):
-            if all(place[:2] == PERTURB for place, _ in factor.values(factor.value)):
+            if all(key[:2] == PERTURB for key, _ in factor.values(factor.value)):
                 slopes = motion_slopes(about, partial(self._state, chain, factor), PART * factor.spread)
                 if slopes is not None:
                     self.slopes[k] = slopes
@@ -732,7 +730,7 @@ class _Traced:
             table.scale[self.exact, k] = np.abs(terms).max(axis=1)
             limits = [CAP[motion.kind] / abs(slope) for motion, slope in slopes.items()]
             if slopes:
-                size = np.abs(moved).max() / MOVE if chain.experiment.monitored else np.abs(rotated).max() / TURN
+                size = np.abs(moved).max() / MOVE if chain.experiment.monitored else np.abs(rotated).max() / ROTATION
                 sizes[k] = float(min([1.0 / max(size, 1e-300), *limits]))
         self.advance(AD_PART, 1, 1)
         return sizes
@@ -743,7 +741,7 @@ class _Traced:
         The factor differs from its value in the base job by ``SHARES`` times the step.
         """
         jobs = [self._job(factor, share * step) for share in SHARES]
-        same = all(place[:2] == PERTURB for place, _ in factor.values(factor.value))
+        same = all(key[:2] == PERTURB for key, _ in factor.values(factor.value))
         try:
             if same:
                 outcomes = self._outcomes(chain, jobs, rows)

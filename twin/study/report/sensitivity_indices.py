@@ -288,8 +288,8 @@ def sensitivity_indices(runs: StudyRuns, response: Response) -> Indices | NoIndi
         return NoIndices("the response is constant")
     if not axes:
         return NoIndices("no factor varies")
-    stated = noise_share(response, runs.study)
-    noise = None if stated is None else stated.share
+    reported_noise = noise_share(response, runs.study)
+    noise = None if reported_noise is None else reported_noise.share
     if not runs.sampled:
         if not np.all(response.good):
             return NoIndices("runs of the grid are missing, and its variance cannot be decomposed")

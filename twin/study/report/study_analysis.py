@@ -417,8 +417,8 @@ def _finite(value: float | None) -> float | None:
 
 ESTIMATE: Record[Estimate] = Record(
     "A number with its 95% interval; null where the runs do not determine it.",
-    Quantity("value", lambda one: _finite(one.value), "the number"),
-    Quantity("interval", lambda one: [_finite(end) for end in one.interval], "lower and upper end"),
+    Quantity("value", lambda number: _finite(number.value), "the number"),
+    Quantity("interval", lambda number: [_finite(end) for end in number.interval], "lower and upper end"),
 )
 EFFECT: Record[statistics.Effect] = Record(
     "Effect of a factor on a response, by the linear model and by ranks.",
@@ -449,19 +449,23 @@ INDEX: Record[Index] = Record(
 )
 INDICES: Record[Indices] = Record(
     "Sobol indices of a response.",
-    Quantity("method", lambda found: found.method, "chaos or grid; null where there are none, with the reason"),
-    Quantity("degree", lambda found: found.degree, "of the polynomials, 0 for a grid"),
-    Quantity("terms", lambda found: found.terms, "number of polynomials, 0 for a grid"),
-    Quantity("held_out_r2", lambda found: found.held_out, "of runs that the model was not fitted to"),
-    Quantity("unexplained_share", lambda found: found.rest, "share of the variance that the model does not explain"),
-    Quantity("noise_share", lambda found: found.noise, "share of the variance that the runs report as noise"),
-    Quantity("factors", lambda found: {index.name: index for index in found.axes}, "by factor", record=INDEX),
+    Quantity("method", lambda analysis: analysis.method, "chaos or grid; null where there are none, with the reason"),
+    Quantity("degree", lambda analysis: analysis.degree, "of the polynomials, 0 for a grid"),
+    Quantity("terms", lambda analysis: analysis.terms, "number of polynomials, 0 for a grid"),
+    Quantity("held_out_r2", lambda analysis: analysis.held_out, "of runs that the model was not fitted to"),
+    Quantity(
+        "unexplained_share", lambda analysis: analysis.rest, "share of the variance that the model does not explain"
+    ),
+    Quantity("noise_share", lambda analysis: analysis.noise, "share of the variance that the runs report as noise"),
+    Quantity("factors", lambda analysis: {index.name: index for index in analysis.axes}, "by factor", record=INDEX),
 )
 CONVERGENCE: Record[Convergence] = Record(
     "Accuracy of a statistic of the runs.",
-    Quantity("relative_half_width", lambda one: one.relative, "half the interval over sigma of the response"),
-    Quantity("enough_runs", lambda one: one.enough, "true if that is below the goal"),
-    Quantity("runs_needed", lambda one: one.needed, "about how many runs would reach it"),
+    Quantity(
+        "relative_half_width", lambda convergence: convergence.relative, "half the interval over sigma of the response"
+    ),
+    Quantity("enough_runs", lambda convergence: convergence.enough, "true if that is below the goal"),
+    Quantity("runs_needed", lambda convergence: convergence.needed, "about how many runs would reach it"),
 )
 
 
@@ -469,19 +473,19 @@ CONVERGENCE: Record[Convergence] = Record(
 class _ResponseAnalysis:
     """Response, or reported sigma of one, with the analysis of the study that it belongs to."""
 
-    found: StudyAnalysis
+    analysis: StudyAnalysis
     of: Response
 
     @property
     def numbers(self) -> statistics.Description:
-        return self.found.descriptions[self.of.name]
+        return self.analysis.descriptions[self.of.name]
 
     @property
     def noise(self) -> statistics.NoiseShare | None:
-        return self.found.noise.get(self.of.name)
+        return self.analysis.noise.get(self.of.name)
 
     def sobol(self) -> dict[str, Any] | None:
-        indices = self.found.indices.get(self.of.name)
+        indices = self.analysis.indices.get(self.of.name)
         if isinstance(indices, NoIndices):
             return {"method": None, "reason": indices.reason}
         return None if indices is None else INDICES(indices)
@@ -518,12 +522,12 @@ RESPONSE: Record[_ResponseAnalysis] = Record(
         "true if that is compatible with the variance of the runs",
         where_known=True,
     ),
-    Quantity("linear_model", lambda a: a.found.linear[a.of.name], "null where none can be fitted", record=LINEAR),
-    Quantity("main_effects", lambda a: a.found.effects[a.of.name], "of a grid", record=MAIN_EFFECT),
+    Quantity("linear_model", lambda a: a.analysis.linear[a.of.name], "null where none can be fitted", record=LINEAR),
+    Quantity("main_effects", lambda a: a.analysis.effects[a.of.name], "of a grid", record=MAIN_EFFECT),
     Quantity("sobol", _ResponseAnalysis.sobol, "sensitivity indices, where the study asks for them", where_known=True),
     Quantity(
         "convergence",
-        lambda a: {one.name: one for one in a.found.convergences.get(a.of.name, ())},
+        lambda a: {convergence.name: convergence for convergence in a.analysis.convergences.get(a.of.name, ())},
         "convergence of the statistics",
         record=CONVERGENCE,
     ),
@@ -550,17 +554,21 @@ FRONT: Record[ParetoFront] = Record(
 )
 STATISTICS: Record[StudyAnalysis] = Record(
     "statistics.json: numbers of a study's report; null where the runs do not determine a number.",
-    Quantity("name", lambda found: found.runs.study.name, "of the study"),
-    Quantity("design", lambda found: found.runs.kind, "kind of the design"),
-    Quantity("runs", lambda found: found.runs.count, "number of runs"),
-    Quantity("failed", lambda found: found.runs.failed.sum(), "runs that failed"),
-    Quantity("confidence", lambda found: statistics.CONFIDENCE, "of all intervals"),
+    Quantity("name", lambda analysis: analysis.runs.study.name, "of the study"),
+    Quantity("design", lambda analysis: analysis.runs.kind, "kind of the design"),
+    Quantity("runs", lambda analysis: analysis.runs.count, "number of runs"),
+    Quantity("failed", lambda analysis: analysis.runs.failed.sum(), "runs that failed"),
+    Quantity("confidence", lambda analysis: statistics.CONFIDENCE, "of all intervals"),
     Quantity(
         "responses",
-        lambda found: {one.name: _ResponseAnalysis(found, one) for one in found.runs.everything},
+        lambda analysis: {
+            response.name: _ResponseAnalysis(analysis, response) for response in analysis.runs.everything
+        },
         "responses, and the sigmas that the runs report for them",
         record=RESPONSE,
     ),
-    Quantity("requirements", lambda found: found.requirements, "in the study's order, then all", record=REQUIREMENT),
-    Quantity("pareto", lambda found: found.fronts, "of the pairs that the study asks for", record=FRONT),
+    Quantity(
+        "requirements", lambda analysis: analysis.requirements, "in the study's order, then all", record=REQUIREMENT
+    ),
+    Quantity("pareto", lambda analysis: analysis.fronts, "of the pairs that the study asks for", record=FRONT),
 )

@@ -300,7 +300,7 @@ def _points(axes: Axes, x: Series, y: Series, seed: int) -> None:
     axes.plot(x_positions[shown], y_positions[shown], ".", color=BLUE, ms=dot_size(len(shown)), alpha=0.7)
 
 
-_WAYS = {"min": "small is good", "max": "large is good"}
+_BEST_TEXTS = {"min": "small is good", "max": "large is good"}
 
 
 def pareto_figure(analysis: StudyAnalysis) -> Figure:
@@ -326,8 +326,8 @@ def pareto_figure(analysis: StudyAnalysis) -> Figure:
             point = (front.x[front.knee], front.y[front.knee])
             label = f"knee, run {front.runs[front.knee]}"
             axes.plot(*point, "D", color=VERMILION, ms=8, mfc="none", mew=1.6, label=label)
-        axes.set_xlabel(f"{x.label} ({_WAYS[front.spec.best_x]})")
-        axes.set_ylabel(f"{y.label} ({_WAYS[front.spec.best_y]})")
+        axes.set_xlabel(f"{x.label} ({_BEST_TEXTS[front.spec.best_x]})")
+        axes.set_ylabel(f"{y.label} ({_BEST_TEXTS[front.spec.best_y]})")
         finish(axes)
         if np.any(front.ranks >= 0):
             axes.legend(loc="lower left", bbox_to_anchor=(0.0, 1.04), ncols=3)

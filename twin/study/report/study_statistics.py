@@ -154,9 +154,9 @@ class StudyRuns:
         responses, sigmas = [], []
         for name, response in study.responses.items():
             unit = str(data[name].attrs.get("units", ""))
-            stated = {ending: data[f"{name}{ending}"].values.astype(np.float64) for ending in response.sigma_keys}
-            responses.append(Response(name, unit, data[name].values.astype(np.float64), stated.get(NOISE)))
-            reported = [Response(f"{name}{ending}", unit, sigma, None, name) for ending, sigma in stated.items()]
+            sigma_values = {ending: data[f"{name}{ending}"].values.astype(np.float64) for ending in response.sigma_keys}
+            responses.append(Response(name, unit, data[name].values.astype(np.float64), sigma_values.get(NOISE)))
+            reported = [Response(f"{name}{ending}", unit, sigma, None, name) for ending, sigma in sigma_values.items()]
             sigmas += [series for series in reported if not series.constant]
         messages = tuple(str(m) for m in data["message"].values.tolist()) if "message" in data else ()
         doubts = tuple(str(m) for m in data["doubt"].values.tolist()) if "doubt" in data else ()
@@ -411,19 +411,19 @@ class NoiseShare:
     share : float
         Mean of the reported noise variances divided by the variance of the runs; slightly above 1 by chance if only
         noise varies.
-    chance : float
+    p_value : float
         p-value: probability of a variance over the runs as small as this one or smaller, if nothing but the reported
         noise varied.
     """
 
     response: str
     share: float
-    chance: float
+    p_value: float
 
     @property
     def possible(self) -> bool:
         """True if the reported noise is compatible with the variance of the runs."""
-        return self.chance >= FALSE_ALARM
+        return self.p_value >= FALSE_ALARM
 
 
 def noise_share(response: Response, study: StudySpec) -> NoiseShare | None:
@@ -443,12 +443,12 @@ def noise_share(response: Response, study: StudySpec) -> NoiseShare | None:
     # noise common to all runs does not contribute to their variance
     if response.noise is None or study.noise == "shared" or response.constant:
         return None
-    stated = response.noise[response.good] ** 2
-    stated = stated[np.isfinite(stated)]
-    if len(stated) < 2 or not np.any(stated):
+    variances = response.noise[response.good] ** 2
+    variances = variances[np.isfinite(variances)]
+    if len(variances) < 2 or not np.any(variances):
         return None
-    share = float(np.mean(stated) / np.var(response.known, ddof=1))
-    freedom = (len(stated) - 1) * float(np.mean(stated) ** 2 / np.mean(stated**2))
+    share = float(np.mean(variances) / np.var(response.known, ddof=1))
+    freedom = (len(variances) - 1) * float(np.mean(variances) ** 2 / np.mean(variances**2))
     return NoiseShare(response.name, share, float(stats.chi2.cdf(freedom / share, freedom)))
 
 

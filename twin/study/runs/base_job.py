@@ -130,9 +130,9 @@ class ProcedureBase:
 
     def evaluate(self, tree: Tree, runs: Sequence[Run], backend: Backend) -> list[Outcome]:
         """Return the results of every run, or the reason of its failure; runs are evaluated one after the other."""
-        return [self._one(tree, run, backend) for run in runs]
+        return [self._outcome(tree, run, backend) for run in runs]
 
-    def _one(self, tree: Tree, run: Run, backend: Backend) -> Outcome:
+    def _outcome(self, tree: Tree, run: Run, backend: Backend) -> Outcome:
         try:
             setup: Any = validate(self.model, YamlFile("", with_values(tree, run.values), {}))
             done = self.procedure.run(setup, backend, setup.test.seed if run.seed is None else run.seed, silent)
@@ -156,7 +156,7 @@ Tree = dict[str, Any]
 """Plain data of a job: nested mappings, lists and single values."""
 
 
-def with_place(tree: Tree, model: type[Spec], key: KeyPath, neutral: bool = False) -> Tree:
+def with_entry(tree: Tree, model: type[Spec], key: KeyPath, neutral: bool = False) -> Tree:
     """Return a job's plain data in which the key path ``key`` exists; missing optional parts get their defaults.
 
     Parameters
@@ -197,7 +197,7 @@ def with_place(tree: Tree, model: type[Spec], key: KeyPath, neutral: bool = Fals
 
 
 def is_neutral(tree: Tree, model: type[Spec], key: KeyPath) -> bool:
-    """Return True if the entries that ``with_place`` adds to reach ``key`` do not change the job's results.
+    """Return True if the entries that ``with_entry`` adds to reach ``key`` do not change the job's results.
 
     Parameters
     ----------

@@ -131,7 +131,7 @@ def _block(setup: StudySetup, backend: Backend, runs: Sequence[Run]) -> tuple[Bl
 def _prepared(task: Task) -> tuple[StudySetup, Backend]:
     if task.source != source_digest():
         raise OtherProgramError("the worker has other source files than the command: changed since it was started?")
-    _one_thread()
+    _limit_threads()
     return _setup(task.config), load_backend(task.backend)
 
 
@@ -140,7 +140,7 @@ def _setup(config: str) -> StudySetup:
     return study_from_text(config)
 
 
-def _one_thread() -> None:
+def _limit_threads() -> None:
     """Limit the numerical libraries of this process to one thread, since there are as many workers as cores.
 
     For workers started outside this program the environment variables come too late, so the libraries are limited
@@ -189,7 +189,7 @@ class Engine:
         Array backend of the ray trace.
     advance : callable
         Function that receives the numbers of finished and of all runs.
-    say : callable
+    notify : callable
         Function that receives the estimate of time and memory after the first block.
     warn : callable
         Function that receives warnings.
@@ -203,7 +203,7 @@ class Engine:
     journal: Journal
     backend: str = "llvm"
     advance: Callable[[int, int], None] = lambda done, total: None
-    say: Callable[[str], None] = lambda text: None
+    notify: Callable[[str], None] = lambda text: None
     warn: Callable[[str], None] = lambda text: None
     computed: int = 0
     seconds: float = 0.0
@@ -229,14 +229,14 @@ class Engine:
         """Return the results of all runs, in order; no block may be missing."""
         return BlockResult.joined([known for block in range(self.plan.blocks) if (known := self._known(block))])
 
-    def run(self, workers: cluster.Workers, own_memory: float = 0.0) -> None:
+    def run(self, workers: cluster.Workers, main_memory: float = 0.0) -> None:
         """Compute all missing blocks.
 
         Parameters
         ----------
         workers : cluster.Workers
             Worker processes.
-        own_memory : float
+        main_memory : float
             Memory of this process, bytes, for the estimate.
 
         Raises
@@ -256,7 +256,7 @@ class Engine:
             return
         there = self.plan.runs - self._runs(missing)
         first = self._first(workers, missing[0])
-        self._estimate(first, missing, there, max(1, workers.count), own_memory)
+        self._estimate(first, missing, there, max(1, workers.count), main_memory)
         self.advance(there + self.computed, self.plan.runs)
         suspects = self._all(workers, missing[1:], there)
         # a block is blamed only when it is alone, for the scheduler suspects all that a worker had when it died
@@ -268,18 +268,18 @@ class Engine:
     def _runs(self, blocks: Sequence[int]) -> int:
         return sum(len(self.plan.block(block)) for block in blocks)
 
-    def _estimate(self, first: Pilot, missing: Sequence[int], there: int, workers: int, own_memory: float) -> None:
+    def _estimate(self, first: Pilot, missing: Sequence[int], there: int, workers: int, main_memory: float) -> None:
         """Report the estimated time and memory of the study, from its first block."""
         runs = self._runs(missing)
         seconds_per_run = first.result.seconds / len(first.result.messages)
         seconds = -(-(len(missing) - 1) // workers) * first.result.seconds + first.start_seconds * (workers > 1)
-        memory, limit = own_memory + workers * first.memory, self.plan.setup.study.limits
+        memory, limit = main_memory + workers * first.memory, self.plan.setup.study.limits
         if memory > limit.bytes:
             self.warn(
                 f"the processes need about {1e-9 * memory:.1f} GB, more than the study's {limit.memory}; use fewer "
                 "--workers"
             )
-        self.say(
+        self.notify(
             f"{runs} runs{f' ({there} already done)' if there else ''} in {len(missing)} blocks on {workers} "
             f"worker{'s' if workers > 1 else ''}; about {time_text(seconds)}, {1e-9 * memory:.1f} GB; "
             f"{1e3 * seconds_per_run:.3g} ms a run"
@@ -360,10 +360,10 @@ def check_responses(setup: StudySetup, sample: Any) -> None:
             try:
                 base_job.check_response(sample, path)
             except Problem as problem:
-                place: KeyPath = ("responses", name, key)
+                key_path: KeyPath = ("responses", name, key)
                 text = f"the results of {setup.study.base.command!r} do not have this: {problem.problem}"
                 restated = Problem(text, problem.found, problem.allowed, problem.suggestion, problem.within)
-                raise setup.error(restated, place) from None
+                raise setup.error(restated, key_path) from None
             if key == "noise":
                 _check_noise(setup, sample, name, path)
 

@@ -59,21 +59,21 @@ def draw(study: StudySpec) -> dict[str, np.ndarray]:
     axes = axes_of(study)
     if study.design.kind == GRID:
         sizes = [levels(study.factors[axis[0]]) for axis in axes]
-        places = np.unravel_index(np.arange(run_count(study)), sizes)
+        indices = np.unravel_index(np.arange(run_count(study)), sizes)
         return {
-            name: _level(study.factors[name], place) for axis, place in zip(axes, places, strict=True) for name in axis
+            name: _level(study.factors[name], index) for axis, index in zip(axes, indices, strict=True) for name in axis
         }
     cube = unit_cube(study.design.kind, run_count(study), len(axes), study.design.seed)
     return {name: _quantile(study.factors[name], cube[:, k]) for k, axis in enumerate(axes) for name in axis}
 
 
-def _level(factor: FactorSpec, place: np.ndarray) -> np.ndarray:
+def _level(factor: FactorSpec, index: np.ndarray) -> np.ndarray:
     if factor.kind in _LISTS:
-        return place
+        return index
     if factor.kind != "range":
         raise KeyError(f"a factor of kind {factor.kind!r} cannot be counted")
     low, high = factor.numbers().values
-    return np.asarray(np.linspace(low, high, factor.count or 2)[place])
+    return np.asarray(np.linspace(low, high, factor.count or 2)[index])
 
 
 def _quantile(factor: FactorSpec, u: np.ndarray) -> np.ndarray:
@@ -167,9 +167,9 @@ class Scaling:
 
         ``values`` maps key paths to values and is changed in place.
         """
-        for place, ratio in self.ratio.items():
-            number = number_of(values[place]) if place in values else self.base[place]
-            values[place] = scaled(number, float(ratio[run]))
+        for key, ratio in self.ratio.items():
+            number = number_of(values[key]) if key in values else self.base[key]
+            values[key] = scaled(number, float(ratio[run]))
 
 
 def scaled(number: tuple[float | int, str], ratio: float) -> Any:
@@ -229,14 +229,14 @@ def _nominal(factor: FactorSpec, tree: Tree, unit: str) -> float:
     return number
 
 
-def number_at(base: Tree, place: KeyPath, unit: str) -> float:
+def number_at(base: Tree, key: KeyPath, unit: str) -> float:
     """Return the number that the base job has at a factor's key, in a unit.
 
     Parameters
     ----------
     base : dict
         Plain data of the base job, without values of factors.
-    place : KeyPath
+    key : KeyPath
         Key path of the factor.
     unit : str
         Unit of the factor's numbers, empty for pure numbers.
@@ -247,7 +247,7 @@ def number_at(base: Tree, place: KeyPath, unit: str) -> float:
         The base job has no value there, or one of a different kind.
     """
     try:
-        value = leaf(base, place)
+        value = leaf(base, key)
     except Problem:
         value = None
     number = None if value is None else number_in(value, unit)
@@ -381,8 +381,8 @@ class Plan:
                     base[scale.key] = number_of(leaf(self.setup.tree, scale.key))
                 except Problem as problem:
                     raise self.setup.error(problem, ("factors", column.name, "scales", k, "key")) from None
-            for place, multipliers in self._ratios(column, column.values).items():
-                ratio[place] = ratio[place] * multipliers if place in ratio else multipliers
+            for key, multipliers in self._ratios(column, column.values).items():
+                ratio[key] = ratio[key] * multipliers if key in ratio else multipliers
         return Scaling(base, ratio)
 
     def _ratios(self, column: Column, values: np.ndarray) -> dict[KeyPath, np.ndarray]:
@@ -404,7 +404,7 @@ class Plan:
     def run(self, number: int) -> Run:
         """Return one run: its number, its values for the base job, and its seed."""
         factors = self.setup.study.factors
-        values = {place: c.cell(number) for c in self.columns for place in factors[c.name].places}
+        values = {key: c.cell(number) for c in self.columns for key in factors[c.name].places}
         self.scaling.apply(values, number)
         return Run(number, tuple(values.items()), None if self.seeds is None else int(self.seeds[number]))
 
@@ -424,10 +424,8 @@ class Plan:
             for value in _telling(column, extremes(factor)):
                 cell = with_unit(value, column.unit) if column.unit else value
                 multipliers = self._ratios(column, np.array([value]))
-                follow = [
-                    (place, scaled(self.scaling.base[place], float(ratio[0]))) for place, ratio in multipliers.items()
-                ]
-                self._check_value(column.name, [*((place, cell) for place in factor.places), *follow])
+                follow = [(key, scaled(self.scaling.base[key], float(ratio[0]))) for key, ratio in multipliers.items()]
+                self._check_value(column.name, [*((key, cell) for key in factor.places), *follow])
 
     def _check_value(self, name: str, values: list[tuple[Any, Any]]) -> None:
         tree = with_values(self.setup.tree, values)

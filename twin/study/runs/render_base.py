@@ -206,8 +206,8 @@ class RenderBase:
         for (name, *_), members in groups.items():
             experiment = used[name]
 
-            def before(frames: int, seed: int, name: str = name, one: MonitorExperiment = experiment) -> np.ndarray:
-                return self._frames_before(name, one, frames, seed)
+            def before(frames: int, seed: int, name: str = name, pair: MonitorExperiment = experiment) -> np.ndarray:
+                return self._frames_before(name, pair, frames, seed)
 
             pairs = [work for _, work in members]
             done = (

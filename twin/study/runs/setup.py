@@ -25,7 +25,7 @@ from scenes.yaml.errors import InputError, Issue, KeyPath, Problem, key_text, na
 from scenes.yaml.input_file import is_file, unusable
 from scenes.yaml.spec import Source, Spec, validate
 from twin.framework.provenance import source_digest, versions
-from twin.study.runs.base_job import BaseJob, ProcedureBase, Tree, is_neutral, with_place, with_values
+from twin.study.runs.base_job import BaseJob, ProcedureBase, Tree, is_neutral, with_entry, with_values
 
 PROGRAM = "twin.study"
 BY_NAME = ("instrument", "disturbances")
@@ -102,13 +102,13 @@ class StudySetup:
         source = self.study.source
         return replace(issue, file=source.file, line=source.line(key), key=(*source.prefix, *key))
 
-    def factor_at(self, place: KeyPath) -> tuple[str, KeyPath] | None:
-        """Return name and key of the factor that sets the base job's value at ``place``, or above or below it."""
+    def factor_at(self, key: KeyPath) -> tuple[str, KeyPath] | None:
+        """Return name and key of the factor that sets the base job's value at ``key``, or above or below it."""
         for name, factor in self.study.factors.items():
             scaled = [(scale.key, ("scales", k)) for k, scale in enumerate(factor.scales)]
             for changed, where in (*((p, factor.key_of(k)) for k, p in enumerate(factor.places)), *scaled):
-                n = min(len(changed), len(place))
-                if changed[:n] == tuple(place)[:n]:
+                n = min(len(changed), len(key))
+                if changed[:n] == tuple(key)[:n]:
                     return name, ("factors", name, *where)
         return None
 
@@ -210,56 +210,56 @@ def _placed(study: StudySpec, tree: Tree) -> StudySetup:
     model = setup.job.model
     changed: list[tuple[KeyPath, KeyPath, bool]] = []
     for name, factor in study.factors.items():
-        changed += [(place, ("factors", name, *factor.key_of(k)), True) for k, place in enumerate(factor.places)]
+        changed += [(key, ("factors", name, *factor.key_of(k)), True) for k, key in enumerate(factor.places)]
     for name, factor in study.factors.items():
         changed += [(s.key, ("factors", name, "scales", k, "key"), False) for k, s in enumerate(factor.scales)]
-    for place, at, is_set in changed:
+    for key, at, is_set in changed:
         try:
-            _refuse_names(study, place)
-            tree = with_place(tree, model, place, neutral=is_set)
-            if is_neutral(base, model, place) and not _inherited(base, place):
-                base = with_place(base, model, place, neutral=is_set)
+            _refuse_names(study, key)
+            tree = with_entry(tree, model, key, neutral=is_set)
+            if is_neutral(base, model, key) and not _inherited(base, key):
+                base = with_entry(base, model, key, neutral=is_set)
         except Problem as problem:
             raise setup.error(problem, at) from None
     # an entry created for one factor may need the value of another to be valid
-    tree = with_values(tree, [(place, f.scalars()[-1]) for f in study.factors.values() for place in _unset(tree, f)])
+    tree = with_values(tree, [(key, f.scalars()[-1]) for f in study.factors.values() for key in _unset(tree, f)])
     return StudySetup(study, tree, base)
 
 
-def _inherited(base: Tree, place: KeyPath) -> bool:
+def _inherited(base: Tree, key: KeyPath) -> bool:
     """Return True for a key of a body's temperature if the body inherits it from the heated body that carries it."""
-    if place[:2] != ("job", "perturb") or place[3:4] != ("temperature",):
+    if key[:2] != ("job", "perturb") or key[3:4] != ("temperature",):
         return False
-    perturb, node = base["job"].get("perturb", {}), str(place[2])
+    perturb, node = base["job"].get("perturb", {}), str(key[2])
     warmed = {path for path, perturbation in perturb.items() if "temperature" in perturbation}
     warmed |= set(base["job"].get("course", {}).get("temperature", {}))
     return node not in warmed and any(node.startswith(f"{path}/") for path in warmed)
 
 
-def _refuse_names(study: StudySpec, place: KeyPath) -> None:
+def _refuse_names(study: StudySpec, key: KeyPath) -> None:
     """Raise Problem for a factor that would change the name of a file that has already been read."""
-    if study.base.command == "render" and place[:1] == ("job",) and place[1:2] and place[1] in BY_NAME:
+    if study.base.command == "render" and key[:1] == ("job",) and key[1:2] and key[1] in BY_NAME:
         text = "this file has already been read, vary its contents instead"
-        raise Problem(text, key_text(place), f"a key that begins with {place[1]}, without job", within=(0,))
-    if "deformation" in place:
+        raise Problem(text, key_text(key), f"a key that begins with {key[1]}, without job", within=(0,))
+    if "deformation" in key:
         text = "a table of displaced nodes is part of the base, and a study does not vary it"
-        raise Problem(text, key_text(place), "another key of perturb: rotate, shift, scale, figure or temperature")
-    if "finishes" in place and place[-1] in ("table", "sha256"):
-        raise Problem("a table of a finish is part of the base, and a study does not vary it", key_text(place))
-    if "temperature" in place[:-1] and place[-1] in HEAT_KEYS:
+        raise Problem(text, key_text(key), "another key of perturb: rotate, shift, scale, figure or temperature")
+    if "finishes" in key and key[-1] in ("table", "sha256"):
+        raise Problem("a table of a finish is part of the base, and a study does not vary it", key_text(key))
+    if "temperature" in key[:-1] and key[-1] in HEAT_KEYS:
         text = "a table of temperatures is part of the base, and a study does not vary it"
-        raise Problem(text, key_text(place), "change or gradient, which are added to the table")
+        raise Problem(text, key_text(key), "change or gradient, which are added to the table")
 
 
 def _unset(tree: Tree, factor: FactorSpec) -> list[KeyPath]:
     """Return the key paths of a factor that have no value in the base job yet."""
     out = []
-    for place in factor.places:
+    for key in factor.places:
         node: Any = tree
-        for part in place:
+        for part in key:
             node = node[part]
         if node is None:
-            out.append(place)
+            out.append(key)
     return out
 
 
@@ -277,8 +277,8 @@ def _with_tables(study: StudySpec) -> StudySpec:
         key: KeyPath = ("factors", name, "table")
         table = factor.table
         if table.file not in tables:
-            place = Path(study.source.file).parent / table.file
-            tables[table.file] = _read_table(study, place, key, named[table.file])
+            path = Path(study.source.file).parent / table.file
+            tables[table.file] = _read_table(study, path, key, named[table.file])
         columns = tables[table.file]
         new = factor.model_copy(update={"table": table.model_copy(update={"values": tuple(columns[table.column])})})
         try:
@@ -322,22 +322,22 @@ def _read_table(study: StudySpec, path: Path, key: KeyPath, named: Mapping[str, 
         heads = [head.strip() for head in next(rows, [])]
         if heads and (missing := [column for column in named if column not in heads]):
             text, allowed, meant = "no such column", names_text(heads), nearest(missing[0], heads)
-            place = (*named[missing[0]], "column")
-            raise study.error(text, place, found=missing[0], allowed=allowed, suggestion=meant)
+            key_path = (*named[missing[0]], "column")
+            raise study.error(text, key_path, found=missing[0], allowed=allowed, suggestion=meant)
         checked(1, heads)
         # of columns of one name the last
-        places = {head: k for k, head in enumerate(heads) if head in named}
-        columns = {head: [] for head in places}
-        most = MOST_CELLS // max(len(places), 1)
+        column_of = {head: k for k, head in enumerate(heads) if head in named}
+        columns = {head: [] for head in column_of}
+        most = MOST_CELLS // max(len(column_of), 1)
         for number, row in enumerate(rows, 2):
             if len(row) != len(heads):
                 text = f"row {number} of the table {path} has {len(row)} cells, the first {len(heads)}"
                 raise wrong(text, "as many cells in every row as names in the first")
             if number > most + 1:
-                allowed = f"at most {most} with {len(places)} of its columns; draw from a distribution beyond that"
+                allowed = f"at most {most} with {len(column_of)} of its columns; draw from a distribution beyond that"
                 raise wrong(f"the table {path} has too many rows for a study", allowed)
-            checked(number, [row[k] for k in places.values()])
-            for head, k in places.items():
+            checked(number, [row[k] for k in column_of.values()])
+            for head, k in column_of.items():
                 columns[head].append(_cell(row[k]))
     except csv.Error as error:
         raise wrong(f"the table {path} cannot be read: {error}", "a CSV file") from None

@@ -95,24 +95,24 @@ class Ingest:
             if isinstance(item, Refusal):
                 refused.append((item, item.entry.digest if item.entry else None))
                 continue
-            one, digest = next(digests)
-            stream = (one.kind, one.subject)
+            new_entry, digest = next(digests)
+            stream = (new_entry.kind, new_entry.subject)
             if digest in known:
                 again += 1
-            elif reason := self._refusal_reason(one):
-                refused.append((Refusal(reason, one.line, one), digest))
+            elif reason := self._refusal_reason(new_entry):
+                refused.append((Refusal(reason, new_entry.line, new_entry), digest))
                 continue
             else:
-                new_entries.append((one, digest))
+                new_entries.append((new_entry, digest))
                 known.add(digest)
-                if one.kind == "monitor" and self.first is None:
-                    self.first = (utc_text(one.time), _before(one.content))
-            self.seen[stream] = max(one.time, self.seen.get(stream, one.time))
+                if new_entry.kind == "monitor" and self.first is None:
+                    self.first = (utc_text(new_entry.time), _before(new_entry.content))
+            self.seen[stream] = max(new_entry.time, self.seen.get(stream, new_entry.time))
         before = source is not None
         fresh = self._new_refusals(content, refused, before)
         if new_entries or fresh or not before:
             self.write(content, source_digest, None if source is None else int(source[0]), new_entries, fresh)
-        refusals_made = tuple((one.line, one.reason) for one, _ in refused)
+        refusals_made = tuple((new_entry.line, new_entry.reason) for new_entry, _ in refused)
         return IngestResult(content.file, len(new_entries), again, refusals_made, before, len(refused) - len(fresh))
 
     def _new_refusals(
@@ -124,13 +124,15 @@ class Ingest:
         grows.
         """
         out = {
-            digest_of_data([entry] if entry else [content.file, content.meaning, one.line, one.reason]): (one, entry)
-            for one, entry in refused
+            digest_of_data(
+                [entry] if entry else [content.file, content.meaning, new_refusal.line, new_refusal.reason]
+            ): (new_refusal, entry)
+            for new_refusal, entry in refused
             if entry or not before  # the same file at any path
         }
         known = self._present(REFUSED.c.sha256, list(out))
         readings = self._present(REFUSED.c.entry, [entry for _, entry in out.values() if entry])
-        return {key: own for key, own in out.items() if key not in known and own[1] not in readings}
+        return {key: refusal for key, refusal in out.items() if key not in known and refusal[1] not in readings}
 
     def _present(self, column: Any, digests: list[str]) -> set[str]:
         """Return those of the given digests that a column of the database contains."""
@@ -236,31 +238,31 @@ class Ingest:
         rows = [
             {
                 "sha256": digest,
-                "kind": one.kind,
-                "subject": one.subject,
-                "time_us": one.time,
-                "time_utc": utc_text(one.time),
-                "content": canonical(one.content),
+                "kind": refusal.kind,
+                "subject": refusal.subject,
+                "time_us": refusal.time,
+                "time_utc": utc_text(refusal.time),
+                "content": canonical(refusal.content),
                 "source_id": source,
-                "line": one.line,
-                "origin": one.origin or None,
+                "line": refusal.line,
+                "origin": refusal.origin or None,
             }
-            for one, digest in new_entries
+            for refusal, digest in new_entries
         ]
         self._insert(ENTRY, rows)
         if rows:  # checkpoints after the earliest new entry do not contain it
-            earliest = min(one.time for one, _ in new_entries)
+            earliest = min(refusal.time for refusal, _ in new_entries)
             self.connection.execute(delete(CHECKPOINT).where(CHECKPOINT.c.time_us >= earliest))
         refusals_made = [
             {
                 "sha256": key,
                 "source_id": source,
-                "line": one.line,
-                "reason": one.reason,
+                "line": refusal.line,
+                "reason": refusal.reason,
                 "entry": entry,
                 "refused_utc": moment,
             }
-            for key, (one, entry) in refused.items()
+            for key, (refusal, entry) in refused.items()
         ]
         self._insert(REFUSED, refusals_made)
 
@@ -275,7 +277,7 @@ def _before(content: Mapping[str, Any]) -> Before:
     for camera, channels in (content["numbers"].get("spots") or {}).items():
         for channel, spot in channels.items():
             for axis in ("row", "column"):
-                place, sigma = (spot.get("before", {}).get(key) for key in (axis, f"{axis}_sigma"))
-                if place is not None and sigma:
-                    out[camera, channel, axis] = (float(place), float(sigma))
+                position, sigma = (spot.get("before", {}).get(key) for key in (axis, f"{axis}_sigma"))
+                if position is not None and sigma:
+                    out[camera, channel, axis] = (float(position), float(sigma))
     return out
