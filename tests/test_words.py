@@ -12,10 +12,10 @@ OPENINGS = re.compile(r"(Of|The same|As|Its|What|Whether)\b(?!-)")
 
 
 def retired_words() -> set[str]:
-    """Return the words that the glossary's table "Retired words" marks as retired in identifiers."""
+    """Return what the glossary's table "Retired words" marks as retired in identifiers, such as ``left_out``."""
     table = (ROOT / "docs/glossary.md").read_text("utf-8").split("## Retired words")[1]
     rows = [[cell.strip() for cell in line.split("|")[1:-1]] for line in table.splitlines() if line.startswith("|")]
-    return {word for row in rows if row[2] == "yes" for word in re.findall(r"\w+", row[0])}
+    return {text.strip().replace(" ", "_") for row in rows if row[2] == "yes" for text in re.split("[,/]", row[0])}
 
 
 def identifiers(tree: ast.AST) -> Iterator[tuple[str, int]]:
@@ -35,7 +35,8 @@ def identifiers(tree: ast.AST) -> Iterator[tuple[str, int]]:
 def offences(source: str, retired: set[str]) -> list[str]:
     """Return the identifiers of a source text that contain a retired word, and its docstrings that are fragments."""
     tree = ast.parse(source)
-    names = [f"{line}: {name}" for name, line in identifiers(tree) if retired & set(name.lower().split("_"))]
+    words = re.compile(f"(^|_)({'|'.join(sorted(retired))})(_|$)")
+    names = [f"{line}: {name}" for name, line in identifiers(tree) if words.search(name.lower())]
     documented = (ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)
     texts = [(node, ast.get_docstring(node) or "") for node in ast.walk(tree) if isinstance(node, documented)]
     return names + [f"{getattr(node, 'lineno', 1)}: {text[:60]}" for node, text in texts if OPENINGS.match(text)]
@@ -55,3 +56,4 @@ def test_a_retired_word_is_noticed() -> None:
     assert len(offences(source, {"told", "untold"})) == 4
     assert offences('def fit():\n    """Fit."""\n    told_by = "told"\n', {"told"}) == ["3: told_by"]
     assert not offences('def fit():\n    """Assemble a fit."""\n    toldness = {"told": 1}\n', {"told"})
+    assert offences("_left_out = left = out = 1\n", {"left_out"}) == ["1: _left_out"]

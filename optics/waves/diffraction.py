@@ -557,7 +557,7 @@ class PixelResponse:
     def apply(self, images: np.ndarray) -> np.ndarray:
         """Return the filtered images, smaller by ``half_width`` pixels on every side.
 
-        ``images`` (B, R, C) are B images of R rows and C columns; the result is (B, R - 2 h, C - 2 h), h the half width.
+        ``images`` (B, R, C) are B images of R rows and C columns; the result is (B, R - 2 h, C - 2 h), half width h.
         """
         # imported late, since commands that only check files import this module
         import cv2

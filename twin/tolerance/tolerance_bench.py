@@ -30,7 +30,7 @@ from twin.camera.varied_beams import AT_ONCE, BeamLight, RoughWavefrontError, Va
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.monitor.truth import LINE_POINTS, line_points
 from twin.targets.target_images import wavelengths_enough
-from twin.tolerance.designed_light import WavefrontNorm, budget_spectrum, fixed_transfers
+from twin.tolerance.budget_spectrum import WavefrontNorm, budget_spectrum, fixed_transfers
 from twin.tolerance.monitor_merit import Merit, MonitorMerit, merits_of, obstructed_shares, require_bodies
 from twin.tolerance.variations import VariedParameter, compensator_parameters, states_of, tolerance_parameters
 

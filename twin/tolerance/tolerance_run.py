@@ -26,7 +26,7 @@ from twin.framework.memory import Lowered, require_memory
 from twin.framework.procedure import Advance, silent
 from twin.framework.record import Quantity, Record
 from twin.tolerance.allocation import Allocation, allocate
-from twin.tolerance.given_warnings import beam_warnings, instrument_warnings, interpolation_warnings
+from twin.tolerance.instrument_warnings import beam_warnings, instrument_warnings, interpolation_warnings
 from twin.tolerance.merit_models import InverseLimits, ScaledModel, Sensitivities, inverse_limits, sensitivities
 from twin.tolerance.monitor_merit import Merit, merit_unit, shown_merit
 from twin.tolerance.samples import Samples, Workforce, draw_samples
