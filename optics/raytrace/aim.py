@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from optics.geometry.tree import State
-from optics.numerics.array_math import PhysicalError
+from optics.numerics.array_math import PhysicalError, solve_pairs
 from optics.numerics.backend import Backend
 from optics.raytrace.assembly import Assembly, Element
 from optics.raytrace.system import SystemBatch, assemble
@@ -149,7 +149,7 @@ def aim(
         if not np.isfinite(worst):
             break  # also after a step along a singular Jacobian
         moving = np.max(np.abs(miss), axis=-1)[..., None] > tolerance
-        change = np.where(moving, _solve(slope, miss), 0.0)
+        change = np.where(moving, solve_pairs(slope, miss), 0.0)
         q = q + change
         moved = hit(q)
         error = (moved - current) - np.einsum("bnij,bnj->bni", slope, change)
@@ -162,14 +162,6 @@ def aim(
         f"aiming at the last element did not converge: {float(np.max(np.abs(goal - current))):.3g} m off after "
         f"{MAX_ITERATIONS} steps; the perturbation may move the beam off the mirrors"
     )
-
-
-def _solve(matrix: np.ndarray, right: np.ndarray) -> np.ndarray:
-    """Return the solutions (..., 2) of systems of two linear equations by Cramer's rule; not finite if singular."""
-    (a, b), (c, d) = np.moveaxis(matrix, (-2, -1), (0, 1))
-    x, y = np.moveaxis(right, -1, 0)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        return np.stack([d * x - b * y, a * y - c * x], axis=-1) / (a * d - b * c)[..., None]
 
 
 def surviving_rays(

@@ -28,7 +28,7 @@ from optics.numerics.backend import Backend, one_blas_thread
 from optics.numerics.number_tree import FrozenMap
 from optics.raytrace.assembly import Assembly
 from optics.raytrace.first_order import equal_area_radius
-from optics.waves.imaging import path_to_sphere
+from optics.waves.imaging import fit_part, path_to_sphere
 from optics.waves.line_transfer import line_transfers
 from optics.waves.optical_transfer import polychromatic_transfer
 from optics.waves.pupil_shadow import SMALLEST
@@ -55,7 +55,7 @@ from twin.camera.camera_results import (
     in_cycles_per_m,
     in_si,
 )
-from twin.camera.cut_wavefront import RAYS_ACCURACY, WORST_LIGHT, fit_by_rays, fit_illuminated
+from twin.camera.cut_wavefront import RAYS_ACCURACY, WORST_LIGHT, fit_illuminated
 from twin.targets.target_path import LineRays, TargetPath
 
 RINGS = 12
@@ -266,19 +266,13 @@ class CameraOptics:
         for k, where in enumerate(fields):
             passed = rays.valid[k]
             weight = nodes.weight * passed[node_slice]
-            tilt = zernike.fit(3, nodes.x, nodes.y, error[k, node_slice], weight)
             exact = None
             if is_vignetted:
                 exact = fit_illuminated(self.path, self.state, sight[k], RINGS, float(light[k]), self.path_error, terms)
-            tilt = tilt if exact is None else exact.fit.level
-            flat = error[k] - zernike.basis(3, *stop.T) @ tilt
+            fit = fit_part(nodes.x, nodes.y, weight, error[k, node_slice], terms) if exact is None else exact.fit
+            flat = error[k] - zernike.basis(3, *stop.T) @ fit.level
             table = np.full(inside.shape, np.nan)
             table[inside] = np.where(passed, flat, np.nan)[1 + nodes.count + len(edge) :]
-            statistics = (
-                fit_by_rays(nodes, weight, flat[node_slice], terms, bool(np.all(passed)))
-                if exact is None
-                else exact.fit
-            )
             through = float(np.sum(weight) / np.sum(nodes.weight)) if exact is None else exact.light
             wave = Wavefront(
                 field=(float(where[0]), float(where[1])),
@@ -287,12 +281,12 @@ class CameraOptics:
                 x=axis,
                 y=axis,
                 map=table,
-                coefficients=statistics.coefficients,
-                parts=statistics.parts,
-                rms=statistics.rms,
+                coefficients=fit.coefficients,
+                parts=fit.parts,
+                rms=fit.rms,
                 peak_to_valley=float(np.ptp(flat[1:][passed[1:]])),
-                residual=statistics.residual_rms,
-                strehl=statistics.strehl,
+                residual=fit.residual_rms,
+                strehl=fit.strehl,
                 vignetted=1.0 - through,
                 position=self._place(rays, k),
                 hole=(np.nan if is_vignetted else 0.0) if exact is None else exact.hole,
