@@ -317,8 +317,8 @@ class Disturbances:
         moments = np.array([law.two_time_moments(then, now) for law in self.laws]).reshape(-1, 3)
         return self.scaled(np.sqrt(np.maximum(moments[:, 0] + moments[:, 2] - 2.0 * moments[:, 1], 0.0)))
 
-    def with_copies(self, which: Sequence[int], times: float, law: TimeLaw) -> Disturbances:
-        """Return the prior with independent copies of some motions added, which have another law in time.
+    def with_copies(self, which: Sequence[int], times: float, law: TimeLaw | None = None) -> Disturbances:
+        """Return the prior with independent copies of some motions added, which may have another law in time.
 
         The copies are correlated among each other as the originals are.
 
@@ -328,8 +328,8 @@ class Disturbances:
             Indices of the motions.
         times : float
             Ratio of the standard deviations of the copies to those of the motions.
-        law : TimeLaw
-            Law in time of the copies.
+        law : TimeLaw, optional
+            Law in time of the copies; by default that of each original.
         """
         indices = list(which)
         count = len(self.labels)
@@ -350,7 +350,7 @@ class Disturbances:
             np.concatenate([self.spots, times * self.spots[:, indices]], axis=1),
             np.concatenate([self.parameters, times * self.parameters[:, indices]], axis=1),
             correlation,
-            (*self.laws, *(law,) * len(indices)),
+            (*self.laws, *(law or self.laws[k] for k in indices)),
             self.jump_false_alarm,
         )
 

@@ -24,14 +24,14 @@ then wrong for all bodies at once.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.special import gammaln, ndtr
 
 from analysis.arrays import Array
 from analysis.monitor import parameters
-from analysis.monitor.disturbances import Disturbances, TimeLaw
+from analysis.monitor.disturbances import Disturbances
 from analysis.monitor.monitor_formulas import GroundGeometry
 from analysis.monitor.parameters import ANGLE_GROUP, GROUND_GROUP, CameraCalibration, Parameter
 
@@ -326,33 +326,12 @@ def with_further_spots(stated: Disturbances, spots: Array, own: Sequence[bool]) 
         channels); the copy moves as much as the original but independently.
     """
     apart = np.array(own, bool)
-    copies = np.flatnonzero(apart)
-    count, more = len(stated.labels), len(copies)
-    moved = np.zeros((len(stated.spots) + len(spots), count + more))
-    moved[: len(stated.spots), :count] = stated.spots
-    moved[len(stated.spots) :, :count] = np.where(apart, 0.0, spots)
-    moved[len(stated.spots) :, count:] = spots[:, copies]
-    correlation = np.zeros((count + more, count + more))
-    correlation[:count, :count] = stated.correlation
-    correlation[count:, count:] = stated.correlation[np.ix_(copies, copies)]
-
-    def with_copies(values: tuple[str, ...]) -> tuple[str, ...]:
-        return (*values, *(values[k] for k in copies))
-
-    laws: tuple[TimeLaw, ...] = (*stated.laws, *(stated.laws[k] for k in copies))
-    return Disturbances(
-        name=stated.name,
-        labels=with_copies(stated.labels),
-        bodies=with_copies(stated.bodies),
-        causes=with_copies(stated.causes),
-        sigmas=np.concatenate([stated.sigmas, stated.sigmas[copies]]),
-        units=with_copies(stated.units),
-        spots=moved,
-        parameters=np.concatenate([stated.parameters, np.zeros((len(stated.parameters), more))], axis=1),
-        correlation=correlation,
-        laws=laws,
-        jump_false_alarm=stated.jump_false_alarm,
-    )
+    both = stated.with_copies(np.flatnonzero(apart).tolist(), 1.0)
+    more = len(both.labels) - len(stated.labels)
+    further = np.concatenate([np.where(apart, 0.0, spots), spots[:, apart]], axis=1)
+    existing = np.concatenate([stated.spots, np.zeros((len(stated.spots), more))], axis=1)
+    parameters = np.concatenate([stated.parameters, np.zeros((len(stated.parameters), more))], axis=1)
+    return replace(both, spots=np.concatenate([existing, further]), parameters=parameters)
 
 
 def field_covariance(

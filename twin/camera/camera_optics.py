@@ -389,10 +389,10 @@ class CameraOptics:
         )
 
     @one_blas_thread()
-    def errors(self, fields: Sequence[Field | FieldText] | np.ndarray) -> np.ndarray:
+    def errors(self, fields: Sequence[Field | FieldText] | np.ndarray, rings: int = RINGS) -> np.ndarray:
         """Compute rms wavefront errors at F fields, (F, 2), in waves of the design wavelength, (F,).
 
-        Piston and tilt are removed.
+        Piston and tilt are removed. ``rings`` is the number of rings of the quadrature over the stop.
 
         Raises
         ------
@@ -400,9 +400,9 @@ class CameraOptics:
             In this state the light misses the stop or the plane of the line CCD.
         """
         all_fields, plane = self.fractions(fields), FocalPlane.of(self.model.spec)
-        step = max(1, MAX_RAYS // stop_nodes(self.model, RINGS, self.cut is not None).count)
+        step = max(1, MAX_RAYS // stop_nodes(self.model, rings, self.cut is not None).count)
         parts = [all_fields[start : start + step] for start in range(0, len(all_fields), step)]
-        return np.concatenate([self.beams(part).errors(plane) for part in parts])
+        return np.concatenate([self.beams(part, rings).errors(plane) for part in parts])
 
     def pupils(self, fields: Sequence[Field | FieldText] | np.ndarray) -> tuple[PupilFunction, ...]:
         """Compute the exit pupils of F fields, (F, 2), with image axes along the line and along the track.
