@@ -113,11 +113,7 @@ class TimeLaw:
 
     def step_probability(self, time: ArrayLike) -> Array:
         """Return the probability that the step of an event has occurred by a time in seconds (any shape)."""
-        at, chance = np.array(self.event).T
-        when = np.asarray(time, np.float64)
-        if len(at) == 1:
-            return np.asarray((when >= at[0]) * chance[0])
-        return np.asarray(np.interp(when, at, chance))
+        return step_probability(self.event, time)
 
     def two_time_moments(self, then: float, now: float) -> tuple[float, float, float]:
         """Return the variance at an earlier time, the covariance with a later time, and the variance at the later time.
@@ -148,6 +144,16 @@ class TimeLaw:
         if self.relaxation_s is not None:
             out = out * -np.expm1(-np.maximum(since, 0.0) / self.relaxation_s)
         return out
+
+
+def step_probability(chances: Sequence[tuple[float, float]], time: ArrayLike) -> Array:
+    """Return the probability that a step has occurred by a time in seconds (any shape).
+
+    ``chances`` are pairs of a time and this probability, linear between; one pair for a step at a known time.
+    """
+    at, chance = np.array(chances).T
+    when = np.asarray(time, np.float64)
+    return np.asarray((when >= at[0]) * chance[0] if len(at) == 1 else np.interp(when, at, chance))
 
 
 @shows("name", "labels", "spots [px]")

@@ -6,6 +6,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from optics.geometry.tree import State
 from optics.numerics.array_math import PhysicalError, solve_pairs
@@ -47,6 +48,15 @@ class RayFan:
     direction: np.ndarray
     axes: np.ndarray
     moves_position: bool = False
+
+    @classmethod
+    def toward(cls, position: np.ndarray, direction: np.ndarray, first: ArrayLike = (0.0, 1.0, 0.0)) -> RayFan:
+        """Return rays from points (B, N, 3) with directions near a given one, broadcastable to (B, N, 3).
+
+        ``first`` is a vector near which the first transverse axis of every ray is taken.
+        """
+        along = np.broadcast_to(direction, position.shape)
+        return cls(position, along, transverse_axes(along, np.broadcast_to(first, along.shape)))
 
     def at(self, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return launch points (metres) and unit directions, (B, N, 3) each, for given parameters (a, b) of each ray.

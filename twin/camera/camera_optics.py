@@ -26,6 +26,7 @@ from optics.geometry.tree import State
 from optics.numerics.array_math import UnphysicalError, check_range
 from optics.numerics.backend import Backend, one_blas_thread
 from optics.numerics.number_tree import FrozenMap
+from optics.numerics.quadrature import circle
 from optics.raytrace.assembly import Assembly
 from optics.raytrace.first_order import equal_area_radius
 from optics.waves.imaging import fit_part, path_to_sphere
@@ -570,5 +571,4 @@ def even_step(frequency: np.ndarray) -> bool:
 
 def rim(count: int) -> np.ndarray:
     """Return points evenly spaced just inside the edge of the stop, in units of its radius, (count, 2)."""
-    azimuth = 2.0 * np.pi * np.arange(count) / count
-    return np.asarray(INSIDE * np.stack([np.cos(azimuth), np.sin(azimuth)], axis=-1))
+    return np.asarray(INSIDE * circle(count))
