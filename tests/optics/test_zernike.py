@@ -143,3 +143,21 @@ def test_fit_separates_what_it_is_given() -> None:
     np.testing.assert_allclose([*fit.level, *fit.coefficients[3:]], wanted, atol=1e-19)
     assert fit.rms == pytest.approx(np.linalg.norm(wanted[3:]), rel=1e-10)
     assert fit.residual_rms < 1e-19
+
+
+def test_a_ring_of_positive_weights_is_the_disk_minus_its_hole() -> None:
+    """Both kinds of quadrature, Gauss' over the ring and the disk's less the hole's, have the same contributions."""
+    hole = 0.4
+    point, share = np.polynomial.legendre.leggauss(12)
+    radius = np.sqrt(0.5 * (1.0 + hole**2) + 0.5 * (1.0 - hole**2) * point)
+    angle = 2.0 * np.pi * np.arange(24) / 24
+    x, y = (np.outer(radius, part(angle)).ravel() for part in (np.cos, np.sin))
+    ring = x, y, np.repeat(share, 24)
+    minus = (
+        *(np.append(part, hole * part) for part in (NODES.x, NODES.y)),
+        np.append(NODES.weight, -(hole**2) * NODES.weight),
+    )
+    fits = [fit_part(x, y, weight, 3e-8 * x**3 + 2e-8 * x * y + 1e-8 * y, 15) for x, y, weight in (ring, minus)]
+    for name in ("level", "coefficients", "parts", "rms"):
+        np.testing.assert_allclose(getattr(fits[0], name), getattr(fits[1], name), atol=1e-21, err_msg=name)
+    assert np.linalg.norm(fits[0].parts) == pytest.approx(fits[0].rms, rel=1e-9)
