@@ -9,6 +9,7 @@ vanishes, sigma sqrt(pi/2) remains (Rice, Bell Syst. Tech. J. 24, 46 (1945)).
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -95,6 +96,11 @@ def gain(columns: np.ndarray, root: np.ndarray | None = None, cutoff: float = 1e
     return np.asarray(inverse if root is None else inverse @ np.linalg.inv(root), dtype=np.float64)
 
 
+def rms(values: ArrayLike) -> float:
+    """Return the root mean square of all elements of an array, in its unit."""
+    return float(np.sqrt(np.mean(np.square(values))))
+
+
 def proportion_interval(successes: int, trials: int, confidence: float) -> tuple[float, float]:
     """Return the Clopper-Pearson confidence interval of a proportion; (0, 1) without trials.
 
@@ -142,6 +148,35 @@ def proportion_interval(successes: int, trials: int, confidence: float) -> tuple
 
     interval = binomtest(successes, trials).proportion_ci(confidence, "exact")
     return float(interval.low), float(interval.high)
+
+
+def null_combinations(design: Array, names: Sequence[str], tolerance: float, least: float) -> tuple[Array, str]:
+    """Return the combinations of P unknowns that observations leave undetermined, (k, P), and their text.
+
+    The largest entry of each is 1.
+
+    Parameters
+    ----------
+    design : (M, P) ndarray
+        Derivatives of M observations with respect to the unknowns.
+    names : sequence of str
+        Names of the unknowns.
+    tolerance : float
+        Singular value, with columns of unit length and relative to the largest, up to which a combination counts as
+        undetermined.
+    least : float
+        Entry up to which an unknown is omitted from the text.
+    """
+    length = np.linalg.norm(design, axis=0)
+    length = np.where(length > 0, length, 1.0)
+    _, values, vt = np.linalg.svd(design / length, full_matrices=True)
+    values = np.pad(values, (0, len(vt) - values.size))
+    vectors = vt[values <= tolerance * max(float(values[0]), 1e-300)] / length
+    vectors = vectors / np.abs(vectors).max(axis=1, keepdims=True)
+    text = "; ".join(
+        " ".join(f"{v:+.3g} x {name}" for v, name in zip(row, names, strict=True) if abs(v) > least) for row in vectors
+    )
+    return vectors, text
 
 
 def robust_sigma(residuals: ArrayLike) -> float:

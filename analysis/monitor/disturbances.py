@@ -113,11 +113,7 @@ class TimeLaw:
 
     def step_probability(self, time: ArrayLike) -> Array:
         """Return the probability that the step of an event has occurred by a time in seconds (any shape)."""
-        at, probability = np.array(self.event).T
-        when = np.asarray(time, np.float64)
-        if len(at) == 1:
-            return np.asarray((when >= at[0]) * probability[0])
-        return np.asarray(np.interp(when, at, probability))
+        return step_probability(self.event, time)
 
     def two_time_moments(self, then: float, now: float) -> tuple[float, float, float]:
         """Return the variance at an earlier time, the covariance with a later time, and the variance at the later time.
@@ -148,6 +144,16 @@ class TimeLaw:
         if self.relaxation_s is not None:
             out = out * -np.expm1(-np.maximum(since, 0.0) / self.relaxation_s)
         return out
+
+
+def step_probability(chances: Sequence[tuple[float, float]], time: ArrayLike) -> Array:
+    """Return the probability that a step has occurred by a time in seconds (any shape).
+
+    ``chances`` are pairs of a time and this probability, linear between; one pair for a step at a known time.
+    """
+    at, chance = np.array(chances).T
+    when = np.asarray(time, np.float64)
+    return np.asarray((when >= at[0]) * chance[0] if len(at) == 1 else np.interp(when, at, chance))
 
 
 @shows("name", "labels", "spots [px]")
@@ -317,8 +323,8 @@ class Disturbances:
         moments = np.array([law.two_time_moments(then, now) for law in self.laws]).reshape(-1, 3)
         return self.scaled(np.sqrt(np.maximum(moments[:, 0] + moments[:, 2] - 2.0 * moments[:, 1], 0.0)))
 
-    def with_copies(self, which: Sequence[int], times: float, law: TimeLaw) -> Disturbances:
-        """Return the prior with independent copies of some motions added, which have another law in time.
+    def with_copies(self, which: Sequence[int], times: float, law: TimeLaw | None = None) -> Disturbances:
+        """Return the prior with independent copies of some motions added, which may have another law in time.
 
         The copies are correlated among each other as the originals are.
 
@@ -328,8 +334,8 @@ class Disturbances:
             Indices of the motions.
         times : float
             Ratio of the standard deviations of the copies to those of the motions.
-        law : TimeLaw
-            Law in time of the copies.
+        law : TimeLaw, optional
+            Law in time of the copies; by default that of each original.
         """
         indices = list(which)
         count = len(self.labels)
@@ -350,7 +356,7 @@ class Disturbances:
             np.concatenate([self.spots, times * self.spots[:, indices]], axis=1),
             np.concatenate([self.parameters, times * self.parameters[:, indices]], axis=1),
             correlation,
-            (*self.laws, *(law,) * len(indices)),
+            (*self.laws, *(law or self.laws[k] for k in indices)),
             self.jump_false_alarm,
         )
 

@@ -322,62 +322,42 @@ def jumping_bodies(
     return tuple(out)
 
 
-@dataclass(frozen=True, eq=False)
-class Hint:
-    """Hypotheses that one body has made a jump of unknown size, one for each of the gaps before the last L readings.
+def undetected(looked: tuple[Array, Array], evidence: tuple[Array, Array], outputs: Array, expected: Array) -> Amounts:
+    """Return the amounts of a jump of unknown size of one body before each of the last L readings.
 
-    Dimensions: r motions of the body that may jump.
+    The log weight of a hypothesis is the logarithm of its likelihood ratio times its prior probability.
 
-    Attributes
+    Dimensions: L gaps between readings, in each of which a step may have occurred, q values that readings can
+    contain (outputs), r motions of the body that may jump.
+
+    Parameters
     ----------
-    log_weight : (L,) ndarray
-        Logarithm of the weight of each hypothesis, its likelihood ratio times its prior probability.
-    mean : (L, r) ndarray
-        Mean, if the jump occurred in that gap, of the r independent amounts of unit prior variance that make up the
-        jump.
-    covariance : (L, r, r) ndarray
-        Covariance of these amounts.
+    looked : tuple of ndarray
+        Score (L, q) and information (L, q, q) of steps from which the weights of the hypotheses are computed.
+    evidence : tuple of ndarray
+        Score and information of steps from which the amounts of the jump are computed.
+    outputs : (q, r) ndarray
+        Effect on the outputs of the r independent amounts of unit prior variance that make up the jump.
+    expected : (L,) ndarray
+        Mean number of jumps in the gap before each reading; 0 where there is no gap.
     """
-
-    log_weight: Array
-    mean: Array
-    covariance: Array
-
-    @classmethod
-    def of(cls, looked: tuple[Array, Array], evidence: tuple[Array, Array], outputs: Array, expected: Array) -> Hint:
-        """Compute the hypotheses from the scores and information of steps.
-
-        Dimensions: L gaps between readings, in each of which a step may have occurred, q values that readings can
-        contain (outputs), r motions of the body that may jump.
-
-        Parameters
-        ----------
-        looked : tuple of ndarray
-            Score (L, q) and information (L, q, q) of steps from which the weights of the hypotheses are computed.
-        evidence : tuple of ndarray
-            Score and information of steps from which the amounts of the jump are computed.
-        outputs : (q, r) ndarray
-            Effect on the outputs of the r independent amounts of unit prior variance that make up the jump.
-        expected : (L,) ndarray
-            Mean number of jumps in the gap before each reading; 0 where there is no gap.
-        """
-        logs, means, squares = [], [], []
-        for times in _SCALES:
-            amounts = Amounts.of(*evidence, outputs, times)
-            judged = amounts if looked is evidence else Amounts.of(*looked, outputs, times)
-            logs.append(judged.log_weight)
-            means.append(amounts.mean)
-            squares.append(amounts.covariance + amounts.mean[:, :, None] * amounts.mean[:, None, :])
-        together = np.logaddexp.reduce(logs, axis=0)
-        share = np.exp(np.array(logs) - together)
-        mean = np.einsum("sk,ski->ki", share, means)
-        square = np.einsum("sk,skij->kij", share, squares)
-        with np.errstate(divide="ignore"):
-            weight = together - np.log(len(_SCALES)) + np.log(expected)
-        return cls(weight, mean, square - mean[:, :, None] * mean[:, None, :])
+    logs, means, squares = [], [], []
+    for times in _SCALES:
+        amounts = Amounts.of(*evidence, outputs, times)
+        judged = amounts if looked is evidence else Amounts.of(*looked, outputs, times)
+        logs.append(judged.log_weight)
+        means.append(amounts.mean)
+        squares.append(amounts.covariance + amounts.mean[:, :, None] * amounts.mean[:, None, :])
+    together = np.logaddexp.reduce(logs, axis=0)
+    share = np.exp(np.array(logs) - together)
+    mean = np.einsum("sk,ski->ki", share, means)
+    square = np.einsum("sk,skij->kij", share, squares)
+    with np.errstate(divide="ignore"):
+        weight = together - np.log(len(_SCALES)) + np.log(expected)
+    return Amounts(mean, square - mean[:, :, None] * mean[:, None, :], weight)
 
 
-def _jump_probabilities(hints: Sequence[Hint], window: int | None = None) -> list[Array]:
+def jump_probabilities(hints: Sequence[Amounts], window: int | None = None) -> list[Array]:
     """Return for each body the probability of a jump before each reading, (L,), with at most one jump in a window.
 
     The window extends over the given number of readings on either side, or over all.
@@ -392,33 +372,6 @@ def _jump_probabilities(hints: Sequence[Hint], window: int | None = None) -> lis
         near = np.lib.stride_tricks.sliding_window_view(padded, 2 * window + 1)
         total = np.logaddexp(0.0, np.logaddexp.reduce(near, axis=1))
     return [np.exp(hint.log_weight - total) for hint in hints]
-
-
-def mixture(mean: Array, covariance: Array, hints: Sequence[Hint], moved: Sequence[Array]) -> tuple[Array, Array]:
-    """Return mean (n,) and covariance (n, n) of the states with undetected jumps weighted by their probabilities.
-
-    Dimensions: n states of the filter, L gaps between readings, in each of which a step may have occurred, r motions of
-    the body that may jump.
-
-    Parameters
-    ----------
-    mean : (n,) ndarray
-        Mean of the states without a jump.
-    covariance : (n, n) ndarray
-        Covariance of the states without a jump.
-    hints : sequence of Hint
-        Hypotheses of a jump for each body, with their weights.
-    moved : sequence of (L, n, r) ndarrays
-        For each body, derivatives of the present states with respect to the amounts of a jump before each reading.
-    """
-    probabilities = _jump_probabilities(hints)
-    away = [np.einsum("knr,kr->kn", m, hint.mean) for m, hint in zip(moved, hints, strict=True)]
-    shift = np.asarray(sum(p @ a for p, a in zip(probabilities, away, strict=True)))
-    out = covariance - np.outer(shift, shift)
-    for probability, each, m, hint in zip(probabilities, away, moved, hints, strict=True):
-        inner = np.matmul(probability[:, None, None] * m, hint.covariance)
-        out = out + (probability[:, None] * each).T @ each + np.tensordot(inner, m, axes=([0, 2], [0, 2]))
-    return mean + shift, 0.5 * (out + out.T)
 
 
 def undetected_variance(
@@ -449,9 +402,9 @@ def undetected_variance(
     hints = []
     for body, b, j in zip(bodies, score, information, strict=True):
         evidence = b, j
-        hints.append(Hint.of(evidence, evidence, np.eye(len(body.motions)), gap / body.every_s))
+        hints.append(undetected(evidence, evidence, np.eye(len(body.motions)), gap / body.every_s))
     out = []
-    for body, hint, probability in zip(bodies, hints, _jump_probabilities(hints, window // 2), strict=True):
+    for body, hint, probability in zip(bodies, hints, jump_probabilities(hints, window // 2), strict=True):
         square = (hint.mean @ body.root.T) ** 2 + np.einsum("ij,kjl,il->ki", body.root, hint.covariance, body.root)
         over = np.divide(probability * body.every_s, gap, out=np.zeros_like(gap), where=gap > 0.0)
         out.append(_AGAIN * over[:, None] * square)

@@ -37,7 +37,7 @@ from scipy.linalg import solve_triangular
 from scipy.special import gammaincc, gammaln, ndtr
 
 from analysis.arrays import Array
-from analysis.monitor.disturbances import Disturbances, TimeLaw
+from analysis.monitor.disturbances import Disturbances, TimeLaw, step_probability
 from analysis.statistics import limit_of
 
 MOST = 100
@@ -231,10 +231,7 @@ class Step:
 
     def step_probability(self, time: float) -> float:
         """Return the probability that the step has occurred by a time in seconds."""
-        at, probability = np.array(self.time_distribution).T
-        if len(at) == 1:
-            return float((time >= at[0]) * probability[0])
-        return float(np.interp(time, at, probability))
+        return float(step_probability(self.time_distribution, time))
 
 
 @dataclass(frozen=True, eq=False)
@@ -654,16 +651,40 @@ class Bodies:
         amounts : sequence of Amounts
             Estimated amounts of the jump, for each body.
         """
-        shift, spread = np.zeros(len(mean)), np.zeros(covariance.shape)
-        for amount, share, level, effect in zip(amounts, self.weight, levels, self.spots, strict=True):
-            moved = level - response @ effect
-            each = np.einsum("knr,kr->kn", moved, amount.mean)
-            shift += share @ each
-            spread += (share[:, None] * each).T @ each
-            inner = np.matmul(share[:, None, None] * moved, amount.covariance)
-            spread += np.tensordot(inner, moved, axes=([0, 2], [0, 2]))
-        out = covariance + spread - np.outer(shift, shift)
-        return mean + shift, 0.5 * (out + out.T)
+        moved = [level - response @ effect for level, effect in zip(levels, self.spots, strict=True)]
+        return jump_mixture(mean, covariance, self.weight, amounts, moved)
+
+
+def jump_mixture(
+    mean: Array, covariance: Array, weight: Sequence[Array] | Array, amounts: Sequence[Amounts], moved: Sequence[Array]
+) -> tuple[Array, Array]:
+    """Return mean (n,) and covariance (n, n) of states with one of several jumps, weighted by its probability.
+
+    Dimensions: n states of the filter, L gaps between readings, in each of which a step may have occurred, r motions of
+    the body that may jump.
+
+    Parameters
+    ----------
+    mean : (n,) ndarray
+        Mean of the states without a jump.
+    covariance : (n, n) ndarray
+        Covariance of the states without a jump.
+    weight : sequence of (L,) ndarrays
+        For each body, the probability of a jump in each gap.
+    amounts : sequence of Amounts
+        For each body, means (L, r) and covariances (L, r, r) of the amounts of a jump.
+    moved : sequence of (L, n, r) ndarrays
+        For each body, derivatives of the states with respect to the amounts.
+    """
+    shift, spread = np.zeros(len(mean)), np.zeros(covariance.shape)
+    for amount, share, effect in zip(amounts, weight, moved, strict=True):
+        each = np.einsum("knr,kr->kn", effect, amount.mean)
+        shift += share @ each
+        spread += (share[:, None] * each).T @ each
+        inner = np.matmul(share[:, None, None] * effect, amount.covariance)
+        spread += np.tensordot(inner, effect, axes=([0, 2], [0, 2]))
+    out = covariance + spread - np.outer(shift, shift)
+    return mean + shift, 0.5 * (out + out.T)
 
 
 def mixture_moments(amounts: Sequence[Amounts], effects: Sequence[Array], weight: Array) -> tuple[Array, Array]:

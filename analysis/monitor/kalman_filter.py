@@ -60,7 +60,6 @@ from analysis.monitor.filter_state import (
     RECENT,
     BadReading,
     FilterState,
-    Hint,
     Innovation,
     JumpingBody,
     Observed,
@@ -69,10 +68,11 @@ from analysis.monitor.filter_state import (
     Whitened,
     bad_reading,
     jump_evidence,
+    jump_probabilities,
     jumping_bodies,
     may_be_bad,
-    mixture,
     probability_good,
+    undetected,
     undetected_variance,
 )
 from analysis.monitor.jump_detection import (
@@ -84,6 +84,7 @@ from analysis.monitor.jump_detection import (
     Step,
     Steps,
     candidates,
+    jump_mixture,
     knots,
     mixture_moments,
     most_likely_jump,
@@ -653,9 +654,9 @@ class SeriesFilter:
         for body in self.jumping_bodies:
             expected = (current.until - current.after) / body.every_s
             looked, evidence = ((t.score, t.information) for t in (jump_track, track))
-            hints.append(Hint.of(looked, evidence, body.spots, expected))
+            hints.append(undetected(looked, evidence, body.spots, expected))
             moved.append(self.space.level_of(body.motions) @ body.root - track.response @ body.spots)
-        mean, covariance = mixture(track.mean, track.covariance, hints, moved)
+        mean, covariance = jump_mixture(track.mean, track.covariance, jump_probabilities(hints), hints, moved)
         none = current.until[:0]
         return replace(
             current, after=none, until=none, state=replace(track.alone(), mean=mean, covariance=covariance), search=None

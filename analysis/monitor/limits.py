@@ -24,14 +24,14 @@ then wrong for all bodies at once.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.special import gammaln, ndtr
 
 from analysis.arrays import Array
 from analysis.monitor import parameters
-from analysis.monitor.disturbances import Disturbances, TimeLaw
+from analysis.monitor.disturbances import Disturbances
 from analysis.monitor.monitor_formulas import GroundGeometry
 from analysis.monitor.parameters import ANGLE_GROUP, GROUND_GROUP, CameraCalibration, Parameter
 
@@ -326,33 +326,12 @@ def with_further_spots(disturbances: Disturbances, spots: Array, individual: Seq
         channels); the copy moves as much as the original but independently.
     """
     apart = np.array(individual, bool)
-    copies = np.flatnonzero(apart)
-    count, more = len(disturbances.labels), len(copies)
-    moved = np.zeros((len(disturbances.spots) + len(spots), count + more))
-    moved[: len(disturbances.spots), :count] = disturbances.spots
-    moved[len(disturbances.spots) :, :count] = np.where(apart, 0.0, spots)
-    moved[len(disturbances.spots) :, count:] = spots[:, copies]
-    correlation = np.zeros((count + more, count + more))
-    correlation[:count, :count] = disturbances.correlation
-    correlation[count:, count:] = disturbances.correlation[np.ix_(copies, copies)]
-
-    def with_copies(values: tuple[str, ...]) -> tuple[str, ...]:
-        return (*values, *(values[k] for k in copies))
-
-    laws: tuple[TimeLaw, ...] = (*disturbances.laws, *(disturbances.laws[k] for k in copies))
-    return Disturbances(
-        name=disturbances.name,
-        labels=with_copies(disturbances.labels),
-        bodies=with_copies(disturbances.bodies),
-        causes=with_copies(disturbances.causes),
-        sigmas=np.concatenate([disturbances.sigmas, disturbances.sigmas[copies]]),
-        units=with_copies(disturbances.units),
-        spots=moved,
-        parameters=np.concatenate([disturbances.parameters, np.zeros((len(disturbances.parameters), more))], axis=1),
-        correlation=correlation,
-        laws=laws,
-        jump_false_alarm=disturbances.jump_false_alarm,
-    )
+    both = disturbances.with_copies(np.flatnonzero(apart).tolist(), 1.0)
+    more = len(both.labels) - len(disturbances.labels)
+    further = np.concatenate([np.where(apart, 0.0, spots), spots[:, apart]], axis=1)
+    existing = np.concatenate([disturbances.spots, np.zeros((len(disturbances.spots), more))], axis=1)
+    parameters = np.concatenate([disturbances.parameters, np.zeros((len(disturbances.parameters), more))], axis=1)
+    return replace(both, spots=np.concatenate([existing, further]), parameters=parameters)
 
 
 def field_covariance(

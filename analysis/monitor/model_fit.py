@@ -308,24 +308,12 @@ def _show(values: Array, smallest: float = 0.0) -> str:
 
 def _check_rank(spots: Array, names: Sequence[str] | None) -> None:
     """Raise RankError if the columns of the spot Jacobian are dependent, with the null vectors."""
-    count = spots.shape[1]
-    length = np.linalg.norm(spots, axis=0)
-    scaled = spots / np.where(length > 0, length, 1.0)
-    _, values, vt = np.linalg.svd(scaled, full_matrices=True)
-    values = np.pad(values, (0, count - values.size))
-    null = vt[values <= _RANK_TOLERANCE * max(values[0], 1e-300)]
-    if not null.size:
-        return
-    labels = list(names) if names is not None else [f"motion {k}" for k in range(count)]
-    vectors = null / np.where(length > 0, length, 1.0)
-    vectors /= np.abs(vectors).max(axis=1, keepdims=True)
-    shown = "; ".join(
-        " ".join(f"{v:+.6g} x {label}" for v, label in zip(vector, labels, strict=True) if abs(v) > 1e-12)
-        for vector in vectors
-    )
-    raise RankError(
-        f"model fit: the spots cannot separate the motions; this combination moves no spot: {shown}", vectors
-    )
+    labels = list(names) if names is not None else [f"motion {k}" for k in range(spots.shape[1])]
+    null, text = statistics.null_combinations(spots, labels, _RANK_TOLERANCE, 1e-12)
+    if len(null):
+        raise RankError(
+            f"model fit: the spots cannot separate the motions; this combination moves no spot: {text}", null
+        )
 
 
 def _jacobians(spots: ArrayLike, parameters: ArrayLike, limited: bool = True) -> tuple[Array, Array]:

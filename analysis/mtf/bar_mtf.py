@@ -32,7 +32,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from analysis.arrays import Array, MeasurementError
-from analysis.mtf.edge_location import LARGEST_GREY, grey_fault
+from analysis.mtf.edge_location import LARGEST_GREY, grey_plane
 from analysis.mtf.edge_pages import different_pages, mean_page, rounding_residual
 from analysis.mtf.slanted_edge import EdgeMtf
 from analysis.spots.noise import NoiseModel
@@ -274,19 +274,8 @@ def bar_mtf(
 
 
 def _checked(region: ArrayLike, saturation: float | None) -> Array:
-    array = np.asarray(region)
-    if array.ndim != 2 or array.dtype.kind not in "uif":
-        raise BarError(f"the region must be a plane of real grey values (H, W), found {array.dtype} {array.shape}")
-    if min(array.shape) < _LEAST_SIDE:
-        raise BarError(
-            f"the region of {array.shape[0]} x {array.shape[1]} px is too small: take at least {_LEAST_SIDE} x "
-            f"{_LEAST_SIDE} px inside the group"
-        )
-    grey = np.asarray(array, dtype=np.float64)
-    fault = grey_fault(grey, saturation)
-    if fault:
-        raise BarError(fault)
-    return grey
+    allowed = f"{_LEAST_SIDE} x {_LEAST_SIDE} px inside the group"
+    return grey_plane(region, (_LEAST_SIDE, _LEAST_SIDE), allowed, saturation, BarError)
 
 
 def _level(

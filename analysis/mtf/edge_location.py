@@ -87,18 +87,39 @@ def checked_region(region: ArrayLike, saturation: float | None) -> Array:
     EdgeError
         The region is not a plane of real finite numbers, is too small, or is saturated.
     """
+    allowed = f"{LEAST_ACROSS} px across the edge and {LEAST_ALONG} px along it, better 64 x 64"
+    return grey_plane(region, (LEAST_ALONG, LEAST_ACROSS), allowed, saturation, EdgeError)
+
+
+def grey_plane(
+    region: ArrayLike, least: tuple[int, int], allowed: str, saturation: float | None, error: type[ValueError]
+) -> Array:
+    """Return a region as float64 (H, W); raise ``error`` if it cannot be measured.
+
+    Dimensions: H rows, W columns.
+
+    Parameters
+    ----------
+    region : array_like
+        Grey values, (H, W).
+    least : (int, int)
+        Smallest shorter and smallest longer side, px.
+    allowed : str
+        Description of the smallest region.
+    saturation : float or None
+        As for `checked_region`.
+    error : type
+        Class of the errors.
+    """
     array = np.asarray(region)
     if array.ndim != 2 or array.dtype.kind not in "uif":
-        raise EdgeError(f"the region must be a plane of real grey values (H, W), found {array.dtype} {array.shape}")
-    least = f"{LEAST_ACROSS} px across the edge and {LEAST_ALONG} px along it"
-    if min(array.shape) < LEAST_ALONG or max(array.shape) < LEAST_ACROSS:
-        raise EdgeError(
-            f"the region of {array.shape[0]} x {array.shape[1]} px is too small: take at least {least}, better 64 x 64"
-        )
+        raise error(f"the region must be a plane of real grey values (H, W), found {array.dtype} {array.shape}")
+    if min(array.shape) < least[0] or max(array.shape) < least[1]:
+        raise error(f"the region of {array.shape[0]} x {array.shape[1]} px is too small: take at least {allowed}")
     grey = np.ascontiguousarray(array, dtype=np.float64)
     fault = grey_fault(grey, saturation)
     if fault:
-        raise EdgeError(fault)
+        raise error(fault)
     return grey
 
 

@@ -271,7 +271,11 @@ def resect(
         steps += 1
         design, miss, _ = system()
         length = np.linalg.norm(design, axis=0)
-        _check_rank(design, length, names)
+        null, text = statistics.null_combinations(design, names, _RANK, 1e-6)
+        if len(null):
+            raise ResectionError(
+                f"resection: the points do not determine: {text}; these changes move no image point", null
+            )
         step = -statistics.gain(design) @ miss
         attitude = attitude @ Rotation.from_rotvec(step[:3]).as_matrix()
         for name in looks:
@@ -370,20 +374,3 @@ def _start(station: Station, lines: Mapping[str, ObservedLine], zero: str) -> tu
         looks[name] = float(np.arctan2(direction[0], direction[2]) - np.arctan2(inner[0], inner[2]))
     start = looks[zero]
     return attitude @ _pitched(start), {name: 0.0 if name == zero else look - start for name, look in looks.items()}
-
-
-def _check_rank(design: Array, length: Array, names: list[str]) -> None:
-    """Raise ResectionError, listing the combinations of unknowns that the points leave undetermined."""
-    scaled = design / np.where(length > 0, length, 1.0)
-    # zero rows, so that all P right vectors result from fewer observations than unknowns, too
-    padded = np.vstack([scaled, np.zeros((max(len(names) - len(scaled), 0), len(names)))])
-    _, values, vt = np.linalg.svd(padded, full_matrices=False)
-    null = vt[values <= _RANK * max(float(values[0]), 1e-300)]
-    if not len(null):
-        return
-    vectors = null / np.where(length > 0, length, 1.0)
-    vectors = vectors / np.abs(vectors).max(axis=1, keepdims=True)
-    text = "; ".join(
-        " ".join(f"{v:+.3g} x {n}" for v, n in zip(row, names, strict=True) if abs(v) > 1e-6) for row in vectors
-    )
-    raise ResectionError(f"resection: the points do not determine: {text}; these changes move no image point", vectors)

@@ -18,7 +18,7 @@ import numpy as np
 from optics.design.design_variables import BIAS, Prescription, Variable
 from optics.geometry.tree import COMPLEX_STEP
 from optics.numerics.backend import Backend
-from optics.numerics.quadrature import PupilNodes
+from optics.numerics.quadrature import PupilNodes, circle
 from optics.raytrace.aim import RayFan, aim
 from optics.raytrace.system import assemble
 from optics.raytrace.trace import BeamMissedError, jvp, make_rays, trace
@@ -51,9 +51,8 @@ class Beams:
     @property
     def pupil(self) -> np.ndarray:
         """Pupil coordinates of a beam's N rays, (N, 2), in units of its radius: chief ray, quadrature nodes, rim."""
-        angle = 2.0 * np.pi * np.arange(self.rim) / self.rim
         nodes = np.stack([self.nodes.x, self.nodes.y], axis=-1)
-        return np.concatenate([np.zeros((1, 2)), nodes, np.stack([np.cos(angle), np.sin(angle)], axis=-1)])
+        return np.concatenate([np.zeros((1, 2)), nodes, circle(self.rim)])
 
 
 @dataclass(frozen=True, eq=False)

@@ -116,6 +116,14 @@ class Motion:
         """Relative change of a glass's dispersion, 1 / (1 + ``abbe``) - 1, due to the change of its Abbe number."""
         return 1.0 / (1.0 + self.abbe) - 1.0
 
+    def plus(self, added: Motion) -> Motion:
+        """Return the motion with another's rotation vector, shift and scale added to its own, about the other's pivot.
+
+        To first order it is that of one motion after the other; `compose` is exact.
+        """
+        rotate, shift = (triple(np.add(*pair)) for pair in ((self.rotate, added.rotate), (self.shift, added.shift)))
+        return replace(self, rotate=rotate, shift=shift, pivot=added.pivot, scale=self.scale + added.scale)
+
     def component(self, kind: str, axis: int) -> float:
         """Return one number of the motion, in SI units.
 

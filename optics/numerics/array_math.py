@@ -60,6 +60,17 @@ def inverse(matrix: np.ndarray) -> np.ndarray:
         return np.asarray(adjugate / determinant(matrix)[..., None, None])
 
 
+def solve_pairs(matrix: np.ndarray, right: np.ndarray) -> np.ndarray:
+    """Return the solutions (..., 2) of systems of two linear equations, (..., 2, 2) and (..., 2), by Cramer's rule.
+
+    They are not finite where a matrix is singular.
+    """
+    (a, b), (c, d) = np.moveaxis(matrix, (-2, -1), (0, 1))
+    x, y = np.moveaxis(right, -1, 0)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.asarray(np.stack([d * x - b * y, a * y - c * x], axis=-1) / (a * d - b * c)[..., None])
+
+
 def sqrt(x: Any) -> Any:
     """Return the square root of a number, NumPy or Dr.Jit array."""
     if _is_numpy(x):

@@ -97,6 +97,12 @@ def even_disk(count: int) -> PupilNodes:
     return _frozen(r * np.cos(angle), r * np.sin(angle), np.full(count, np.pi / count))
 
 
+def circle(count: int) -> np.ndarray:
+    """Return points evenly spaced around the unit circle, the first at (1, 0), (count, 2)."""
+    angle = 2.0 * np.pi * np.arange(count) / count
+    return np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+
+
 def disk_for(phase: float) -> PupilNodes:
     """Return quadrature nodes over the disk, enough for images of a smooth wavefront.
 

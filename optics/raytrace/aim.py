@@ -6,9 +6,10 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from optics.geometry.tree import State
-from optics.numerics.array_math import PhysicalError
+from optics.numerics.array_math import PhysicalError, solve_pairs
 from optics.numerics.backend import Backend
 from optics.raytrace.assembly import Assembly, Element
 from optics.raytrace.system import SystemBatch, assemble
@@ -47,6 +48,15 @@ class RayFan:
     direction: np.ndarray
     axes: np.ndarray
     moves_position: bool = False
+
+    @classmethod
+    def toward(cls, position: np.ndarray, direction: np.ndarray, first: ArrayLike = (0.0, 1.0, 0.0)) -> RayFan:
+        """Return rays from points (B, N, 3) with directions near a given one, broadcastable to (B, N, 3).
+
+        ``first`` is a vector near which the first transverse axis of every ray is taken.
+        """
+        along = np.broadcast_to(direction, position.shape)
+        return cls(position, along, transverse_axes(along, np.broadcast_to(first, along.shape)))
 
     def at(self, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return launch points (metres) and unit directions, (B, N, 3) each, for given parameters (a, b) of each ray.
@@ -149,7 +159,7 @@ def aim(
         if not np.isfinite(worst):
             break  # also after a step along a singular Jacobian
         moving = np.max(np.abs(miss), axis=-1)[..., None] > tolerance
-        change = np.where(moving, _solve(slope, miss), 0.0)
+        change = np.where(moving, solve_pairs(slope, miss), 0.0)
         q = q + change
         moved = hit(q)
         error = (moved - current) - np.einsum("bnij,bnj->bni", slope, change)
@@ -162,14 +172,6 @@ def aim(
         f"aiming at the last element did not converge: {float(np.max(np.abs(goal - current))):.3g} m off after "
         f"{MAX_ITERATIONS} steps; the perturbation may move the beam off the mirrors"
     )
-
-
-def _solve(matrix: np.ndarray, right: np.ndarray) -> np.ndarray:
-    """Return the solutions (..., 2) of systems of two linear equations by Cramer's rule; not finite if singular."""
-    (a, b), (c, d) = np.moveaxis(matrix, (-2, -1), (0, 1))
-    x, y = np.moveaxis(right, -1, 0)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        return np.stack([d * x - b * y, a * y - c * x], axis=-1) / (a * d - b * c)[..., None]
 
 
 def surviving_rays(

@@ -244,8 +244,7 @@ def aim_chief_rays(
     AimError
         No ray reaches the centre of the stop.
     """
-    direction = np.broadcast_to(guess, points.shape)
-    fan = RayFan(points, direction, transverse_axes(direction, np.broadcast_to(transverse, direction.shape)))
+    fan = RayFan.toward(points, guess, transverse)
     initial, slope = (None, None) if start is None else start
     return fan, *aim(backend, to_stop, fan, np.zeros(2), initial, slope)
 

@@ -23,7 +23,7 @@ from optics.geometry.aperture import Circle, Edge, Ellipse, Polygon, Ray, Rectan
 from optics.geometry.polygon import area, area_in_disk, compact, intersect, padded, sides
 from optics.numerics import quadrature
 from optics.numerics.array_math import UnphysicalError
-from optics.numerics.quadrature import PupilNodes
+from optics.numerics.quadrature import PupilNodes, circle
 from optics.waves.pupil_shadow import RIM_SIDES, SMALLEST, quadrature_within, separate, tiled, without
 from optics.waves.pupil_terms import products, smooth_terms, to_terms
 
@@ -319,8 +319,8 @@ def _covers(edge: Edge, ring: Circle, terms: np.ndarray) -> bool:
 
 def _disk(count: int) -> np.ndarray:
     """Return the regular polygon (count, 2) with the area of the unit disk."""
-    angle = 2.0 * np.pi * np.arange(count) / count
-    return np.asarray(np.sqrt(angle[1] / np.sin(angle[1])) * np.stack([np.cos(angle), np.sin(angle)], axis=-1))
+    side = 2.0 * np.pi / count
+    return np.asarray(np.sqrt(side / np.sin(side)) * circle(count))
 
 
 def _outlines(edge: Edge, round_sides: int) -> Iterator[tuple[list[np.ndarray], bool]]:

@@ -86,83 +86,51 @@ def path_to_sphere(
     return np.asarray(path - back)
 
 
-@dataclass(frozen=True, eq=False)
-class WavefrontFit:
-    """Zernike coefficients of a wavefront (Noll order, index 0 = Z1), metres rms each, and the remaining rms.
+def orthonormal_rows(x: np.ndarray, y: np.ndarray, weight: np.ndarray, last: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return the matrix from values on a part of the unit disk to Zernike terms made orthonormal over it.
 
-    Attributes
-    ----------
-    coefficients : (..., last) ndarray
-        Coefficients of the terms Z1 to Z of Noll index ``last``, metres rms.
-    rms : (...) ndarray
-        Rms wavefront error after removal of piston and tilt, metres.
-    residual_rms : (...) ndarray
-        Rms of the wavefront minus the fit, metres.
-    """
-
-    coefficients: np.ndarray
-    rms: np.ndarray
-    residual_rms: np.ndarray
-
-
-def fit_wavefront(
-    x: np.ndarray, y: np.ndarray, weight: np.ndarray, difference: np.ndarray, last: int = 28
-) -> WavefrontFit:
-    """Fit Z1..Z_last to path differences at pupil coordinates x, y (unit disk) with quadrature weights.
-
-    Piston and tilt are removed from ``rms`` (they move the image, they do not blur it); defocus is kept.
+    The terms are made orthonormal one after the other (Gram-Schmidt, as for annular pupils: Mahajan, J. Opt. Soc. Am.
+    71, 75, 1981). Over the whole disk they are the Zernike terms themselves. Over a part of it fitted coefficients are
+    not contributions to the rms: two terms that are similar there may each be larger than the whole.
 
     Parameters
     ----------
     x, y : (N,) ndarray
-        Pupil coordinates of N rays on the unit disk.
+        Pupil coordinates of N points near the unit disk.
     weight : (N,) ndarray
-        Quadrature weights.
-    difference : (..., N) ndarray
-        Optical path differences, metres.
-    last : int
-        Highest Noll index.
-    """
-    coefficients = zernike.fit(last, x, y, difference, weight)
-    share = weight / np.sum(weight)
-    fitted = coefficients @ zernike.basis(last, x, y).T
-    plane = coefficients[..., :3] @ zernike.basis(3, x, y).T
-    rest = difference - plane
-    rest = rest - np.sum(rest * share, axis=-1, keepdims=True)
-    rms = np.sqrt(np.sum(rest**2 * share, axis=-1))
-    residual = np.sqrt(np.sum((difference - fitted) ** 2 * share, axis=-1))
-    return WavefrontFit(coefficients, rms, residual)
-
-
-def orthonormal_parts(
-    x: np.ndarray, y: np.ndarray, weight: np.ndarray, difference: np.ndarray, last: int
-) -> np.ndarray:
-    """Return the contributions of Zernike terms to the rms of path differences over a part of the unit disk.
-
-    The terms are made orthonormal over the weight one after the other (Gram-Schmidt, as for annular pupils: Mahajan, J.
-    Opt. Soc. Am. 71, 75, 1981). Over the whole disk they are the Zernike terms themselves. Over a part of it fitted
-    coefficients are not contributions to the rms: two terms that are similar there may each be larger than the whole.
-
-    Parameters
-    ----------
-    x, y : (N,) ndarray
-        Pupil coordinates of N rays on the unit disk.
-    weight : (N,) ndarray
-        Quadrature weights over the illuminated part; 0 where there is no light.
-    difference : (N,) ndarray
-        Optical path differences.
+        Quadrature weights with a positive sum; negative where shadows are subtracted.
     last : int
         Highest Noll index.
 
     Returns
     -------
-    (last,) ndarray
-        Contributions, in the unit of ``difference``, with the signs of the terms.
+    rows : (last, N) ndarray
+        Matrix from values at the points to their means with the orthonormal terms.
+    root : (last, last) ndarray
+        Lower triangular matrix from the orthonormal terms to the Zernike terms.
+
+    Raises
+    ------
+    UnphysicalError
+        The terms are not positive definite over the quadrature: too few nodes, or almost no area.
     """
-    bright = weight > 0.0
-    root = np.sqrt(weight[bright] / np.sum(weight))
-    q, r = np.linalg.qr(zernike.basis(last, x[bright], y[bright]) * root[:, None])
-    return np.asarray(np.sign(np.diag(r)) * (q.T @ (difference[bright] * root)))
+    basis, share = zernike.basis(last, x, y), weight / np.sum(weight)
+    independent = UnphysicalError(f"{last} Zernike terms are not independent over the light that comes through")
+    if np.all(share >= 0.0):
+        q, r = np.linalg.qr(basis * np.sqrt(share)[:, None])
+        if len(r) < last or not np.min(np.abs(np.diag(r))) > DEPENDENT:
+            raise independent
+        sign = np.sign(np.diag(r))[:, None]
+        return sign * q.T * np.sqrt(share), (sign * r).T
+    try:
+        root = np.linalg.cholesky(basis.T @ (share[:, None] * basis))
+    except np.linalg.LinAlgError as error:
+        raise independent from error
+    return np.linalg.solve(root, basis.T * share), root
+
+
+DEPENDENT = 1e-12
+"""Rms of the part of a Zernike term that the terms before it do not explain, below which it is rounding."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -195,8 +163,8 @@ class PartFit:
     strehl: float
 
 
-def fit_part(x: np.ndarray, y: np.ndarray, weight: np.ndarray, difference: np.ndarray, last: int) -> PartFit:
-    """Fit Z1..Z_last to a wavefront over a part of the unit disk.
+def fit_part(x: np.ndarray, y: np.ndarray, weight: np.ndarray, difference: np.ndarray, last: int = 28) -> PartFit:
+    """Fit Z1..Z_last to a wavefront over a part of the unit disk, or all of it.
 
     The quadrature weights may be negative, where shadows are subtracted.
 
@@ -218,21 +186,12 @@ def fit_part(x: np.ndarray, y: np.ndarray, weight: np.ndarray, difference: np.nd
     """
     share = weight / np.sum(weight)
     basis = zernike.basis(last, x, y)
-
-    def orthonormal(count: int, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        terms = basis[:, :count]
-        try:
-            root = np.linalg.cholesky(terms.T @ (share[:, None] * terms))
-        except np.linalg.LinAlgError as error:
-            raise UnphysicalError(
-                f"{count} Zernike terms are not independent over the light that comes through"
-            ) from error
-        parts = np.linalg.solve(root, terms.T @ (share * values))
-        return parts, np.linalg.solve(root.T, parts)
-
-    _, level = orthonormal(3, difference)
+    rows, root = orthonormal_rows(x, y, weight, 3)
+    level = np.linalg.solve(root.T, rows @ difference)
     flat = difference - basis[:, :3] @ level
-    parts, coefficients = orthonormal(last, flat)
+    rows, root = orthonormal_rows(x, y, weight, last)
+    parts = rows @ flat
+    coefficients = np.linalg.solve(root.T, parts)
     square = float(share @ flat**2)
     residual = float(share @ (flat - basis @ coefficients) ** 2)
     phasor = share @ np.exp(2j * np.pi * flat)

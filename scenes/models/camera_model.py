@@ -31,6 +31,7 @@ from optics.materials.glass import ABBE_LINES
 from optics.numerics.array_math import PhysicalError, matvec
 from optics.numerics.backend import Backend
 from optics.numerics.number_tree import FrozenMap
+from optics.numerics.quadrature import circle
 from optics.raytrace.aim import AimError, transverse_axes
 from optics.raytrace.assembly import Assembly, Element, Interaction
 from optics.raytrace.first_order import (
@@ -348,14 +349,8 @@ def _along(
     _require_light(backend, imaging, axis.base[None], direction)
     if spec.stop_diameter is not None:
         return axis, 0.5 * spec.stop_diameter
-    ring = centre + 0.5 * spec.entrance_pupil * _ring() @ transverse_axes(direction, LINE_AXIS)
+    ring = centre + 0.5 * spec.entrance_pupil * circle(_RIM) @ transverse_axes(direction, LINE_AXIS)
     return axis, equal_area_radius(_require_light(backend, to_stop, ring, direction))
-
-
-def _ring() -> np.ndarray:
-    """Return the ``_RIM`` points on the rim of a unit circle from which areas of beams are computed, (_RIM, 2)."""
-    angle = 2.0 * np.pi * np.arange(_RIM) / _RIM
-    return np.stack([np.cos(angle), np.sin(angle)], axis=-1)
 
 
 def _require_light(backend: Backend, systems: SystemBatch, launch: np.ndarray, direction: np.ndarray) -> np.ndarray:
@@ -405,7 +400,7 @@ def pupil_diameter(backend: Backend, to_stop: SystemBatch, axis: CameraAxis, rad
     AimError
         The beam does not reach the stop.
     """
-    rays, axes = aim_collimated(backend, to_stop, axis.direction[None], axis.centre[None], radius * _ring())
+    rays, axes = aim_collimated(backend, to_stop, axis.direction[None], axis.centre[None], radius * circle(_RIM))
     return 2.0 * equal_area_radius(rays[0] @ axes[0].T)
 
 
@@ -1037,8 +1032,7 @@ def _apertures(
     them. A mirror or a lens centred on its own axis is round, as it is made: a circle about its vertex, or an ellipse
     where it is flat, like a slanted flat in a round beam. The remaining ones are rectangles.
     """
-    angle = 2.0 * np.pi * np.arange(_RIM_POINTS) / _RIM_POINTS
-    rim = stop_radius * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+    rim = stop_radius * circle(_RIM_POINTS)
     fields = [
         (x, y) for x in np.linspace(-spec.field.x, spec.field.x, 5) for y in np.linspace(-spec.field.y, spec.field.y, 3)
     ]

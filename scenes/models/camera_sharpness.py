@@ -7,7 +7,7 @@ error over the field.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from functools import lru_cache
 
@@ -49,9 +49,6 @@ _STEPS = 6
 _DIFFERENCE = 1e-4
 """Step of the focal plane for derivatives, metres and radians: far above rounding, and the errors are linear over it.
 """
-
-_MOST_RAYS = 500_000
-"""Largest number of rays traced together, to limit memory."""
 
 _FEW_FIELDS = tuple((x, y) for x in (0.0, 1.0) for y in (-1.0, 0.0, 1.0))
 """Fields of the quick check, as fractions of the half field along the line and along the track: one half of the field
@@ -214,46 +211,6 @@ class FieldBeams:
             np.sum(step * direction[:, 0], axis=-1),
             illuminated,
         )
-
-    @classmethod
-    def field_errors(
-        cls,
-        model: CameraModel,
-        backend: Backend,
-        fields: Sequence[tuple[float, float]],
-        rings: int,
-        vignetting: Cut | None = None,
-    ) -> np.ndarray:
-        """Return the rms wavefront error at each of F field points on the image plane of the camera's file, in waves.
-
-        Parameters
-        ----------
-        model : CameraModel
-            The camera.
-        backend : Backend
-            Backend that traces the rays.
-        fields : sequence of tuple[float, float]
-            F field points, as fractions of the half field.
-        rings : int
-            Number of rings of Gauss' rule over the stop.
-        vignetting : callable or None
-            Function that returns the rays that bodies about the camera block.
-
-        Returns
-        -------
-        (F,) ndarray
-            Errors in waves of the design wavelength.
-
-        Raises
-        ------
-        AimError, BeamMissedError, InputError
-            Light of a field does not come through, or edges block all of it.
-        """
-        # Fields are traced in parts, which limits the memory to some 100 MB.
-        step = max(1, _MOST_RAYS // stop_nodes(model, rings, vignetting is not None).count)
-        parts = [tuple(fields[k : k + step]) for k in range(0, len(fields), step)]
-        plane = FocalPlane.of(model.spec)
-        return np.concatenate([cls.trace(model, backend, part, rings, vignetting).errors(plane) for part in parts])
 
     @property
     def share(self) -> np.ndarray:

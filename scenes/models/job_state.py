@@ -11,10 +11,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
-from optics.geometry.pose import Pose, triple
+from optics.geometry.pose import Pose
 from optics.geometry.tree import Motion, State, compose
 from optics.numerics.number_tree import FrozenMap
 from optics.thermal.heat import Temperature
@@ -24,6 +25,7 @@ from optics.thermal.thermo_elastic import Displacement, FaceChange
 from scenes.models.disturbances import UNITS, DisturbancePrior
 from scenes.models.instrument_model import Instrument
 from scenes.models.thermal_model import Held, TemperatureError, ThermalModel
+from scenes.specs.course import NO_MOTION
 from scenes.specs.job import JobSpec, PerturbationSpec
 from scenes.specs.job_tables import DeformationSpec, TableTemperatureSpec
 from scenes.specs.resolved import ResolvedJob
@@ -306,16 +308,34 @@ def _in_words(field: Temperature) -> str:
     return f"temperature: {{change: {field.change:.6g} K, gradient: [{slope}]}}"
 
 
-def heated_bodies(job: JobSpec, thermal: ThermalModel) -> dict[str, HeatedBody]:
+def heated_bodies(
+    job: JobSpec, thermal: ThermalModel, known: dict[Any, HeatedBody] | None = None
+) -> dict[str, HeatedBody]:
     """Return path of each body that a job heats by a table -> the table's linear field and its further effects.
+
+    Parameters
+    ----------
+    job : JobSpec
+        The job.
+    thermal : ThermalModel
+        Thermal model of its instrument.
+    known : dict, optional
+        Tables of earlier calls, to which new ones are added, so that each is read once.
 
     Raises
     ------
     InputError
         A table does not describe its body.
     """
-    tables = {path: what.heat for path, what in job.perturb.items() if what.heat.table is not None}
-    return {path: heated_body(thermal, job, path, spec) for path, spec in tables.items()}
+    out, known = {}, {} if known is None else known
+    for path, what in job.perturb.items():
+        if what.heat.table is not None:
+            # change and gradient are added to the table, and are not part of it
+            spec = what.heat.model_copy(update={"change": 0.0, "gradient": NO_MOTION})
+            if (path, spec) not in known:
+                known[path, spec] = heated_body(thermal, job, path, spec)
+            out[path] = known[path, spec]
+    return out
 
 
 def with_heat(fields: Mapping[str, Temperature], heated: Mapping[str, HeatedBody]) -> dict[str, Temperature]:
@@ -425,16 +445,25 @@ def job_state(
         raise job.error(str(error), ("perturb", error.origin, "temperature"), allowed=error.allowed) from error
 
 
-def deformations_of(job: JobSpec, instrument: Instrument) -> dict[str, NodalDeformation]:
+def deformations_of(
+    job: JobSpec, instrument: Instrument, known: dict[Any, NodalDeformation] | None = None
+) -> dict[str, NodalDeformation]:
     """Return path of each body with a table of displaced nodes in the job -> its deformation.
+
+    ``known`` has the deformations of earlier calls, to which new ones are added, so that each table is read once.
 
     Raises
     ------
     InputError
         A table does not describe its body.
     """
-    tables = {path: what.deformation for path, what in job.perturb.items() if what.deformation is not None}
-    return {path: deformed_face(instrument, job, path, table) for path, table in tables.items()}
+    out, known = {}, {} if known is None else known
+    for path, what in job.perturb.items():
+        if what.deformation is not None:
+            if (path, what.deformation) not in known:
+                known[path, what.deformation] = deformed_face(instrument, job, path, what.deformation)
+            out[path] = known[path, what.deformation]
+    return out
 
 
 def on_deformed(
@@ -479,10 +508,7 @@ def motions_of(job: JobSpec, time: int | None = None) -> State:
     out = {path: what.motion() for path, what in job.perturb.items()}
     if job.course is not None and time is not None:
         for path, added in job.course.motions(time).items():
-            motion = out.get(path, Motion())
-            rotate = triple(a + b for a, b in zip(motion.rotate, added.rotate, strict=True))
-            shift = triple(a + b for a, b in zip(motion.shift, added.shift, strict=True))
-            out[path] = replace(motion, rotate=rotate, shift=shift, pivot=added.pivot, scale=motion.scale + added.scale)
+            out[path] = out.get(path, Motion()).plus(added)
     return out
 
 

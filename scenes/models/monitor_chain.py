@@ -155,8 +155,7 @@ def _traced_out(
 
     spots = np.array([[*p, 0.0] for c in channels for p in (c.pinhole, c.ccd)])
     points = model.focal_plane.apply(spots)[None]
-    guess = np.broadcast_to(-model.image_direction, points.shape)
-    fan = RayFan(points, guess, transverse_axes(guess, np.broadcast_to(LINE_AXIS, guess.shape)))
+    fan = RayFan.toward(points, -model.image_direction, LINE_AXIS)
     where = " and ".join(c.key for c in channels)
     q = _aimed(backend, to_stop, fan, np.zeros(2), where, ("monitor", "field"))
     position, direction = fan.at(q)
@@ -386,8 +385,7 @@ def square_facets(
             None
         ]
         guess = cameras[channel.camera].toward_optics(placed.pose(f"{BASE}/{channel.camera}/focal_plane").rotation)
-        guess = np.broadcast_to(guess, start.shape)
-        fan = RayFan(start, guess, transverse_axes(guess, np.broadcast_to([0.0, 1.0, 0.0], guess.shape)))
+        fan = RayFan.toward(start, guess)
         arriving = assembly.with_element(Element("arriving", channel.face_body, plane(), Interaction.PASS))
         systems = assemble(arriving, [(*names[:-1], "arriving")])
         q = _aimed(backend, systems, fan, np.zeros(2), channel.key, (CENTRAL_KEY, "position"))

@@ -22,8 +22,8 @@ from optics.geometry.pose import Pose
 from optics.geometry.solid import Face, Solid, SolidError, face_plane, solid_mesh
 from optics.geometry.tree import PlacedBodies, State
 from optics.numerics.backend import Backend
-from optics.numerics.quadrature import even_disk
-from optics.raytrace.aim import AimError, RayFan, aim, surviving_rays, transverse_axes
+from optics.numerics.quadrature import circle, even_disk
+from optics.raytrace.aim import AimError, RayFan, aim, surviving_rays
 from optics.raytrace.assembly import Assembly, Element, points_to_world
 from optics.raytrace.element_numbers import media_along
 from optics.raytrace.system import SystemBatch, assemble
@@ -495,9 +495,8 @@ def _disk(rays: int = RAYS) -> np.ndarray:
 
 def _full_disk() -> np.ndarray:
     """Return N points on rings over the unit disk, (N, 2), with a margin of 0.1 % inside its edge for ray aiming."""
-    angle = 2.0 * np.pi * np.arange(_AROUND) / _AROUND
-    ring = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
-    return np.concatenate([np.zeros((1, 2)), *((k + 1) / _RINGS * (1.0 - 1e-3) * ring for k in range(_RINGS))])
+    ring = (1.0 - 1e-3) * circle(_AROUND)
+    return np.concatenate([np.zeros((1, 2)), *((k + 1) / _RINGS * ring for k in range(_RINGS))])
 
 
 _WHOLE = _full_disk()
@@ -822,8 +821,7 @@ def _through(
     tuple of ndarray
         Positions and unit vectors of the rays, (B, N, 3) each.
     """
-    start, guess = (np.broadcast_to(a, (*target.shape[:2], 3)) for a in (start, guess))
-    fan = RayFan(start, guess, transverse_axes(guess, np.broadcast_to([0.0, 1.0, 0.0], guess.shape)))
+    fan = RayFan.toward(np.broadcast_to(start, (*target.shape[:2], 3)), guess)
     q, _ = aim(backend, systems, fan, target, tolerance=_AIM)
     return fan.at(q)
 

@@ -22,6 +22,7 @@ from scipy.spatial import ConvexHull
 from optics.geometry.aperture import Circle, Rectangle
 from optics.geometry.polygon import area, hull, intersect
 from optics.geometry.tree import PlacedBodies
+from optics.numerics.array_math import solve_pairs
 from optics.numerics.backend import Backend
 from optics.numerics.quadrature import PupilNodes
 from optics.raytrace.aim import transverse_axes
@@ -506,7 +507,7 @@ class _Bundle:
             arm = points - start
             ahead = np.einsum("bvx,bx->bv", arm, self.along) / np.einsum("bvx,bx->bv", displacement, self.along)
             miss = np.einsum("bix,bvx->bvi", self.axes, arm - ahead[..., None] * displacement)
-            out = out + _solved(slope, miss)
+            out = out + solve_pairs(slope, miss)
         return np.where(empty[:, None, None], out[:, :1], out)
 
     def _guess(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -528,7 +529,7 @@ class _Bundle:
         off = np.einsum("bix,bcx->bci", self.axes, points - first - ahead * displacement)
         near, far = (np.einsum("bix,bxj->bij", self.axes, self.spread[:, k])[:, None] for k in (0, 1))
         slope = near + ahead[..., None] * (far - near)
-        return _solved(slope, off), slope
+        return solve_pairs(slope, off), slope
 
     def _ahead(self, points: np.ndarray) -> np.ndarray:
         """Return how far along the path from the first to the second surface points lie, as a fraction of it.
@@ -574,21 +575,6 @@ class _Bundle:
             crossings = np.where(crossing[..., None], crossings, inside)
             corners = np.concatenate([kept, crossings], axis=1)
         return corners
-
-
-def _solved(matrix: np.ndarray, right: np.ndarray) -> np.ndarray:
-    """Solve many systems of two linear equations by Cramer's rule, which is fast for many at once.
-
-    Parameters
-    ----------
-    matrix : (..., 2, 2) ndarray
-        Matrices.
-    right : (..., 2) ndarray
-        Right-hand sides.
-    """
-    (a, b), (c, d) = (np.moveaxis(row, -1, 0) for row in np.moveaxis(matrix, -2, 0))
-    x, y = np.moveaxis(right, -1, 0)
-    return np.asarray(np.stack([d * x - b * y, a * y - c * x], axis=-1) / (a * d - b * c)[..., None])
 
 
 _FAR = 100.0

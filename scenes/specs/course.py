@@ -9,6 +9,7 @@ from typing import Annotated, Any
 
 from pydantic import AfterValidator, Field, WithJsonSchema, model_validator
 
+from optics.geometry.tree import Motion
 from optics.geometry.zernike import MAX_NOLL
 from optics.numerics.array_math import index_of_value
 from optics.numerics.number_tree import FrozenMap
@@ -134,24 +135,14 @@ class MotionCourse(Spec):
         """Name of a quantity (rotate, shift, scale) -> its values, one for each time; None if the file has none."""
         return {"rotate": self.rotate, "shift": self.shift, "scale": self.scale}
 
-    def at(self, k: int) -> "NodeMotion":
+    def at(self, k: int) -> Motion:
         """Return the motion of the body at time number ``k`` of the course, counted from 0."""
-        return NodeMotion(
+        return Motion(
             NO_MOTION if self.rotate is None else self.rotate[k],
             NO_MOTION if self.shift is None else self.shift[k],
-            0.0 if self.scale is None else self.scale[k],
             self.pivot,
+            0.0 if self.scale is None else self.scale[k],
         )
-
-
-@dataclass(frozen=True)
-class NodeMotion:
-    """Motion of a body at one time: rotation vector (radians), shift (metres), relative scale, name of the pivot."""
-
-    rotate: tuple[float, float, float]
-    shift: tuple[float, float, float]
-    scale: float
-    pivot: str
 
 
 class CourseSpec(Spec):
@@ -237,7 +228,7 @@ class CourseSpec(Spec):
             for path, table in self.temperature.items()
         }
 
-    def motions(self, k: int) -> dict[str, NodeMotion]:
+    def motions(self, k: int) -> dict[str, Motion]:
         """Return node path -> motion that the course causes at time number ``k``, counted from 0."""
         return {path: moves.at(k) for path, moves in self.motion.items()}
 

@@ -8,7 +8,7 @@ from optics.geometry.aperture import Circle
 from optics.geometry.surface import Surface
 from optics.geometry.tree import Motion
 from optics.numerics import quadrature
-from optics.waves.imaging import eikonal, fit_wavefront, path_to_sphere
+from optics.waves.imaging import eikonal, fit_part, path_to_sphere
 from tests.optics.bench import PASS, Stage, at, build, run
 
 # Noll, JOSA 66, 207 (1976), table I: index -> n, m (m < 0: sine)
@@ -131,7 +131,7 @@ def test_defocus_of_a_moved_image(backend) -> None:
     difference = path_difference(hit, leaving, path, radius=np.inf)
     cosine = np.abs(leaving[:, 2])
     np.testing.assert_allclose(np.abs(difference), dz * (1.0 - cosine), rtol=1e-3, atol=1e-13)
-    fit = fit_wavefront(NODES.x, NODES.y, NODES.weight, difference[1:])
+    fit = fit_part(NODES.x, NODES.y, NODES.weight, difference[1:])
     assert fit.rms == pytest.approx(dz * (RADIUS / F) ** 2 / 2 / np.sqrt(12), rel=0.01)
     assert abs(fit.coefficients[3]) == pytest.approx(fit.rms, rel=1e-3)
 
@@ -139,7 +139,25 @@ def test_defocus_of_a_moved_image(backend) -> None:
 def test_fit_separates_what_it_is_given() -> None:
     wanted = np.zeros(28)
     wanted[[0, 1, 2, 3, 6, 10, 21]] = [5e-6, 3e-6, -2e-6, 10e-9, -20e-9, 30e-9, 5e-9]
-    fit = fit_wavefront(NODES.x, NODES.y, NODES.weight, wanted @ zernike.basis(28, NODES.x, NODES.y).T)
-    np.testing.assert_allclose(fit.coefficients, wanted, atol=1e-19)
+    fit = fit_part(NODES.x, NODES.y, NODES.weight, wanted @ zernike.basis(28, NODES.x, NODES.y).T)
+    np.testing.assert_allclose([*fit.level, *fit.coefficients[3:]], wanted, atol=1e-19)
     assert fit.rms == pytest.approx(np.linalg.norm(wanted[3:]), rel=1e-10)
     assert fit.residual_rms < 1e-19
+
+
+def test_a_ring_of_positive_weights_is_the_disk_minus_its_hole() -> None:
+    """Both kinds of quadrature, Gauss' over the ring and the disk's less the hole's, have the same contributions."""
+    hole = 0.4
+    point, share = np.polynomial.legendre.leggauss(12)
+    radius = np.sqrt(0.5 * (1.0 + hole**2) + 0.5 * (1.0 - hole**2) * point)
+    angle = 2.0 * np.pi * np.arange(24) / 24
+    x, y = (np.outer(radius, part(angle)).ravel() for part in (np.cos, np.sin))
+    ring = x, y, np.repeat(share, 24)
+    minus = (
+        *(np.append(part, hole * part) for part in (NODES.x, NODES.y)),
+        np.append(NODES.weight, -(hole**2) * NODES.weight),
+    )
+    fits = [fit_part(x, y, weight, 3e-8 * x**3 + 2e-8 * x * y + 1e-8 * y, 15) for x, y, weight in (ring, minus)]
+    for name in ("level", "coefficients", "parts", "rms"):
+        np.testing.assert_allclose(getattr(fits[0], name), getattr(fits[1], name), atol=1e-21, err_msg=name)
+    assert np.linalg.norm(fits[0].parts) == pytest.approx(fits[0].rms, rel=1e-9)

@@ -9,7 +9,7 @@ from optics.raytrace.assembly import points_to_world
 from optics.raytrace.first_order import LineChange, chief_rays, line_change
 from optics.raytrace.system import assemble
 from optics.raytrace.trace import make_rays, trace
-from optics.waves.imaging import fit_wavefront, path_to_sphere
+from optics.waves.imaging import fit_part, path_to_sphere
 from scenes.models.camera_model import IMAGE, CameraModel, collimated, field_direction
 from tests.tiers import quick
 
@@ -42,9 +42,7 @@ def wavefront_error(model: CameraModel, rays: tuple[np.ndarray, ...]) -> float:
     """Waves rms at the camera's wavelength, tilt removed."""
     radius = float(model.first_order.exit_pupil_distance[0])
     to_sphere = path_to_sphere(*rays, rays[0][:1], radius)
-    return (
-        float(fit_wavefront(NODES.x, NODES.y, NODES.weight, to_sphere[0] - to_sphere[1:]).rms) / model.spec.wavelength
-    )
+    return float(fit_part(NODES.x, NODES.y, NODES.weight, to_sphere[0] - to_sphere[1:]).rms) / model.spec.wavelength
 
 
 def line_geometry(backend, model: CameraModel, states: list[State]) -> LineChange:

@@ -264,9 +264,7 @@ def test_edges_take_the_share_of_their_area(backend, cut, bare) -> None:
         # 10 000 rays spread evenly tell an area to its outline over their distance: 1e-3
         assert optics.wavefront().vignetted == pytest.approx(share, abs=2e-3), text
     with pytest.raises(InputError, match="edges block practically all light"):
-        FieldBeams.field_errors(
-            derive_camera(with_edges("{clear: circle, radius: 5 mm}"), backend), backend, [(0.0, 0.0)], 6
-        )
+        CameraOptics.alone(with_edges("{clear: circle, radius: 5 mm}"), backend).errors([(0.0, 0.0)], 6)
 
 
 @pytest.mark.second
@@ -296,7 +294,7 @@ def test_every_table_tells_one_wavefront_error_of_a_cut_beam(backend, cut) -> No
     # maps over the field and through focus trace the same rays, one to the image and one to the focal plane: rounding
     # of metres of path; these 10 000 are right to what they stand for in a wavefront, too
     close = {"rtol": 1e-6, "atol": 1e-8}
-    mapped = FieldBeams.field_errors(cut.model, backend, fields, 5)
+    mapped = cut.errors(fields, 5)
     np.testing.assert_allclose(mapped, rms, rtol=RAYS_ACCURACY)
     np.testing.assert_allclose(field_curves(cut, False, 3).error[[0, 2]], rms[:2], **close)
     focus = through_focus(cut, fields, False)

@@ -10,7 +10,6 @@ from optics.numerics.array_math import UnphysicalError
 from optics.raytrace.trace import BeamMissedError
 from optics.waves.optical_transfer import polychromatic_transfer
 from scenes.models.camera_model import field_direction
-from scenes.models.camera_sharpness import FieldBeams
 from scenes.specs.spectrum import SpectrumSpec
 from tests.oracles.test_reference_cameras import bundle, rms_spot, wavefront_error
 from tests.scenes.lens.colour_cameras import colour_camera
@@ -67,7 +66,7 @@ def test_what_prisms_take_is_missing_in_every_table(backend, gf7_pair) -> None:
     whole = CameraOptics.within(gf7_pair, "forward", backend, obstruction=False)
     rms = [wave.rms for wave in waves]
     # maps are of 10 000 rays
-    mapped = FieldBeams.field_errors(view.model, backend, fields, 5, view.cut)
+    mapped = view.errors(fields, 5)
     np.testing.assert_allclose(mapped, rms, rtol=RAYS_ACCURACY)
     focus = through_focus(view, fields, False)
     np.testing.assert_allclose(focus.error[:, len(focus.defocus) // 2], mapped, rtol=1e-6)

@@ -12,7 +12,7 @@ from optics.numerics import quadrature
 from optics.raytrace.assembly import points_to_world
 from optics.raytrace.first_order import chief_rays
 from optics.raytrace.system import assemble
-from optics.waves.imaging import aim_collimated, fit_wavefront, path_to_sphere
+from optics.waves.imaging import aim_collimated, fit_part, path_to_sphere
 from scenes.models.camera_model import LAUNCH_DISTANCE
 from twin.monitor.image_quality import FIELDS, QUALITY
 from twin.monitor.image_quality import image_quality as quality_of
@@ -68,7 +68,7 @@ def launched(instrument, backend, state, direction: np.ndarray) -> np.ndarray:
 
 
 def rms(difference: np.ndarray) -> float:
-    return float(fit_wavefront(NODES.x, NODES.y, NODES.weight, difference[1:]).rms) / WAVELENGTH
+    return float(fit_part(NODES.x, NODES.y, NODES.weight, difference[1:]).rms) / WAVELENGTH
 
 
 def test_a_camera_that_turns_as_a_whole_is_as_sharp(quality) -> None:

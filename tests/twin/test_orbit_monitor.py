@@ -13,6 +13,7 @@ from scipy.stats import chi2
 from analysis.monitor.disturbances import Disturbances
 from analysis.monitor.model_fit import unobservable_modes
 from analysis.orbit.forward_intersection import CalibratedLine, IntersectionError, Sightings, intersect_pair
+from analysis.statistics import rms
 from optics.geometry.tree import Motion
 from scenes.models.disturbances import state_of
 from scenes.specs.course import CourseSpec
@@ -31,7 +32,6 @@ from twin.orbit.monitoring.loop_run import LoopRun
 from twin.orbit.monitoring.monitoring_numbers import CORRECTION, LOOP
 from twin.orbit.monitoring.monitoring_report import monitor_report
 from twin.orbit.monitoring.monitoring_run import run_monitor
-from twin.orbit.monitoring.pair_flight import rms
 
 ARCSEC = np.pi / 648000
 FALSE_ALARM = 1e-6

@@ -19,14 +19,14 @@ from optics.numerics.number_tree import FrozenMap
 from scenes.models.disturbances import DisturbancePrior, prior_of_spec
 from scenes.specs.asbuilt import AsBuiltSetup, MeasurementsSpec
 from scenes.specs.tolerance import OF_MONITOR, MeritSpec, ToleranceBudgetSpec, ToleranceSetup
-from scenes.yaml.errors import names_text, unknown
+from scenes.yaml.errors import names_text
 from twin.asbuilt.measured_kinds import KINDS, MeasuredKind, Site, View
 from twin.asbuilt.parameters import Parameters
 from twin.camera.camera_optics import CameraOptics
 from twin.camera.varied_beams import VariedBeams
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.monitor.truth import line_points
-from twin.tolerance.tolerance_bench import ToleranceBench
+from twin.tolerance.tolerance_bench import ToleranceBench, judged_camera
 
 STEP = 0.05
 """Step of the central differences with respect to a parameter, in standard deviations of its prior.
@@ -77,7 +77,7 @@ class AsBuiltBench(Site):
             allowed = "the nominal instrument"
             raise self.test.error(problem, ("instrument",), found=self.test.instrument, allowed=allowed)
         self.experiment = MonitorExperiment(setup.base, backend)
-        self.camera = self._camera_name()
+        self.camera = judged_camera(self.test, self.experiment.instrument)
         self.line = line_points(self.experiment.instrument, self.camera)
         prior = self.experiment.stated
         if prior is None or not prior.components:
@@ -96,14 +96,6 @@ class AsBuiltBench(Site):
                 allowed = "`twin.uncertainty` on the resulting instrument"
                 raise self.test.error(problem, ("merits", name, "kind"), found=merit.kind, allowed=allowed)
         self.merits = self.bench(dict(self.test.merits))
-
-    def _camera_name(self) -> str:
-        names = tuple(self.experiment.instrument.cameras)
-        if self.test.camera is None and len(names) > 1:
-            raise self.test.error("the instrument has several cameras", ("camera",), allowed=names_text(names))
-        if self.test.camera is not None and self.test.camera not in names:
-            raise self.test.error(unknown("no such camera", self.test.camera, names), ("camera",))
-        return self.test.camera or names[0]
 
     def _kinds(self, measured: MeasurementsSpec, where: str) -> tuple[MeasuredKind, ...]:
         return tuple(KINDS[kind](self, name, spec, (where, kind, name)) for kind, name, spec in measured.named())

@@ -131,9 +131,12 @@ class MeasuredKind(ABC):
         PhysicalError is raised if the light of a state is lost.
         """
 
-    @abstractmethod
     def covariance(self) -> np.ndarray:
-        """Return the covariance of the random errors of the D readings, (D, D), in squared SI units."""
+        """Return the covariance of the random errors of the D readings, (D, D), in squared SI units.
+
+        By default all have the same variance, without correlation.
+        """
+        return np.asarray(self.spec.sigma**2 * np.eye(len(self.labels)))
 
     def biases(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return the effect of each systematic error on the readings, and the standard deviations of these errors.
@@ -200,10 +203,6 @@ class WavefrontReadings(MeasuredKind):
         paths = self.beams.light(view.states).paths
         return np.asarray(np.einsum("ftn,sfn->sft", self.rows, paths).reshape(len(view.states), -1))
 
-    def covariance(self) -> np.ndarray:
-        """Return the covariance of the Zernike terms: the same variance for all, without correlation."""
-        return np.asarray(self.spec.sigma**2 * np.eye(len(self.labels)))
-
     def biases(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return the effects of an unknown focus at each field, and of a reference error of each Zernike term.
 
@@ -255,8 +254,7 @@ class FocusReadings(MeasuredKind):
 
     def covariance(self) -> np.ndarray:
         """Return the covariance of the foci: independent errors, and one error common to all fields."""
-        count = len(self.labels)
-        return np.asarray(self.spec.sigma**2 * np.eye(count) + self.spec.common**2)
+        return super().covariance() + self.spec.common**2
 
     def read(self) -> np.ndarray:
         """Return the best foci in the test's file, or in focus.json, metres."""
@@ -297,10 +295,6 @@ class MtfReadings(MeasuredKind):
     def predict(self, view: View) -> np.ndarray:
         """Return the MTF of each field and direction in every state."""
         return self.tried.parts_of(view.states)
-
-    def covariance(self) -> np.ndarray:
-        """Return the covariance of the MTF values: the same variance for all, without correlation."""
-        return np.asarray(self.spec.sigma**2 * np.eye(len(self.labels)))
 
     def read(self) -> np.ndarray:
         """Return the MTF values in the test's file."""
@@ -412,10 +406,6 @@ class SpotReadings(MeasuredKind):
         """Return the spot positions relative to the nominal ones, pixels: energy centroids, as means of traced rays."""
         return self._positions(view.states) - self.nominal
 
-    def covariance(self) -> np.ndarray:
-        """Return the covariance of the spot coordinates: the same variance for all, without correlation."""
-        return np.asarray(self.spec.sigma**2 * np.eye(len(self.labels)))
-
     def read(self) -> np.ndarray:
         """Return the spot positions in the file minus the nominal ones, pixels."""
         path = self.file("file", self.spec.file, "a CSV file, or the recovered.json of a run")
@@ -505,7 +495,7 @@ class TemperatureReadings(MeasuredKind):
 
     def covariance(self) -> np.ndarray:
         """Return the covariance of the temperatures: independent errors, and one error common to all readings."""
-        return np.asarray(self.spec.sigma**2 * np.eye(len(self.labels)) + self.spec.common**2)
+        return super().covariance() + self.spec.common**2
 
     def read(self) -> np.ndarray:
         """Return the temperatures in the test's file above nominal, kelvin."""
@@ -535,13 +525,6 @@ class PositionReadings(MeasuredKind):
     def predict(self, view: View) -> np.ndarray:
         """Return the displacements of the bodies' origins from the drawing in each state, metres."""
         return np.asarray((self._positions(view.states) - self.nominal).reshape(len(view.states), -1))
-
-    def covariance(self) -> np.ndarray:
-        """Return the covariance of the 3 N coordinates of N bodies' displacements, (3 N, 3 N), in m^2.
-
-        All coordinates have the same variance and are uncorrelated.
-        """
-        return np.asarray(self.spec.sigma**2 * np.eye(len(self.labels)))
 
     def biases(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return the effect on the readings of an unknown shift and rotation of the measuring machine's frame."""

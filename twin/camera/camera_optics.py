@@ -26,9 +26,10 @@ from optics.geometry.tree import State
 from optics.numerics.array_math import UnphysicalError, check_range
 from optics.numerics.backend import Backend, one_blas_thread
 from optics.numerics.number_tree import FrozenMap
+from optics.numerics.quadrature import circle
 from optics.raytrace.assembly import Assembly
 from optics.raytrace.first_order import equal_area_radius
-from optics.waves.imaging import path_to_sphere
+from optics.waves.imaging import fit_part, path_to_sphere
 from optics.waves.line_transfer import line_transfers
 from optics.waves.optical_transfer import polychromatic_transfer
 from optics.waves.pupil_shadow import SMALLEST
@@ -55,7 +56,7 @@ from twin.camera.camera_results import (
     in_cycles_per_m,
     in_si,
 )
-from twin.camera.cut_wavefront import RAYS_ACCURACY, WORST_LIGHT, fit_by_rays, fit_illuminated
+from twin.camera.cut_wavefront import RAYS_ACCURACY, WORST_LIGHT, fit_illuminated
 from twin.targets.target_path import LineRays, TargetPath
 
 RINGS = 12
@@ -266,19 +267,13 @@ class CameraOptics:
         for k, where in enumerate(fields):
             passed = rays.valid[k]
             weight = nodes.weight * passed[node_slice]
-            tilt = zernike.fit(3, nodes.x, nodes.y, error[k, node_slice], weight)
             exact = None
             if is_vignetted:
                 exact = fit_illuminated(self.path, self.state, sight[k], RINGS, float(light[k]), self.path_error, terms)
-            tilt = tilt if exact is None else exact.fit.level
-            flat = error[k] - zernike.basis(3, *stop.T) @ tilt
+            fit = fit_part(nodes.x, nodes.y, weight, error[k, node_slice], terms) if exact is None else exact.fit
+            flat = error[k] - zernike.basis(3, *stop.T) @ fit.level
             table = np.full(inside.shape, np.nan)
             table[inside] = np.where(passed, flat, np.nan)[1 + nodes.count + len(edge) :]
-            statistics = (
-                fit_by_rays(nodes, weight, flat[node_slice], terms, bool(np.all(passed)))
-                if exact is None
-                else exact.fit
-            )
             through = float(np.sum(weight) / np.sum(nodes.weight)) if exact is None else exact.light
             wave = Wavefront(
                 field=(float(where[0]), float(where[1])),
@@ -287,12 +282,12 @@ class CameraOptics:
                 x=axis,
                 y=axis,
                 map=table,
-                coefficients=statistics.coefficients,
-                parts=statistics.parts,
-                rms=statistics.rms,
+                coefficients=fit.coefficients,
+                parts=fit.parts,
+                rms=fit.rms,
                 peak_to_valley=float(np.ptp(flat[1:][passed[1:]])),
-                residual=statistics.residual_rms,
-                strehl=statistics.strehl,
+                residual=fit.residual_rms,
+                strehl=fit.strehl,
                 vignetted=1.0 - through,
                 position=self._place(rays, k),
                 hole=(np.nan if is_vignetted else 0.0) if exact is None else exact.hole,
@@ -395,10 +390,10 @@ class CameraOptics:
         )
 
     @one_blas_thread()
-    def errors(self, fields: Sequence[Field | FieldText] | np.ndarray) -> np.ndarray:
+    def errors(self, fields: Sequence[Field | FieldText] | np.ndarray, rings: int = RINGS) -> np.ndarray:
         """Compute rms wavefront errors at F fields, (F, 2), in waves of the design wavelength, (F,).
 
-        Piston and tilt are removed.
+        Piston and tilt are removed. ``rings`` is the number of rings of the quadrature over the stop.
 
         Raises
         ------
@@ -406,9 +401,9 @@ class CameraOptics:
             In this state the light misses the stop or the plane of the line CCD.
         """
         all_fields, plane = self.fractions(fields), FocalPlane.of(self.model.spec)
-        step = max(1, MAX_RAYS // stop_nodes(self.model, RINGS, self.cut is not None).count)
+        step = max(1, MAX_RAYS // stop_nodes(self.model, rings, self.cut is not None).count)
         parts = [all_fields[start : start + step] for start in range(0, len(all_fields), step)]
-        return np.concatenate([self.beams(part).errors(plane) for part in parts])
+        return np.concatenate([self.beams(part, rings).errors(plane) for part in parts])
 
     def pupils(self, fields: Sequence[Field | FieldText] | np.ndarray) -> tuple[PupilFunction, ...]:
         """Compute the exit pupils of F fields, (F, 2), with image axes along the line and along the track.
@@ -576,5 +571,4 @@ def even_step(frequency: np.ndarray) -> bool:
 
 def rim(count: int) -> np.ndarray:
     """Return points evenly spaced just inside the edge of the stop, in units of its radius, (count, 2)."""
-    azimuth = 2.0 * np.pi * np.arange(count) / count
-    return np.asarray(INSIDE * np.stack([np.cos(azimuth), np.sin(azimuth)], axis=-1))
+    return np.asarray(INSIDE * circle(count))

@@ -20,7 +20,7 @@ from optics.numerics.backend import Backend
 from optics.raytrace.first_order import LineChange
 from scenes.models.camera_design import with_plane
 from scenes.models.camera_model import focal_plane_body
-from scenes.models.camera_sharpness import BLURRED, FIELDS, FieldBeams, FocalPlane, field_text
+from scenes.models.camera_sharpness import BLURRED, FIELDS, FocalPlane, field_text
 from scenes.models.instrument_builder import build_instrument
 from scenes.models.job_state import job_state, motions_of
 from scenes.models.thermal_model import ThermalModel
@@ -39,7 +39,7 @@ from twin.camera.aberrations import (
     ray_fans,
     third_order,
 )
-from twin.camera.camera_optics import CameraOptics
+from twin.camera.camera_optics import RINGS, CameraOptics
 from twin.camera.camera_results import Field, Mtf, Spot, Wavefront
 from twin.camera.colour import COLOURS, Colours, colour_data, evaluate_colours
 from twin.camera.first_order_data import FIRST_ORDER, FirstOrderData, first_order_data
@@ -66,6 +66,9 @@ FAN_FIELDS: tuple[Field, ...] = ((0.0, 0.0), (1.0, 0.0), (1.0, 1.0))
 
 ERROR_GRID = (25, 9)
 """Number of fields along the line and along the track at which the map of rms wavefront errors is computed."""
+
+MAP_RINGS = 5
+"""Number of rings of the quadrature over the stop for that map of a camera as designed."""
 
 MAP_POINTS = 129
 """Number of points of a wavefront map along each axis of the stop."""
@@ -299,9 +302,7 @@ def run_camera(
     advance("focus", 1, 1)
     field = field_maps.field_grid(ERROR_GRID)
     where = tuple(map(tuple, field.reshape(-1, 2)))
-    errors = (
-        optics.errors(where) if built else FieldBeams.field_errors(optics.model, backend, where, 5, optics.cut)
-    ).reshape(field.shape[:2])
+    errors = optics.errors(where, RINGS if built else MAP_RINGS).reshape(field.shape[:2])
     if setup.perturb:
         change = trace_truth(instrument, backend, [state]).cameras[mounted]
         perturbed = Perturbed(

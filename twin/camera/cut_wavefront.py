@@ -11,9 +11,8 @@ from optics.geometry.polygon import covered
 from optics.geometry.tree import State
 from optics.numerics import quadrature
 from optics.numerics.array_math import UnphysicalError
-from optics.numerics.quadrature import PupilNodes
 from optics.waves.edge_shadow import IlluminatedStop, holes
-from optics.waves.imaging import PartFit, fit_part, fit_wavefront, orthonormal_parts
+from optics.waves.imaging import PartFit, fit_part
 from optics.waves.pupil_shadow import SMALLEST
 from optics.waves.pupil_terms import products, smooth_terms
 from twin.targets.target_path import LineRays, TargetPath
@@ -157,33 +156,3 @@ def _tamed(stop: IlluminatedStop, pieces: np.ndarray, rings: int, wave: np.ndarr
     light_values = free[None, ring_nodes], wave[None, ring_nodes, None]
     terms = smooth_terms(table[ring_nodes], stop.weight[0, ring_nodes], *light_values)
     return np.where(free, wave, table @ terms[0, :, 0])
-
-
-def fit_by_rays(nodes: PupilNodes, weight: np.ndarray, flat: np.ndarray, terms: int, free: bool) -> PartFit:
-    """Compute the statistics of a levelled wavefront from the rays that pass.
-
-    Parameters
-    ----------
-    nodes : PupilNodes
-        The N quadrature nodes of the stop.
-    weight : (N,) ndarray
-        Weights of the nodes, 0 where no light passes.
-    flat : (N,) ndarray
-        Wavefront error without piston and tilt, waves.
-    terms : int
-        Number of Zernike terms.
-    free : bool
-        True if none of the weights is 0.
-    """
-    fit = fit_wavefront(nodes.x, nodes.y, weight, flat, terms)
-    # over a part of the disk several terms contain tilt, which was removed from the wavefront before
-    rms = fit.rms if free else np.sqrt(np.sum(weight * flat**2) / np.sum(weight))
-    phasor = np.sum(weight * np.exp(2j * np.pi * flat)) / np.sum(weight)
-    return PartFit(
-        np.zeros(3),
-        fit.coefficients,
-        orthonormal_parts(nodes.x, nodes.y, weight, flat, terms),
-        float(rms),
-        float(fit.residual_rms),
-        float(np.abs(phasor) ** 2),
-    )

@@ -12,7 +12,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from optics.geometry import zernike
 from optics.geometry.polygon import area
 from optics.geometry.tree import PlacedBodies, State
 from optics.numerics import quadrature
@@ -22,7 +21,7 @@ from optics.raytrace.aim import RayFan, aim, transverse_axes
 from optics.raytrace.system import assemble
 from optics.raytrace.trace import BeamMissedError, make_rays, trace
 from optics.waves.edge_shadow import IlluminatedStop
-from optics.waves.imaging import path_to_sphere
+from optics.waves.imaging import orthonormal_rows, path_to_sphere
 from optics.waves.pupil_shadow import SMALLEST
 from optics.waves.pupil_terms import products, to_terms
 from scenes.models.camera_model import LAUNCH_DISTANCE, glass_steps, in_glass
@@ -329,13 +328,7 @@ class VariedBeams:
         out = []
         for x, y, share in self.illuminated_nodes():
             table = products(x, y, self.degree) @ self.solve
-            basis = zernike.basis(last, x, y)
-            gram = basis.T @ (share[:, None] * basis)
-            try:
-                root = np.linalg.cholesky(gram)
-            except np.linalg.LinAlgError as error:
-                raise UnphysicalError(f"{last} Zernike terms are not independent over the light that passes") from error
-            out.append(-np.linalg.solve(root, basis.T @ (share[:, None] * table)))
+            out.append(-orthonormal_rows(x, y, share, last)[0] @ table)
         return np.stack(out)
 
     @cached_property

@@ -19,6 +19,7 @@ from scipy.spatial import ConvexHull
 from analysis.monitor.disturbances import Disturbances
 from optics.numerics.backend import Backend, load_backend
 from optics.numerics.number_tree import FrozenMap
+from optics.numerics.quadrature import circle
 from optics.raytrace.aim import AimError
 from optics.raytrace.trace import BeamMissedError
 from scenes.models import monitor_layout
@@ -358,10 +359,8 @@ def _light(instrument: Instrument, backend: Backend) -> np.ndarray:
 
     Segments inside glass are omitted. Array dimensions: N segments, K cameras; each segment has two end points.
     """
-    angle = 2.0 * np.pi * np.arange(_AROUND) / _AROUND
-    edge = 0.999 * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
     out = []
-    for beam in monitor_beams(instrument, backend, np.concatenate([np.zeros((1, 2)), edge])):
+    for beam in monitor_beams(instrument, backend, np.concatenate([np.zeros((1, 2)), 0.999 * circle(_AROUND)])):
         first = len(instrument.cameras[beam.channel.camera].mirrors)
         last = len(instrument.assembly.sequences[f"{beam.channel.key}/outgoing"])
         out.append(beam.segments[:, [k for k in range(first, last) if beam.inside[k] is None]])

@@ -26,7 +26,7 @@ larger rows.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -38,7 +38,7 @@ from analysis.spots.centroid import energy_centroid, mean_frames
 from analysis.spots.spot_positions import SpotPositions
 from optics.geometry import zernike
 from optics.geometry.aperture import Circle
-from optics.geometry.pose import Pose, about_axis, rotation_matrix
+from optics.geometry.pose import Pose, about_axis, rotation_matrix, triple
 from optics.geometry.surface import Surface, plane
 from optics.geometry.tree import Body, Motion, PlacedBodies, RigidTree, State
 from optics.materials.glass import glass
@@ -614,7 +614,6 @@ def run_autocollimator_test(
     seed: int = 0,
     ideal: bool = False,
     reader: Reader | None = None,
-    progress: Callable[[str], None] | None = None,
 ) -> ReadingTable:
     """Simulate the experiment: render and expose the images of every series, and measure the mirrors' rotations.
 
@@ -632,8 +631,6 @@ def run_autocollimator_test(
         Omit all errors of the bench, noise and rounding.
     reader : Reader, optional
         Reader of an earlier run of the same setup, to save the calibration.
-    progress : callable, optional
-        Called with a text that says what is being done.
 
     Raises
     ------
@@ -641,13 +638,9 @@ def run_autocollimator_test(
         A rotation moves a spot off its area CCD.
     """
     all_series = tuple(series_per_axis(setup.spec) if series is None else series)
-    report = progress or (lambda text: None)
-    if reader is None:
-        report("calibrate the autocollimators")
-        reader = Reader(setup, backend)
+    reader = reader or Reader(setup, backend)
     results: dict[Series, SeriesResult] = {}
     for half_angle in dict.fromkeys(s.half_angle for s in all_series):
-        report(f"mirrors {2.0 * np.degrees(half_angle):.4g} deg apart")
         group = [s for s in all_series if s.half_angle == half_angle]
         states = [state for s in group for state in states_of(setup.spec, s, None if ideal else seed)]
         windows = reader.path(half_angle).windows(states)
@@ -685,12 +678,12 @@ def states_of(spec: AutocollimatorTestSpec, series: Series, seed: int | None) ->
     axis = axis / np.linalg.norm(axis)
     out: list[State] = []
     for i, angle in enumerate(angles):
-        state = {axis_body(series.axis): Motion(rotate=_triple(angle * axis))}
+        state = {axis_body(series.axis): Motion(rotate=triple(angle * axis))}
         for n, unit in enumerate(UNITS):
-            rotation = _triple((*jitter[i, n], 0.0))
+            rotation = triple((*jitter[i, n], 0.0))
             state[autocollimator_body(unit)] = Motion(rotate=rotation, scale=float(scale_error[n]))
             state[ccd_body(unit)] = Motion(rotate=(0.0, 0.0, float(roll[n])))
-            state[mirror_body(unit)] = Motion(rotate=_triple((*mount[n], 0.0)))
+            state[mirror_body(unit)] = Motion(rotate=triple((*mount[n], 0.0)))
         out.append(state)
     return out
 
@@ -742,11 +735,6 @@ def declared_spread(
     )
 
 
-def _triple(vector: Sequence[float] | np.ndarray) -> tuple[float, float, float]:
-    """Return a vector of three as a tuple of floats."""
-    return float(vector[0]), float(vector[1]), float(vector[2])
-
-
 class Reader:
     """Detectors and calibration of the two autocollimators, which are equal.
 
@@ -787,9 +775,7 @@ class Reader:
         rotations = np.stack([*np.meshgrid(angles, angles, indexing="ij"), np.zeros((len(angles),) * 2)], -1).reshape(
             -1, 3
         )
-        windows = self.path(p.narrow).windows(
-            [{axis_body("X"): Motion(rotate=_triple(rotation))} for rotation in rotations]
-        )
+        windows = self.path(p.narrow).windows([{axis_body("X"): Motion(rotate=triple(turn))} for turn in rotations])
         photons, corner = windows.photons[0], windows.corner[0]
         positions, _ = self.positions(self.detector.expected_dn(photons, self.exposure), corner)
         return autocollimator.ReadingMap.fit(

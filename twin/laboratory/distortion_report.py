@@ -10,7 +10,7 @@ import numpy as np
 from analysis.arrays import ARCSEC
 from analysis.orientation.interior import design
 from analysis.spots.centroid import mean_frames
-from analysis.statistics import gain
+from analysis.statistics import gain, rms
 from optics.numerics.number_tree import FrozenMap
 from scenes.specs.camera_tests import MeasuredDistortionSpec
 from scenes.yaml.units import ANGLE, LENGTH, format_quantity
@@ -21,7 +21,7 @@ from twin.framework.svg import BLUE, GREY, INK, LIGHT, ORANGE, VERMILION, look, 
 from twin.laboratory import distortion_run, turntable_run
 from twin.laboratory.distortion_run import DISTORTION, ESTIMATE, POINTS, TRUTH, DistortionRun, SimulatedDistortion
 from twin.laboratory.turntable_report import FIT_NAMES, rejected_table
-from twin.laboratory.turntable_run import DOUBTFUL, rms
+from twin.laboratory.turntable_run import DOUBTFUL
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from analysis.arrays import ARCSEC, MM_PER_M, Array
 from analysis.orientation import interior
 from analysis.spots.spot_positions import SpotError
+from analysis.statistics import rms
 from analysis.turntable.dividing_error import (
     FITS,
     CalibrationSeries,
@@ -50,7 +51,7 @@ from twin.laboratory.measured_readings import (
     read_turntable,
     unwrapped,
 )
-from twin.laboratory.turntable_run import TurntableModel, rms, usable_fits
+from twin.laboratory.turntable_run import TurntableModel, usable_fits
 
 CLOSED_FORMS = tuple(name for name in FITS if name != "network")
 """Names of the closed-form fits of the turntable's dividing error from which the compensation is chosen.

@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from analysis.arrays import Array
-from analysis.statistics import p_value_of
+from analysis.statistics import p_value_of, rms
 from analysis.turntable.dividing_error import (
     FITS,
     AngleFit,
@@ -417,11 +417,6 @@ def usable_fits(
         issue = files.error("too few angles for any fit", ("comparisons",), found=text, allowed="more angles or folds")
         raise issue
     return enough, tuple(name for name in names if name not in enough)
-
-
-def rms(value: Array) -> float:
-    """Return the root mean square of an array."""
-    return float(np.sqrt(np.mean(value**2)))
 
 
 def run_turntable_test(

@@ -28,7 +28,6 @@ from analysis.monitor import model_fit
 from analysis.monitor.disturbances import FALSE_ALARM, Disturbances, TimeLaw
 from analysis.monitor.parameters import CameraCalibration
 from analysis.monitor.recovery import MotionModel, Retraced
-from optics.geometry.pose import triple
 from optics.geometry.tree import AT_REST, COMPLEX_STEP, FIGURE, Motion, PlacedBodies, State, compose
 from optics.numerics.array_math import PhysicalError, inverse, matvec
 from optics.numerics.backend import Backend
@@ -644,9 +643,7 @@ def _together(motions: Sequence[ElementaryMotion], amounts: np.ndarray) -> list[
     for row in amounts.tolist():
         out: dict[str, Motion] = {}
         for motion, amount in zip(motions, row, strict=True):
-            new, old = motion.motion(amount), out.get(motion.body, Motion(pivot=motion.pivot))
-            rotate, shift = triple(np.add(old.rotate, new.rotate)), triple(np.add(old.shift, new.shift))
-            out[motion.body] = Motion(rotate, shift, motion.pivot, old.scale + new.scale)
+            out[motion.body] = out.get(motion.body, Motion()).plus(motion.motion(amount))
         states.append(out)
     return states
 

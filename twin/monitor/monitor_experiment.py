@@ -28,15 +28,14 @@ from scenes.models.instrument_builder import build_instrument
 from scenes.models.instrument_model import Instrument
 from scenes.models.job_state import (
     HeatedBody,
-    deformed_face,
-    heated_body,
+    deformations_of,
+    heated_bodies,
     job_state,
     motions_of,
     on_deformed,
     with_heat,
 )
 from scenes.models.thermal_model import ThermalModel
-from scenes.specs.course import NO_MOTION
 from scenes.specs.instrument import SIDES
 from scenes.specs.job import JobSpec
 from scenes.specs.job_tables import DeformationSpec, TableTemperatureSpec
@@ -254,16 +253,7 @@ class MonitorExperiment:
         InputError
             A table does not describe its body.
         """
-        out = {}
-        for path, perturbation in job.perturb.items():
-            spec = perturbation.heat
-            if spec.table is not None:
-                # change and gradient are added to the table, and are not part of it
-                key = path, spec.model_copy(update={"change": 0.0, "gradient": NO_MOTION})
-                if key not in self._heated:
-                    self._heated[key] = heated_body(self.thermal, job, path, spec)
-                out[path] = self._heated[key]
-        return out
+        return heated_bodies(job, self.thermal, self._heated)
 
     def deformed(self, job: JobSpec) -> Mapping[str, NodalDeformation]:
         """Return body -> its deformation from a table of nodes in the job's files.
@@ -275,14 +265,7 @@ class MonitorExperiment:
         InputError
             A table does not describe its body.
         """
-        out = {}
-        for path, perturbation in job.perturb.items():
-            if perturbation.deformation is not None:
-                if (path, perturbation.deformation) not in self._deformed:
-                    face = deformed_face(self.instrument, job, path, perturbation.deformation)
-                    self._deformed[path, perturbation.deformation] = face
-                out[path] = self._deformed[path, perturbation.deformation]
-        return out
+        return deformations_of(job, self.instrument, self._deformed)
 
     @property
     def nominal_photons(self) -> np.ndarray:

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
+from matplotlib.image import AxesImage
 from matplotlib.ticker import MaxNLocator
 
 from twin.framework import svg
@@ -53,44 +52,41 @@ def _mark_unused(axes: Axes, spot: SpotResult) -> None:
 
 def spots_svg(run: RecoverRun, camera: str) -> str:
     """Draw the mean frames of one camera, a row for each channel."""
-    with svg.look(f"measured-{camera}"):
-        panels = _panels(run, camera)
-        norm = asinh_scale(np.concatenate([spot.mean.ravel() for _, states in panels for _, spot, _ in states]))
-        figure, grid = _grid(len(panels))
-        shown = None
-        for line, (channel, states) in enumerate(panels):
-            for axes, (name, spot, position) in zip(grid[line], states, strict=True):
-                shown = axes.imshow(spot.mean, cmap=svg.GRAY, norm=norm, interpolation="none", extent=_extent(spot))
-                _mark_unused(axes, spot)
-                cross(axes, position, svg.BEFORE if name == "before" else svg.AFTER, 0.11 * spot.mean.shape[1])
-                _labels(axes, f"{channel}, {name}", line == len(panels) - 1)
-        assert shown is not None
-        _bar(figure, shown, grid, "mean frame [DN], asinh stretch")
-        return svg.to_svg(figure)
+    norm = asinh_scale(np.concatenate([s.mean.ravel() for _, states in _panels(run, camera) for _, s, _ in states]))
+
+    def draw(axes: Axes, name: str, spot: SpotResult, place: np.ndarray) -> AxesImage:
+        shown = axes.imshow(spot.mean, cmap=svg.GRAY, norm=norm, interpolation="none", extent=_extent(spot))
+        cross(axes, place, svg.BEFORE if name == "before" else svg.AFTER, 0.11 * spot.mean.shape[1])
+        return shown
+
+    return _images_svg(run, camera, "measured", "mean frame [DN], asinh stretch", draw)
 
 
 def residuals_svg(run: RecoverRun, camera: str) -> str:
     """Draw the fit residuals of one camera's spots in standard deviations, a row for each channel."""
-    with svg.look(f"left-{camera}"):
+
+    def draw(axes: Axes, _name: str, spot: SpotResult, _place: np.ndarray) -> AxesImage:
+        residual = np.zeros_like(spot.mean) if spot.residual is None else spot.residual
+        return svg.signed_map(axes, residual, LIMIT, interpolation="none", extent=_extent(spot))
+
+    return _images_svg(run, camera, "left", "frame \N{MINUS SIGN} fit [σ]", draw)
+
+
+def _images_svg(
+    run: RecoverRun, camera: str, name: str, label: str, draw: Callable[[Axes, str, SpotResult, np.ndarray], AxesImage]
+) -> str:
+    """Draw an image of every spot of a camera before and after, with marks on the pixels that are not used."""
+    with svg.look(f"{name}-{camera}"):
         panels = _panels(run, camera)
-        figure, grid = _grid(len(panels))
-        shown = None
+        figure = svg.new_figure(0.7 + 4.3 * len(panels), {"w_pad": 0.03, "h_pad": 0.03})
+        grid = figure.subplots(len(panels), 2, squeeze=False)
         for line, (channel, states) in enumerate(panels):
-            for axes, (name, spot, _) in zip(grid[line], states, strict=True):
-                residual = np.zeros_like(spot.mean) if spot.residual is None else spot.residual
-                shown = axes.imshow(
-                    residual, cmap=svg.DIVERGING, vmin=-LIMIT, vmax=LIMIT, interpolation="none", extent=_extent(spot)
-                )
+            for axes, (state, spot, place) in zip(grid[line], states, strict=True):
+                shown = draw(axes, state, spot, place)
                 _mark_unused(axes, spot)
-                _labels(axes, f"{channel}, {name}", line == len(panels) - 1)
-        assert shown is not None
-        _bar(figure, shown, grid, "frame \N{MINUS SIGN} fit [σ]")
+                _labels(axes, f"{channel}, {state}", line == len(panels) - 1)
+        figure.colorbar(shown, ax=list(grid.ravel()), label=label, fraction=0.03, pad=0.02)
         return svg.to_svg(figure)
-
-
-def _grid(rows: int) -> tuple[Figure, Any]:
-    figure = svg.new_figure(0.7 + 4.3 * rows, {"w_pad": 0.03, "h_pad": 0.03})
-    return figure, figure.subplots(rows, 2, squeeze=False)
 
 
 def _labels(axes: Axes, title: str, last: bool) -> None:
@@ -101,10 +97,6 @@ def _labels(axes: Axes, title: str, last: bool) -> None:
     axes.xaxis.set_major_locator(MaxNLocator(6, integer=True))
     axes.yaxis.set_major_locator(MaxNLocator(6, integer=True))
     axes.tick_params(length=2.5, color=svg.INK)
-
-
-def _bar(figure: Figure, shown: Any, grid: Any, label: str) -> None:
-    figure.colorbar(shown, ax=list(grid.ravel()), label=label, fraction=0.03, pad=0.02)
 
 
 @dataclass(frozen=True, eq=False)

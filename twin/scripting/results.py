@@ -104,10 +104,7 @@ class Shot:
             for name, place in targets.places.items()
             for direction in place.before.edges
         }
-        table = pd.DataFrame.from_dict(rows, orient="index")
-        if rows:
-            table.index = pd.MultiIndex.from_tuples(rows, names=["camera", "place", "direction"])
-        return table
+        return _indexed(rows, ["camera", "place", "direction"])
 
     @property
     def quality(self) -> pd.DataFrame:
@@ -124,10 +121,7 @@ class Shot:
             for s, when in enumerate(("before", "after"))
             for k, field in enumerate(() if quality is None else quality.fields)
         }
-        table = pd.DataFrame.from_dict(rows, orient="index")
-        if rows:
-            table.index = pd.MultiIndex.from_tuples(rows, names=["camera", "state", "field"])
-        return table
+        return _indexed(rows, ["camera", "state", "field"])
 
     def _repr_html_(self) -> str:
         notes = "".join(f"<p>⚠ {escape(text)}</p>" for text in self.warnings)
@@ -230,9 +224,7 @@ class Found:
             if key in truth and dataset:
                 columns = (dataset[name], dataset[f"{name}_sigma"], dataset[f"{name}_sigma_noise"])
                 rows[where, key] = self._row(float(truth[key]), *columns)
-        table = pd.DataFrame.from_dict(rows, orient="index")
-        table.index = pd.MultiIndex.from_tuples(rows, names=["camera", "parameter"])
-        return table
+        return _indexed(rows, ["camera", "parameter"])
 
     def _row(self, true: float, readings: xr.DataArray, sigma: xr.DataArray, noise: xr.DataArray) -> dict[str, float]:
         """Return one row of ``compare``: true value, estimates, sigmas, and error of one quantity also in sigmas."""
@@ -249,6 +241,14 @@ class Found:
     def __repr__(self) -> str:
         notes = "".join(f"\nwarning: {text}" for text in self.warnings)
         return _reading_frame(self).to_string() + notes
+
+
+def _indexed(rows: Mapping[tuple[Any, ...], Mapping[str, float]], names: list[str]) -> pd.DataFrame:
+    """Return a table of rows by tuples of labels, whose levels have these names; empty without rows."""
+    table = pd.DataFrame.from_dict(rows, orient="index")
+    if rows:
+        table.index = pd.MultiIndex.from_tuples(rows, names=names)
+    return table
 
 
 def _edge_row(place: PlaceTargets, direction: str) -> dict[str, float]:

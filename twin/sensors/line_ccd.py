@@ -38,6 +38,7 @@ import numpy as np
 from scipy.special import j0, jv
 
 from analysis.spots.noise import NoiseModel
+from optics.numerics.quadrature import gauss_of
 from twin.sensors.area_detector import EmvaDetector, FixedPattern
 
 if TYPE_CHECKING:
@@ -260,9 +261,9 @@ class Collection:
             return 0.5 * self.length * x, 0.5 * w
         within, weight = np.polynomial.legendre.leggauss(_PER_STEP)
         centres = np.arange(self.steps) - 0.5 * (self.steps - 1)
-        nodes = ((centres[:, None] + 0.5 * self.open_share * within) / self.steps).ravel()
+        nodes = self.length / self.steps * (centres[:, None] + 0.5 * self.open_share * within).ravel()
         mass = np.tile(0.5 * weight / self.steps, self.steps)
-        return _gauss(nodes, mass, min(count, len(nodes)), self.length)
+        return gauss_of(nodes, mass, count)
 
     def transfer(self, nu: np.ndarray | float, frequency: float, amplitude: float, phase: float) -> np.ndarray:
         """Return the complex transfer function by which one oscillation of the image multiplies its spectrum, (...).
@@ -410,19 +411,3 @@ class Motion:
             still = float(self.level @ (self.last - self.first))
             out = out * np.exp(-4.0 * np.pi**2 * nu**2 * (still - self._of_bands(lag[..., None])))
         return out
-
-
-def _gauss(position: np.ndarray, mass: np.ndarray, count: int, scale: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return positions and weights of the Gauss rule with ``count`` nodes for a symmetric distribution of points.
-
-    The distribution is given by positions and masses; the method is Stieltjes' procedure (Golub and Welsch).
-    """
-    before, now = np.zeros_like(position), np.full_like(position, 1.0 / np.sqrt(mass.sum()))
-    off, last = [], 0.0
-    for _ in range(count - 1):
-        after = position * now - last * before
-        last = float(np.sqrt(mass @ after**2))
-        before, now = now, after / last
-        off.append(last)
-    nodes, vectors = np.linalg.eigh(np.diag(off, 1) + np.diag(off, -1))
-    return scale * nodes, vectors[0] ** 2

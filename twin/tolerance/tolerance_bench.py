@@ -23,7 +23,9 @@ from optics.numerics.backend import Backend, one_blas_thread
 from optics.raytrace.assembly import Element
 from optics.raytrace.first_order import line_change, line_tangents
 from scenes.models.camera_model import lenses
-from scenes.specs.tolerance import OF_MONITOR, SPECTRUM, ToleranceSetup
+from scenes.models.instrument_model import Instrument
+from scenes.specs.asbuilt import AsBuiltSpec
+from scenes.specs.tolerance import OF_MONITOR, SPECTRUM, ToleranceBudgetSpec, ToleranceSetup
 from scenes.yaml.errors import names_text, unknown
 from twin.camera.camera_optics import CameraOptics
 from twin.camera.varied_beams import AT_ONCE, BeamLight, RoughWavefrontError, VariedBeams, VignettedBeamError
@@ -226,6 +228,16 @@ class AdjustedCameras:
         )
 
 
+def judged_camera(test: ToleranceBudgetSpec | AsBuiltSpec, instrument: Instrument) -> str:
+    """Return the name of the camera that a test judges; raise InputError if it is unknown or one of several."""
+    names = tuple(instrument.cameras)
+    if test.camera is None and len(names) > 1:
+        raise test.error("the instrument has several cameras", ("camera",), allowed=names_text(names))
+    if test.camera is not None and test.camera not in names:
+        raise test.error(unknown("no such camera", test.camera, names), ("camera",))
+    return test.camera or names[0]
+
+
 class ToleranceBench:
     """Nominal camera of a tolerance budget, with its varied parameters, compensators and merits.
 
@@ -266,7 +278,7 @@ class ToleranceBench:
         test = setup.test
         self.experiment = experiment or MonitorExperiment(setup.base, backend)
         instrument = self.instrument = self.experiment.instrument
-        self.camera = self._camera_name()
+        self.camera = judged_camera(setup.test, self.instrument)
         self.line = line_points(instrument, self.camera)
         thermal = self.experiment.thermal
         self.numbers: tuple[VariedParameter, ...] = tolerance_parameters(setup, instrument, thermal)
@@ -296,14 +308,6 @@ class ToleranceBench:
         """Name of each tolerance that is a figure error -> its surface."""
         bodies = {number.entry: next(iter(number.moves)) for number in self.numbers if number.kind == SPECTRUM}
         return {name: self.instrument.assembly.face(body) for name, body in bodies.items()}
-
-    def _camera_name(self) -> str:
-        test, names = self.setup.test, tuple(self.instrument.cameras)
-        if test.camera is None and len(names) > 1:
-            raise test.error("the instrument has several cameras", ("camera",), allowed=names_text(names))
-        if test.camera is not None and test.camera not in names:
-            raise test.error(unknown("no such camera", test.camera, names), ("camera",))
-        return test.camera or names[0]
 
     def _adjusts_before_stop(self) -> bool:
         """Return True if adjustments change the light before the stop, so that rays must be aimed at the stop again."""

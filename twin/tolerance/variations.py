@@ -126,8 +126,7 @@ def actuator_parameter(
     InputError
         The body does not exist, or does not allow the motion.
     """
-    moves = _Maker(test, instrument, thermal)._moves(actuator, ("actuators", name), actuator.range_si or 1.0)
-    return VariedParameter(name, name, actuator.parts[1], 1.0, moves)
+    return _Maker(test, instrument, thermal).compensator(name, actuator, "actuators")
 
 
 @dataclass(frozen=True, eq=False)
@@ -152,8 +151,8 @@ class _Maker:
             for j, size in zip(spec.spectrum, sizes, strict=True)
         ]
 
-    def compensator(self, name: str, spec: CompensatorSpec) -> VariedParameter:
-        moves = self._moves(spec, ("compensators", name), spec.range_si or 1.0)
+    def compensator(self, name: str, spec: CompensatorSpec, section: str = "compensators") -> VariedParameter:
+        moves = self._moves(spec, (section, name), spec.range_si or 1.0)
         return VariedParameter(name, name, spec.parts[1], 1.0, moves)
 
     def _node(self, spec: Varied, name: str, key: KeyPath) -> str:

@@ -25,6 +25,7 @@ from analysis.monitor.control_loop import DECAYING, LimitCycle, Margins
 from analysis.monitor.disturbances import FALSE_ALARM
 from analysis.monitor.model_fit import UnobservableMode, error_floor, unobservable_modes
 from analysis.orbit.forward_intersection import check_errors, intersect_pair
+from analysis.statistics import rms
 from optics.numerics.array_math import index_of_value
 from optics.numerics.number_tree import FrozenMap
 from scenes.specs.orbit.monitor import PARAMETERS
@@ -48,7 +49,6 @@ from twin.orbit.monitoring.pair_flight import (
     OrbitAndAttitude,
     PairFlight,
     fly,
-    rms,
     second_view,
     sightings,
     traced_pair,

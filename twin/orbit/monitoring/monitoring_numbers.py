@@ -12,6 +12,7 @@ import numpy as np
 from analysis.arrays import Array
 from analysis.monitor.model_fit import UnobservableMode
 from analysis.monitor.monitor_formulas import PER_SI
+from analysis.statistics import rms
 from scenes.specs.course import moment
 from twin.framework.artefact import significant
 from twin.framework.record import Quantity, Record
@@ -25,7 +26,7 @@ from twin.orbit.monitoring.loop_run import (
     height_rms,
 )
 from twin.orbit.monitoring.monitoring_run import Cause, MonitorRun, Smoothing
-from twin.orbit.monitoring.pair_flight import CaseErrors, rms
+from twin.orbit.monitoring.pair_flight import CaseErrors
 
 MOST_MOTIONS = 8
 """Largest number of motions listed for an unobservable mode."""

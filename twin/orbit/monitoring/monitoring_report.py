@@ -19,6 +19,7 @@ from analysis.monitor import disturbances
 from analysis.monitor.control_loop import open_loop, rejection
 from analysis.monitor.model_fit import UnobservableMode
 from analysis.monitor.monitor_formulas import PER_SI
+from analysis.statistics import rms
 from scenes.specs.course import moment
 from scenes.specs.orbit.monitor import PARAMETERS
 from scenes.yaml.errors import names_text
@@ -31,7 +32,6 @@ from twin.orbit.monitoring import monitoring_numbers as numbers
 from twin.orbit.monitoring.loop_run import LoopRun, height_rms
 from twin.orbit.monitoring.monitoring_numbers import positions
 from twin.orbit.monitoring.monitoring_run import FALSE_ALARM, MonitorRun
-from twin.orbit.monitoring.pair_flight import rms
 from twin.sensors.area_detector import coarse_warnings
 
 PARTS = {

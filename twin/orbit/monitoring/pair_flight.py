@@ -15,6 +15,7 @@ import numpy as np
 
 from analysis.arrays import ARCSEC
 from analysis.orbit.forward_intersection import CalibratedLine, Sightings, check_errors, intersect_pair
+from analysis.statistics import rms
 from optics.geometry.tree import Motion, State
 from optics.numerics.number_tree import FrozenMap
 from scenes.specs.course import moment
@@ -49,11 +50,6 @@ _STEP = np.array([ARCSEC, ARCSEC, ARCSEC, 10e-6])
 """Steps of the derivatives with respect to a camera's rotations d_alpha, d_beta, d_gamma (rad) and change d_f of the
 principal distance (m), over which the intersection is linear to 1e-5.
 """
-
-
-def rms(values: np.ndarray) -> float:
-    """Return the root mean square of all elements of an array, in its unit."""
-    return float(np.sqrt(np.mean(np.square(values))))
 
 
 def motions_at(spec: OrbitMonitorSpec, time: float, only: str | None = None) -> State:
