@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
+from optics.camera.ghosts import DETECTOR
 from optics.camera.seidel import ABERRATIONS
 from optics.geometry import zernike
 from scenes.models.camera_design import file_with_plane
@@ -44,6 +45,7 @@ def camera_report(run: CameraRun) -> Report:
         _through_focus(run),
         _field(run),
         _third_order(run),
+        _ghosts(run),
         *([_bodies(run)] if run.quality is not None else []),
     ]
     return Report(
@@ -283,6 +285,36 @@ def _third_order(run: CameraRun) -> Section:
     )
     table = Table("third-order", "Coefficients by surface", "Waves.", heads, rows, (None, *[3] * (len(heads) - 1)))
     return Section(title, (text,), (table,))
+
+
+MOST_GHOSTS = 15
+"""Number of ghosts in the report's table, the strongest; all are in optics.json and optics.nc."""
+
+
+def _ghosts(run: CameraRun) -> Section:
+    """Return the section on ghosts by two reflections."""
+    ghosts, image = run.ghosts, run.camera.image
+    if not ghosts:
+        return Section("Ghosts", ("No refracting surfaces: no ghosts.",))
+    share = DETECTOR if image.reflectance is None else image.reflectance
+    text = (
+        "Light in the middle of the field that is reflected twice, at two faces of lenses or at the detector and a "
+        "face. Faces reflect by Fresnel's formulas or as the file states, the detector "
+        f"{100 * share:.3g} %, mirrors all light. The strongest of {len(ghosts)} is {ghosts[0].back}, then "
+        f"{ghosts[0].forward}, with {ghosts[0].irradiance:.2g} of the image's irradiance."
+    )
+    rows: list[list[Cell]] = [
+        [g.back, g.forward, fixed(1e3 * g.focus, 3, True) if np.isfinite(g.focus) else "infinite",
+         1e3 * g.diameter, f"{g.energy:.3g}", f"{g.irradiance:.3g}"]
+        for g in ghosts[:MOST_GHOSTS]
+    ]  # fmt: skip
+    heads = ("back", "forward", "focus [mm]", "spot [mm]", "energy", "irradiance")
+    caption = (
+        "Focus: paraxial, from the image plane along the light. Spot: diameter of the traced light. Energy and "
+        "irradiance: relative to the image, whose diameter is that of its spot or Airy disk."
+    )
+    table = Table("ghosts", "Ghosts, the strongest first", caption, heads, rows, (None, None, None, 3, None, None))
+    return Section("Ghosts", (text,), (table,))
 
 
 def _mtf(run: CameraRun) -> Section:

@@ -12,6 +12,7 @@ import xarray as xr
 
 from analysis.arrays import shows
 from analysis.monitor import parameters
+from optics.camera.ghosts import Ghost
 from optics.geometry import zernike
 from optics.geometry.pose import rotation_matrix, triple
 from optics.geometry.tree import Motion, State, compose
@@ -31,10 +32,12 @@ from scenes.specs.resolved import CameraSetup
 from twin.camera import field_maps
 from twin.camera.aberrations import (
     ENERGY,
+    GHOST,
     THIRD_ORDER,
     PointImages,
     RayFans,
     ThirdOrder,
+    camera_ghosts,
     point_images,
     ray_fans,
     third_order,
@@ -221,6 +224,11 @@ class CameraRun:
     def third_order(self) -> ThirdOrder | None:
         """Third-order aberrations of the nominal camera by surface; None for one that is not centred on an axis."""
         return third_order(self.optics.model)
+
+    @cached_property
+    def ghosts(self) -> tuple[Ghost, ...]:
+        """Ghosts of the nominal camera in the middle of the field, the largest irradiance first."""
+        return camera_ghosts(self.optics.model, self.optics.path.backend)
 
     @cached_property
     def fans(self) -> RayFans:
@@ -626,6 +634,7 @@ CAMERA: Record[CameraRun] = Record(
         record=THIRD_ORDER,
         where_known=True,
     ),
+    Quantity("ghosts", lambda run: run.ghosts, "ghosts, the largest irradiance first", record=GHOST),
     Quantity("colours", lambda run: run.colours, "polychromatic results", record=COLOURS, where_known=True),
     Quantity("distortion", lambda run: run.distortion, record=_DISTORTION),
     Quantity("refocus", lambda run: run.refocus, record=_REFOCUS),
@@ -705,5 +714,15 @@ def camera_data(run: CameraRun) -> xr.Dataset:
     coords["fan"] = ("fan", ["along line", "along track"], named("diameter of the stop"))
     coords["pupil"] = ("pupil", run.fans.pupil, named("coordinate in the stop, in units of its radius"))
     coords["fan_field_share"] = (("fan_field", "direction"), np.array(FAN_FIELDS), named(share))
+    if run.ghosts:
+        pairs = [f"{ghost.back} {ghost.forward}" for ghost in run.ghosts]
+        coords["ghost"] = ("ghost", pairs, named("surfaces that reflect back and forward"))
+        for key, text, units in (
+            ("focus", "paraxial focus of a ghost from the image plane", metres),
+            ("diameter", "diameter of a ghost in the image plane", metres),
+            ("energy", "light of a ghost over that of the image", None),
+            ("irradiance", "mean irradiance of a ghost over that of the image", None),
+        ):
+            data[f"ghost_{key}"] = (("ghost",), [getattr(g, key) for g in run.ghosts], named(text, units))
     attributes = {"title": "wavefronts, MTF and distortion of a camera over its field"}
     return xr.Dataset(data, coords, {**attributes, "reference_frames": frames_text("optics")})
