@@ -19,6 +19,7 @@ from twin.camera.camera_run import CameraRun, built_text, camera_data, perturbed
 from twin.camera.colour import Colours
 from twin.camera.first_order_data import FIRST_ORDER, unmodelled_obscuration
 from twin.camera.layout_plot import layout_figure
+from twin.camera.solid_view import solid_view
 from twin.framework.artefact import Artefact, CameraFile, Cell, SvgFigure, Table, fixed, significant
 from twin.framework.data_files import netcdf
 from twin.framework.report import Report, Section, answer
@@ -31,9 +32,10 @@ _TABLE_TERMS = 15
 def camera_report(run: CameraRun) -> Report:
     """Build the report of a camera analysis: verdict, first-order data, layout, image quality over the field."""
     texts = refocus_text(run), built_text(run), perturbed_text(run)
+    solid, files = solid_view(run)
     verdict_text, more = answer(*verdict(run), "see the wavefronts and the layout")
     sections = [
-        _layout(run),
+        _layout(run, solid),
         *([_refocus(run)] if run.refocus is not None else []),
         _wavefronts(run),
         _spots(run),
@@ -55,7 +57,7 @@ def camera_report(run: CameraRun) -> Report:
         _facts(run),
         first_order_table(run),
         tuple(sections),
-        files={"optics.nc": netcdf(camera_data(run))},
+        files={"optics.nc": netcdf(camera_data(run)), **files},
     )
 
 
@@ -160,12 +162,12 @@ def _before(distance: float | None) -> str:
     return f"{abs(distance):.4g} m {'before' if distance > 0.0 else 'behind'}"
 
 
-def _layout(run: CameraRun) -> Section:
-    """Return the section with drawings of the mirrors, lenses and rays."""
+def _layout(run: CameraRun, solid: Artefact) -> Section:
+    """Return the section with drawings of the mirrors, lenses and rays, and the view in three dimensions."""
     model, backend = run.optics.model, run.optics.path.backend
     caption = "To scale, in the prescription's frame; mirrors with their clear apertures; dash-dotted: the parent axis."
     figure = _figure("layout", "Layout with rays", caption, layout_figure, model, backend)
-    return Section("Layout", (), (figure,))
+    return Section("Layout", (), (figure, solid))
 
 
 def _refocus(run: CameraRun) -> Section:

@@ -23,6 +23,7 @@ from scenes.models.camera_design import with_plane
 from scenes.models.camera_model import focal_plane_body
 from scenes.models.camera_sharpness import BLURRED, FIELDS, FieldBeams, FocalPlane, field_text
 from scenes.models.instrument_builder import build_instrument
+from scenes.models.instrument_model import Instrument
 from scenes.models.job_state import job_state, motions_of
 from scenes.models.thermal_model import ThermalModel
 from scenes.specs.camera import CameraSpec
@@ -181,6 +182,8 @@ class CameraRun:
         Obscuration by bodies of the instrument; None for a camera without one.
     colours : Colours or None
         Results over the spectrum or band; None where neither is specified.
+    mounted_in : Instrument or None
+        Instrument that carries the camera; None for a camera alone in its nominal state.
     """
 
     setup: CameraSetup
@@ -200,6 +203,15 @@ class CameraRun:
     perturbed: Perturbed | None = None
     quality: CameraQuality | None = None
     colours: Colours | None = None
+    mounted_in: Instrument | None = None
+
+    @cached_property
+    def instrument(self) -> Instrument:
+        """Instrument that carries the camera, for the 3-D view; a camera alone forms one."""
+        if self.mounted_in is not None:
+            return self.mounted_in
+        spec, _, name = self.setup.mounted_instrument
+        return build_instrument(spec, {name: self.camera}, self.optics.path.backend)
 
     @cached_property
     def worst(self) -> tuple[float, Field]:
@@ -287,7 +299,7 @@ def run_camera(
         refocused = find_focus(CameraOptics.alone(camera, backend), tilt, setup.mounted)
         camera = with_plane(camera, refocused.after)
     optics = CameraOptics.alone(camera, backend)
-    quality, perturbed = None, None
+    quality, perturbed, instrument = None, None, None
     state: State = {}
     if setup.instrument is not None or setup.perturb:
         instrument_spec, cameras, mounted = setup.mounted_instrument
@@ -356,6 +368,7 @@ def run_camera(
         perturbed=perturbed,
         quality=quality,
         colours=colours,
+        mounted_in=instrument,
     )
 
 
