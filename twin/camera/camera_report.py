@@ -18,7 +18,7 @@ from twin.camera.aberrations import COEFFICIENTS
 from twin.camera.camera_run import CameraRun, built_text, camera_data, perturbed_text, refocus_text, verdict
 from twin.camera.colour import Colours
 from twin.camera.first_order_data import FIRST_ORDER, unmodelled_obscuration
-from twin.camera.layout_plot import layout_figure
+from twin.camera.layout_plot import dimensions, layout_figure
 from twin.camera.solid_view import solid_view
 from twin.framework.artefact import Artefact, CameraFile, Cell, SvgFigure, Table, fixed, significant
 from twin.framework.data_files import netcdf
@@ -167,7 +167,10 @@ def _layout(run: CameraRun, solid: Artefact) -> Section:
     model, backend = run.optics.model, run.optics.path.backend
     caption = "To scale, in the prescription's frame; mirrors with their clear apertures; dash-dotted: the parent axis."
     figure = _figure("layout", "Layout with rays", caption, layout_figure, model, backend)
-    return Section("Layout", (), (figure, solid))
+    rows: list[list[Cell]] = [[start, end, 1e3 * size] for start, end, size in dimensions(model)]
+    about = "Along straight lines between vertices; overall: the parts with their clear apertures, along z, y and x."
+    table = Table("dimensions", "Dimensions", about, ("from", "to", "mm"), rows, (None, None, 3))
+    return Section("Layout", (), (figure, table, solid))
 
 
 def _refocus(run: CameraRun) -> Section:

@@ -322,7 +322,7 @@ def run_camera(
     errors = (
         optics.errors(where) if built else FieldBeams.field_errors(optics.model, backend, where, 5, optics.cut)
     ).reshape(field.shape[:2])
-    if setup.perturb:
+    if setup.perturb and instrument is not None:
         change = trace_truth(instrument, backend, [state]).cameras[mounted]
         perturbed = Perturbed(
             job, change, errors, _nyquist(optics) if errors.max() < MAX_WAVES_FOR_MTF else np.empty((0, 2))
@@ -350,7 +350,7 @@ def run_camera(
         advance("colours", 0, 1)
         colours = evaluate_colours(optics, light, MTF_FIELDS, bool(mtfs))
         advance("colours", 1, 1)
-    return CameraRun(
+    run = CameraRun(
         setup=setup,
         camera=camera,
         optics=optics,
@@ -370,6 +370,11 @@ def run_camera(
         colours=colours,
         mounted_in=instrument,
     )
+    for part in ("images", "ghosts"):  # what takes long is computed here, where its progress is shown
+        advance(part, 0, 1)
+        getattr(run, part)
+        advance(part, 1, 1)
+    return run
 
 
 def _nyquist(optics: CameraOptics) -> np.ndarray:

@@ -255,7 +255,10 @@ def studio_parts(instrument: Instrument, paths: LightPaths, pixel: float) -> lis
 
 
 def still_png(instrument: Instrument, paths: LightPaths, size: tuple[int, int] = (1100, 660)) -> bytes:
-    """Draw an instrument by shaded facets, the farthest first, on a transparent ground; return the PNG file."""
+    """Draw an instrument by shaded facets, the farthest first, on a transparent ground; return the PNG file.
+
+    ``size`` is the largest width and height, pixels; each has two samples.
+    """
     scene = build_scene(instrument, replace(paths, beams=()))
     bodies = points_in_world(scene)
     rays = [drawn_rays(beam) for beam in paths.beams]
@@ -284,10 +287,11 @@ def still_png(instrument: Instrument, paths: LightPaths, size: tuple[int, int] =
     facets, colour = np.concatenate(corners), np.concatenate(colours)
     far = np.argsort(-facets.mean(axis=1) @ view.forward)
     flat = view.project(facets.reshape(-1, 3)).reshape(-1, 4, 2)
-    figure = Figure(figsize=(size[0] / 100.0, size[1] / 100.0), dpi=200)
-    axes = figure.add_axes((0.0, 0.0, 1.0, 1.0), xlim=(0, size[0]), ylim=(size[1], 0))
+    top, bottom = np.floor(np.min(flat[..., 1])) - 24.0, np.ceil(np.max(flat[..., 1])) + 24.0
+    figure = Figure(figsize=(size[0] / 100.0, (bottom - top) / 100.0), dpi=200)
+    axes = figure.add_axes((0.0, 0.0, 1.0, 1.0), xlim=(0, size[0]), ylim=(bottom, top))
     axes.set_axis_off()
-    axes.add_collection(PolyCollection(flat[far], facecolors=colour[far], linewidths=0.0, antialiased=False))
+    axes.add_collection(PolyCollection(list(flat[far]), facecolors=colour[far], linewidths=0.0, antialiased=False))
     out = BytesIO()
     figure.savefig(out, format="png", transparent=True, metadata={"Software": None})
     return out.getvalue()
