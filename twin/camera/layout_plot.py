@@ -63,7 +63,7 @@ def _measure(axes: Axes, across: np.ndarray, along: np.ndarray) -> None:
         )
         upright = 90 if start[0] == end[0] else 0
         box = {"facecolor": "white", "edgecolor": "none", "pad": 0.6}
-        axes.text(*where, f"{text} m", rotation=upright, ha="center", va="center", fontsize=7.5, color=GREY, bbox=box)
+        axes.text(float(where[0]), float(where[1]), f"{text} m", rotation=upright, ha="center", va="center", fontsize=7.5, color=GREY, bbox=box)
 
 
 def _fields(axis: int) -> list[tuple[float, float]]:
@@ -142,8 +142,8 @@ def _drawn(model: CameraModel, name: str, axis: int) -> np.ndarray:
 
 
 def _sizes(model: CameraModel) -> np.ndarray:
-    """Return the least and the largest x, y and z of the sections of all surfaces, (3, 2), metres."""
-    drawn = np.concatenate([_drawn(model, name, axis) for name in (*model.mirrors, IMAGE) for axis in (0, 1)])
+    """Return the least and the largest x, y and z of mirrors, lenses and line CCDs, (3, 2), metres."""
+    drawn = np.concatenate([_drawn(model, name, axis) for name in obstacles(model) for axis in (0, 1)])
     return np.stack([drawn.min(axis=0), drawn.max(axis=0)], axis=-1)
 
 
