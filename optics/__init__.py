@@ -18,6 +18,7 @@ Wavefronts and images
     mtf                 modulation transfer function
     encircled_energy, ensquared_energy    energy of an image within circles or squares
     seidel              third-order aberrations by surface: Seidel and chromatic sums
+    ghosts              ghost images by two reflections at lenses, windows and the detector
     mtf_from_psf        MTF of a sampled image
     airy, annular_mtf   diffraction limits of round pupils, with a central obscuration
 Pupils
@@ -58,6 +59,7 @@ from typing import TYPE_CHECKING, Any
 from optics.numerics.llvm import LibraryMissing, ensure_llvm
 
 if TYPE_CHECKING:
+    from optics.camera.ghosts import Ghost, ghosts
     from optics.camera.image_quality import Wavefront, mtf, psf, wavefront
     from optics.camera.prescription import Camera, OpticalSurface
     from optics.camera.ray_bundle import TracedRays, distortion, launch_rays, spot_radius, trace
@@ -81,6 +83,7 @@ with suppress(LibraryMissing):
 
 __all__ = [
     "Camera",
+    "Ghost",
     "OpticalSurface",
     "PupilNodes",
     "SeidelSums",
@@ -95,6 +98,7 @@ __all__ = [
     "ensquared_energy",
     "fit_zernikes",
     "fresnel",
+    "ghosts",
     "glass",
     "glass_names",
     "launch_rays",
@@ -115,6 +119,7 @@ __all__ = [
 _MODULES = {
     "camera.prescription": ("Camera", "OpticalSurface"),
     "camera.ray_bundle": ("TracedRays", "distortion", "launch_rays", "spot_radius", "trace"),
+    "camera.ghosts": ("Ghost", "ghosts"),
     "camera.image_quality": ("Wavefront", "mtf", "psf", "wavefront"),
     "camera.seidel": ("SeidelSums", "seidel"),
     "geometry.annular_zernike": ("annular_zernike",),

@@ -15,7 +15,7 @@ from optics.geometry.surface import plane
 from optics.numerics import quadrature
 from scenes.models.camera_model import IMAGE, surface_of
 from scenes.models.camera_sharpness import FocalPlane
-from scenes.specs.camera import CameraDesignSpec, CameraSpec, ImageSpec
+from scenes.specs.camera import CameraDesignSpec, CameraSpec
 from scenes.specs.load import load_camera
 from scenes.specs.resolved import ExperimentSetup
 from scenes.yaml.errors import unknown
@@ -108,7 +108,7 @@ def camera_of(start: CameraSpec, prescription: Prescription, name: str, descript
         "name": name,
         "description": description or start.description,
         "mirrors": mirrors,
-        "image": ImageSpec.model_construct(z=image.z, tilt=image.tilt or None),
+        "image": start.image.model_copy(update={"z": image.z, "tilt": image.tilt or None}),
         "field_bias": prescription.field_bias,
     }
     return start.model_copy(update=update)
@@ -116,7 +116,7 @@ def camera_of(start: CameraSpec, prescription: Prescription, name: str, descript
 
 def with_plane(camera: CameraSpec, plane: FocalPlane) -> CameraSpec:
     """Return the camera with another image plane, keeping the location from which it was read."""
-    image = ImageSpec.model_construct(z=plane.z, tilt=plane.tilt or None)
+    image = camera.image.model_copy(update={"z": plane.z, "tilt": plane.tilt or None})
     return camera.model_copy(update={"image": image}).with_source(camera.source)
 
 

@@ -64,27 +64,57 @@ def mirror_triangles(
         Vertex numbers of T triangles, with outward winding.
     """
     x0, x1, y0, y1 = aperture.bounds
-    x, y, face = _grid(aperture, 0.5 * (x1 - x0), 0.5 * (y1 - y0), cells)
-    z = surface.sag(x, y)
+    hole = cells // 4 if isinstance(aperture, Circle) and aperture.inner else 0
+    x, y, face = _grid(aperture, 0.5 * (x1 - x0), 0.5 * (y1 - y0), cells, hole)
+    front = np.stack([x, y, surface.sag(x, y)], axis=-1).reshape(-1, 3)
     thickness = THICKNESS * max(x1 - x0, y1 - y0)
-    flat = (z.max() + thickness) if back > 0 else (z.min() - thickness)
-    n = cells + 1
-    front = np.stack([x, y, z], axis=-1).reshape(-1, 3)
     rear = front.copy()
-    rear[:, 2] = flat
-    up, down = np.arange(cells), np.arange(cells, 0, -1)
-    rim = np.concatenate([up, up * n + cells, cells * n + down, down * n])
-    after = np.roll(rim, -1)
-    offset = n * n
-    edge = np.concatenate([np.stack([rim, rim + offset, after], 1), np.stack([after, rim + offset, after + offset], 1)])
-    faces = np.concatenate([face, face[:, ::-1] + offset, edge])
-    return np.concatenate([front, rear]), faces[:, ::-1] if back > 0 else faces
+    rear[:, 2] = (front[:, 2].max() + thickness) if back > 0 else (front[:, 2].min() - thickness)
+    return _closed(front, rear, face, back, cells, hole)
 
 
-def _grid(aperture: Aperture, half_x: float, half_y: float, cells: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def lens_mesh(model: CameraModel, first: str, last: str) -> trimesh.Trimesh:
+    """Return a lens as a watertight trimesh object between its two faces, in the frame of the first, for drawing."""
+    import trimesh
+
+    pose = model.mirror_pose(first).inverse() @ model.mirror_pose(last)
+    edges = [model.apertures[face] for face in (first, last)]
+    if type(edges[0]) is not type(edges[1]):
+        edges = [edge.enclosing for edge in edges]
+    sides, triangles = [], np.empty((0, 3), int)
+    for face, edge in zip((first, last), edges, strict=True):
+        x0, x1, y0, y1 = edge.bounds
+        x, y, triangles = _grid(edge, 0.5 * (x1 - x0), 0.5 * (y1 - y0), GRID)
+        sides.append(np.stack([x, y, model.surfaces[face].sag(x, y)], axis=-1).reshape(-1, 3))
+    back = 1.0 if pose.translation[2] > 0.0 else -1.0
+    return trimesh.Trimesh(*_closed(sides[0], pose.apply(sides[1]), triangles, back, GRID), process=False)
+
+
+def _closed(
+    front: np.ndarray, rear: np.ndarray, face: np.ndarray, back: float, cells: int, hole: int = 0
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the vertices and triangles of a body between two grids of equal outline, with the walls between them.
+
+    ``hole`` is the half width of a hole, in cells, and ``back`` the side of the front on which the rear lies.
+    """
+    n, offset, middle = cells + 1, len(front), cells // 2
+    faces = [face, face[:, ::-1] + offset]
+    for low, high, inward in ((0, cells, 1), *([(middle - hole, middle + hole, -1)] if hole else [])):
+        up, down = np.arange(low, high), np.arange(high, low, -1)
+        rim = np.concatenate([low * n + up, up * n + high, high * n + down, down * n + low])[::inward]
+        after = np.roll(rim, -1)
+        faces += [np.stack([rim, rim + offset, after], 1), np.stack([after, rim + offset, after + offset], 1)]
+    out = np.concatenate(faces)
+    return np.concatenate([front, rear]), out[:, ::-1] if back > 0 else out
+
+
+def _grid(
+    aperture: Aperture, half_x: float, half_y: float, cells: int, hole: int = 0
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return a grid of points about the middle of an aperture, and the T triangles between them.
 
-    The grid has the outline of the aperture's mesh: a disk, ring by ring, or a box.
+    The grid has the outline of the aperture's mesh: a disk, ring by ring, or a box. Within ``hole`` cells of the middle
+    of a ring there are no triangles.
 
     Returns
     -------
@@ -97,14 +127,38 @@ def _grid(aperture: Aperture, half_x: float, half_y: float, cells: int) -> tuple
     match aperture:
         case Circle():
             ring, angle = np.maximum(np.abs(u), np.abs(v)), np.arctan2(v, u)
+            if hole:
+                inner, share = aperture.inner / aperture.radius, 2.0 * hole / cells
+                ring = inner + (1.0 - inner) * np.maximum(ring - share, 0.0) / (1.0 - share)
             u, v = ring * np.cos(angle), ring * np.sin(angle)
         case Rectangle() | Ellipse():
             pass
         case _:
             assert_never(aperture)
     i = (np.arange(cells)[:, None] * n + np.arange(cells)).ravel()
+    i = i[np.max(np.abs(np.stack([i % n, i // n]) + 0.5 - 0.5 * cells), axis=0) > hole]
     triangles = np.concatenate([np.stack([i, i + 1, i + n + 1], 1), np.stack([i, i + n + 1, i + n], 1)])
     return 0.5 * (x0 + x1) + half_x * u, 0.5 * (y0 + y1) + half_y * v, triangles
+
+
+def body_outline(model: CameraModel, name: str, edge: Aperture) -> Aperture:
+    """Return the outline of a camera's surface: outer edge and hole of its file, or ``edge`` if the file gives none."""
+    edges = model.edges.get(name, ())
+    outlines = [
+        edge_spec.shape
+        for edge_spec in edges
+        if not edge_spec.blocks and not edge_spec.rotation and isinstance(edge_spec.shape, Aperture)
+    ]
+    if outlines:
+        edge = outlines[0]
+    holes = [
+        edge_spec.shape
+        for edge_spec in edges
+        if edge_spec.blocks and isinstance(edge_spec.shape, Circle) and not any(edge_spec.shape.centre)
+    ]
+    if holes and isinstance(edge, Circle) and not any(edge.centre) and edge.inner < holes[0].radius < edge.radius:
+        edge = Circle(edge.radius, edge.centre, holes[0].radius)
+    return edge
 
 
 def behind(model: CameraModel, mirror: str) -> float:

@@ -365,6 +365,7 @@ class MonitorDesignSpec(Spec):
 
 Rotation = Annotated[tuple[float, float, float], Vector(Quantity(ANGLE, largest="180 deg"), 3)]
 Light = Literal["refracts", "passes"]
+Reflectance = Annotated[float, Quantity(SCALE, smallest="0 percent", largest="100 percent")]
 
 
 class MirrorSpec(Spec):
@@ -395,6 +396,8 @@ class MirrorSpec(Spec):
     glass : LensGlassSpec | None
         Glass behind a face where light enters a lens, instead of `index`; its dispersion gives the index at every
         wavelength.
+    reflectance : float | None
+        Reflectance of a face of a lens with a coating, for ghosts; by default that of bare glass.
     edges : tuple[SurfaceEdgeSpec, ...] | None
         Edges that block light at this surface besides the stop; light must pass all of them. By default there are no
         edges.
@@ -410,6 +413,7 @@ class MirrorSpec(Spec):
     light: Light | None = None
     index: Annotated[Number, Field(ge=1.0, le=10.0)] | None = None
     glass: LensGlass | None = None
+    reflectance: Reflectance | None = None
     edges: Annotated[tuple[SurfaceEdgeSpec, ...], Field(min_length=1, max_length=100)] | None = None
 
     @model_validator(mode="after")
@@ -428,6 +432,9 @@ class MirrorSpec(Spec):
         if len(media) > 1:
             problem = "the index of a glass follows from its dispersion"
             raise Problem(problem, "index and glass", "only one of them", within=("index",))
+        if self.reflectance is not None and self.light != "refracts":
+            problem = "a reflectance is that of a face of a lens, where it makes ghosts"
+            raise Problem(problem, f"light: {self.light or 'reflected'}", "light: refracts", within=("reflectance",))
         return self
 
     @property
@@ -461,10 +468,13 @@ class ImageSpec(Spec):
     tilt : float | None
         Rotation about the prescription's x, the direction of the line CCD, in radians; by default the plane is
         perpendicular to the axis.
+    reflectance : float | None
+        Reflectance of the detector, for ghosts; by default that of bare silicon, 30 percent.
     """
 
     z: Length
     tilt: Annotated[float, Quantity(ANGLE, largest="45 deg")] | None = None
+    reflectance: Reflectance | None = None
 
 
 _MOST_PIXELS = 1_000_000

@@ -1,4 +1,4 @@
-"""Seidel sums, ray fans and energies of a camera, against the library, each other and the analytic image of a ring."""
+"""Seidel sums, ray fans, energies and ghosts of a camera, against the library, each other and analytic images."""
 
 from __future__ import annotations
 
@@ -11,8 +11,12 @@ from scipy.special import j1
 
 import optics
 from optics import Camera, OpticalSurface
+from scenes.specs.camera import CameraSpec
 from scenes.specs.load import load_camera
-from twin.camera.aberrations import IMAGE_FIELDS, point_images, ray_fans, third_order
+from scenes.yaml.errors import InputError
+from scenes.yaml.spec import validate
+from scenes.yaml.yaml_file import parse_yaml
+from twin.camera.aberrations import IMAGE_FIELDS, camera_ghosts, point_images, ray_fans, third_order
 from twin.camera.camera_optics import CameraOptics
 from twin.camera.camera_run import FAN_FIELDS
 
@@ -108,3 +112,49 @@ def test_point_images_of_a_camera_have_the_energy_of_its_pupil(gf7: CameraOptics
     # a pixel of 7 um contains what the square of 3.5 um does; the curve is interpolated linearly between its points
     at = np.interp(3.5e-6, images.radius, images.ensquared[0])
     assert images.pixel[0] == pytest.approx(at, abs=4e-3)
+
+
+WINDOWED = """
+name: windowed
+focal_length: 2 m
+entrance_pupil: 100 mm
+field: {{x: 0.2 deg, y: 0.1 deg}}
+wavelength: 550 nm
+stop: M1
+mirrors:
+  M1: {{z: 0 m, radius: -4 m, conic: -1 {mirror}}}
+  W1: {{z: -1.8 m, radius: flat, light: refracts, index: 1.5, reflectance: 1 percent}}
+  W2: {{z: -1.806 m, radius: flat, light: refracts, index: 1}}
+image: {{z: -2.002 m, reflectance: 10 percent}}
+line: {{pixels: 1000, pitch: 7 um}}
+"""
+
+
+def windowed(mirror: str = "") -> CameraSpec:
+    return validate(CameraSpec, parse_yaml(WINDOWED.format(mirror=mirror), "windowed.yaml"))
+
+
+def test_ghosts_of_a_camera_file_are_those_of_its_numbers(backend, gf7: CameraOptics) -> None:
+    """Coating and detector of the file; the focal plane is at the paraxial focus, t (1 - 1 / n) behind the mirror's."""
+    model = CameraOptics.alone(windowed(), backend).model
+    surfaces = [
+        OpticalSurface(-4.0, -1.8, -1.0, "mirror", diameter=0.1),
+        OpticalSurface(thickness=-0.006, material=1.5),
+        OpticalSurface(thickness=-0.196),
+    ]
+    camera = Camera(surfaces, 550e-9)
+    names = {"s1": "W1", "s2": "W2", "image": "image"}
+    field = (0.5 * model.spec.field.x, 0.0)
+    expected = optics.ghosts(camera, field, detector=0.1, coatings={1: 0.01})
+    found = camera_ghosts(model, backend, (0.5, 0.0))
+    assert [(g.back, g.forward) for g in found] == [(names[g.back], names[g.forward]) for g in expected]
+    for ours, theirs in zip(found, expected, strict=True):
+        assert ours.focus == pytest.approx(theirs.focus, rel=1e-6)
+        assert ours.energy == pytest.approx(theirs.energy, rel=1e-9)
+        assert (ours.diameter, ours.irradiance) == pytest.approx((theirs.diameter, theirs.irradiance), rel=1e-6)
+    assert camera_ghosts(gf7.model, backend) == ()
+
+
+def test_a_mirror_has_no_reflectance() -> None:
+    with pytest.raises(InputError, match="a reflectance is that of a face of a lens"):
+        windowed(", reflectance: 98 percent")

@@ -1,19 +1,22 @@
-"""Classical data of a camera: Seidel sums by surface, ray fans, and energy of its point images."""
+"""Classical data of a camera: Seidel sums by surface, ray fans, energy of its point images, and ghosts."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from analysis.arrays import shows
+from optics.camera.ghosts import DETECTOR, PUPIL, Ghost, trace_ghosts
 from optics.camera.seidel import SeidelSums, seidel_sums
+from optics.numerics.backend import Backend
 from optics.waves.sampled_psf import encircled_energy, ensquared_energy
-from scenes.models.camera_model import CameraModel, field_direction
+from scenes.models.camera_model import IMAGE, CameraModel, field_direction
 from twin.camera.camera_optics import CameraOptics
 from twin.camera.camera_results import Field
 from twin.camera.colour import Psf, spectral_psfs
+from twin.camera.first_order_data import ray_paths
 from twin.framework.record import Quantity, Record
 
 FAN_POINTS = 41
@@ -213,3 +216,37 @@ ENERGY: Record[PointImages] = Record(
              "than the computed image"),
     Quantity("ensquared_in_pixel", lambda p: p.pixel, "share of the light in a square of the pixel pitch"),
 )  # fmt: skip
+
+
+def camera_ghosts(model: CameraModel, backend: Backend, field: Field = (0.0, 0.0)) -> tuple[Ghost, ...]:
+    """Trace the ghosts of a nominal camera at a field, the largest irradiance first; none without refracting surfaces.
+
+    Coated faces and the detector have the reflectances of the camera's file.
+    """
+    spec, bare = model.spec, model.bare_assembly()
+    coatings = {name: face.reflectance for name, face in spec.mirrors.items() if face.reflectance is not None}
+    detector = DETECTOR if spec.image.reflectance is None else spec.image.reflectance
+    if all(face.light != "refracts" for face in spec.mirrors.values()):
+        return ()
+    for name, edges in model.edges.items():
+        bare = bare.with_element(replace(bare.elements[name], edges=edges))
+    launch = ray_paths(model, backend, [field], PUPIL).points[0, 0]
+    direction = field_direction(spec, field[0] * spec.field.x, field[1] * spec.field.y)
+    names, indices = (*model.mirrors, IMAGE), _indices(model, spec.wavelength)
+    shares = {**coatings, IMAGE: detector}
+    return trace_ghosts(backend, bare, names, indices, launch, direction, spec.wavelength, shares)
+
+
+GHOST: Record[Ghost] = Record(
+    "Ghost of the nominal camera in the middle of the field, by two reflections at faces of lenses or the detector.",
+    Quantity("back", lambda g: g.back, "surface, or image for the detector, that reflects the light back"),
+    Quantity("forward", lambda g: g.forward, "surface before it that reflects the light forward again"),
+    Quantity(
+        "focus_mm",
+        lambda g: g.focus if np.isfinite(g.focus) else None,
+        "paraxial focus from the image plane, positive along the light; null for a parallel beam",
+    ),
+    Quantity("spot_mm", lambda g: g.diameter, "diameter of the traced light in the image plane"),
+    Quantity("energy", lambda g: g.energy, "light relative to that of the image"),
+    Quantity("irradiance", lambda g: g.irradiance, "mean irradiance relative to that of the image's spot or Airy disk"),
+)

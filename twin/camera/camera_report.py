@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
+from optics.camera.ghosts import DETECTOR
 from optics.camera.seidel import ABERRATIONS
 from optics.geometry import zernike
 from scenes.models.camera_design import file_with_plane
@@ -17,7 +18,8 @@ from twin.camera.aberrations import COEFFICIENTS
 from twin.camera.camera_run import CameraRun, built_text, camera_data, perturbed_text, refocus_text, verdict
 from twin.camera.colour import Colours
 from twin.camera.first_order_data import FIRST_ORDER, unmodelled_obscuration
-from twin.camera.layout_plot import layout_figure
+from twin.camera.layout_plot import dimensions, layout_figure
+from twin.camera.solid_view import solid_view
 from twin.framework.artefact import Artefact, CameraFile, Cell, SvgFigure, Table, fixed, significant
 from twin.framework.data_files import netcdf
 from twin.framework.report import Report, Section, answer
@@ -30,9 +32,10 @@ _TABLE_TERMS = 15
 def camera_report(run: CameraRun) -> Report:
     """Build the report of a camera analysis: verdict, first-order data, layout, image quality over the field."""
     texts = refocus_text(run), built_text(run), perturbed_text(run)
+    solid, files = solid_view(run)
     verdict_text, more = answer(*verdict(run), "see the wavefronts and the layout")
     sections = [
-        _layout(run),
+        _layout(run, solid),
         *([_refocus(run)] if run.refocus is not None else []),
         _wavefronts(run),
         _spots(run),
@@ -44,6 +47,7 @@ def camera_report(run: CameraRun) -> Report:
         _through_focus(run),
         _field(run),
         _third_order(run),
+        _ghosts(run),
         *([_bodies(run)] if run.quality is not None else []),
     ]
     return Report(
@@ -53,7 +57,7 @@ def camera_report(run: CameraRun) -> Report:
         _facts(run),
         first_order_table(run),
         tuple(sections),
-        files={"optics.nc": netcdf(camera_data(run))},
+        files={"optics.nc": netcdf(camera_data(run)), **files},
     )
 
 
@@ -159,12 +163,15 @@ def _before(distance: float | None) -> str:
     return f"{abs(distance):.4g} m {'before' if distance > 0.0 else 'behind'}"
 
 
-def _layout(run: CameraRun) -> Section:
-    """Return the section with drawings of the mirrors, lenses and rays."""
+def _layout(run: CameraRun, solid: Artefact) -> Section:
+    """Return the section with drawings of the mirrors, lenses and rays, and the view in three dimensions."""
     model, backend = run.optics.model, run.optics.path.backend
     caption = "To scale, in the prescription's frame; mirrors with their clear apertures; dash-dotted: the parent axis."
     figure = _figure("layout", "Layout with rays", caption, layout_figure, model, backend)
-    return Section("Layout", (), (figure,))
+    rows: list[list[Cell]] = [[start, end, 1e3 * size] for start, end, size in dimensions(model)]
+    about = "Along straight lines between vertices; overall: the parts with their clear apertures, along z, y and x."
+    table = Table("dimensions", "Dimensions", about, ("from", "to", "mm"), rows, (None, None, 3))
+    return Section("Layout", (), (figure, table, solid))
 
 
 def _refocus(run: CameraRun) -> Section:
@@ -284,6 +291,36 @@ def _third_order(run: CameraRun) -> Section:
     )
     table = Table("third-order", "Coefficients by surface", "Waves.", heads, rows, (None, *[3] * (len(heads) - 1)))
     return Section(title, (text,), (table,))
+
+
+MOST_GHOSTS = 15
+"""Number of ghosts in the report's table, the strongest; all are in optics.json and optics.nc."""
+
+
+def _ghosts(run: CameraRun) -> Section:
+    """Return the section on ghosts by two reflections."""
+    ghosts, image = run.ghosts, run.camera.image
+    if not ghosts:
+        return Section("Ghosts", ("No refracting surfaces: no ghosts.",))
+    share = DETECTOR if image.reflectance is None else image.reflectance
+    text = (
+        "Light in the middle of the field that is reflected twice, at two faces of lenses or at the detector and a "
+        "face. Faces reflect by Fresnel's formulas or as the file states, the detector "
+        f"{100 * share:.3g} %, mirrors all light. The strongest of {len(ghosts)} is {ghosts[0].back}, then "
+        f"{ghosts[0].forward}, with {ghosts[0].irradiance:.2g} of the image's irradiance."
+    )
+    rows: list[list[Cell]] = [
+        [g.back, g.forward, fixed(1e3 * g.focus, 3, True) if np.isfinite(g.focus) else "infinite",
+         1e3 * g.diameter, f"{g.energy:.3g}", f"{g.irradiance:.3g}"]
+        for g in ghosts[:MOST_GHOSTS]
+    ]  # fmt: skip
+    heads = ("back", "forward", "focus [mm]", "spot [mm]", "energy", "irradiance")
+    caption = (
+        "Focus: paraxial, from the image plane along the light. Spot: diameter of the traced light. Energy and "
+        "irradiance: relative to the image, whose diameter is that of its spot or Airy disk."
+    )
+    table = Table("ghosts", "Ghosts, the strongest first", caption, heads, rows, (None, None, None, 3, None, None))
+    return Section("Ghosts", (text,), (table,))
 
 
 def _mtf(run: CameraRun) -> Section:

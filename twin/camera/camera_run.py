@@ -12,6 +12,7 @@ import xarray as xr
 
 from analysis.arrays import shows
 from analysis.monitor import parameters
+from optics.camera.ghosts import Ghost
 from optics.geometry import zernike
 from optics.geometry.pose import rotation_matrix, triple
 from optics.geometry.tree import Motion, State, compose
@@ -22,6 +23,7 @@ from scenes.models.camera_design import with_plane
 from scenes.models.camera_model import focal_plane_body
 from scenes.models.camera_sharpness import BLURRED, FIELDS, FocalPlane, field_text
 from scenes.models.instrument_builder import build_instrument
+from scenes.models.instrument_model import Instrument
 from scenes.models.job_state import job_state, motions_of
 from scenes.models.thermal_model import ThermalModel
 from scenes.specs.camera import CameraSpec
@@ -31,10 +33,12 @@ from scenes.specs.resolved import CameraSetup
 from twin.camera import field_maps
 from twin.camera.aberrations import (
     ENERGY,
+    GHOST,
     THIRD_ORDER,
     PointImages,
     RayFans,
     ThirdOrder,
+    camera_ghosts,
     point_images,
     ray_fans,
     third_order,
@@ -181,6 +185,8 @@ class CameraRun:
         Obscuration by bodies of the instrument; None for a camera without one.
     colours : Colours or None
         Results over the spectrum or band; None where neither is specified.
+    mounted_in : Instrument or None
+        Instrument that carries the camera; None for a camera alone in its nominal state.
     """
 
     setup: CameraSetup
@@ -200,6 +206,15 @@ class CameraRun:
     perturbed: Perturbed | None = None
     quality: CameraQuality | None = None
     colours: Colours | None = None
+    mounted_in: Instrument | None = None
+
+    @cached_property
+    def instrument(self) -> Instrument:
+        """Instrument that carries the camera, for the 3-D view; a camera alone forms one."""
+        if self.mounted_in is not None:
+            return self.mounted_in
+        spec, _, name = self.setup.mounted_instrument
+        return build_instrument(spec, {name: self.camera}, self.optics.path.backend)
 
     @cached_property
     def worst(self) -> tuple[float, Field]:
@@ -224,6 +239,11 @@ class CameraRun:
     def third_order(self) -> ThirdOrder | None:
         """Third-order aberrations of the nominal camera by surface; None for one that is not centred on an axis."""
         return third_order(self.optics.model)
+
+    @cached_property
+    def ghosts(self) -> tuple[Ghost, ...]:
+        """Ghosts of the nominal camera in the middle of the field, the largest irradiance first."""
+        return camera_ghosts(self.optics.model, self.optics.path.backend)
 
     @cached_property
     def fans(self) -> RayFans:
@@ -282,7 +302,7 @@ def run_camera(
         refocused = find_focus(CameraOptics.alone(camera, backend), tilt, setup.mounted)
         camera = with_plane(camera, refocused.after)
     optics = CameraOptics.alone(camera, backend)
-    quality, perturbed = None, None
+    quality, perturbed, instrument = None, None, None
     state: State = {}
     if setup.instrument is not None or setup.perturb:
         instrument_spec, cameras, mounted = setup.mounted_instrument
@@ -303,7 +323,7 @@ def run_camera(
     field = field_maps.field_grid(ERROR_GRID)
     where = tuple(map(tuple, field.reshape(-1, 2)))
     errors = optics.errors(where, RINGS if built else MAP_RINGS).reshape(field.shape[:2])
-    if setup.perturb:
+    if setup.perturb and instrument is not None:
         change = trace_truth(instrument, backend, [state]).cameras[mounted]
         perturbed = Perturbed(
             job, change, errors, _nyquist(optics) if errors.max() < MAX_WAVES_FOR_MTF else np.empty((0, 2))
@@ -331,7 +351,7 @@ def run_camera(
         advance("colours", 0, 1)
         colours = evaluate_colours(optics, light, MTF_FIELDS, bool(mtfs))
         advance("colours", 1, 1)
-    return CameraRun(
+    run = CameraRun(
         setup=setup,
         camera=camera,
         optics=optics,
@@ -349,7 +369,13 @@ def run_camera(
         perturbed=perturbed,
         quality=quality,
         colours=colours,
+        mounted_in=instrument,
     )
+    for part in ("images", "ghosts"):  # what takes long is computed here, where its progress is shown
+        advance(part, 0, 1)
+        getattr(run, part)
+        advance(part, 1, 1)
+    return run
 
 
 def _nyquist(optics: CameraOptics) -> np.ndarray:
@@ -627,6 +653,7 @@ CAMERA: Record[CameraRun] = Record(
         record=THIRD_ORDER,
         where_known=True,
     ),
+    Quantity("ghosts", lambda run: run.ghosts, "ghosts, the largest irradiance first", record=GHOST),
     Quantity("colours", lambda run: run.colours, "polychromatic results", record=COLOURS, where_known=True),
     Quantity("distortion", lambda run: run.distortion, record=_DISTORTION),
     Quantity("refocus", lambda run: run.refocus, record=_REFOCUS),
@@ -706,5 +733,15 @@ def camera_data(run: CameraRun) -> xr.Dataset:
     coords["fan"] = ("fan", ["along line", "along track"], named("diameter of the stop"))
     coords["pupil"] = ("pupil", run.fans.pupil, named("coordinate in the stop, in units of its radius"))
     coords["fan_field_share"] = (("fan_field", "direction"), np.array(FAN_FIELDS), named(share))
+    if run.ghosts:
+        pairs = [f"{ghost.back} {ghost.forward}" for ghost in run.ghosts]
+        coords["ghost"] = ("ghost", pairs, named("surfaces that reflect back and forward"))
+        for key, text, units in (
+            ("focus", "paraxial focus of a ghost from the image plane", metres),
+            ("diameter", "diameter of a ghost in the image plane", metres),
+            ("energy", "light of a ghost over that of the image", None),
+            ("irradiance", "mean irradiance of a ghost over that of the image", None),
+        ):
+            data[f"ghost_{key}"] = (("ghost",), [getattr(g, key) for g in run.ghosts], named(text, units))
     attributes = {"title": "wavefronts, MTF and distortion of a camera over its field"}
     return xr.Dataset(data, coords, {**attributes, "reference_frames": frames_text("optics")})

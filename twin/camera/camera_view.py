@@ -22,6 +22,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Circle
 
 from analysis.arrays import summary
+from optics.camera.ghosts import Ghost
 from twin.camera.camera_optics import CameraOptics
 from twin.camera.camera_results import Field, FieldText, Frequencies, Mtf, Spot, Wavefront
 from twin.framework.svg import BLUE, DIVERGING, GREY, INK, LIGHT, VERMILION, look, plain_axes, to_svg
@@ -205,6 +206,20 @@ class CameraView(CameraOptics, Plottable):
             In this state the light misses the stop or the plane of the line CCD.
         """
         return _shown(WavefrontView, super().wavefront(field, points))
+
+    def ghosts(self, field: Field | FieldText = (0.0, 0.0)) -> tuple[Ghost, ...]:
+        """Trace the ghosts of the nominal camera at a field, the largest irradiance first.
+
+        Parameters
+        ----------
+        field : Field or FieldText
+            Field, as for `wavefront`.
+        """
+        # with first-order data, which need a camera's optics
+        from twin.camera.aberrations import camera_ghosts
+
+        along, across = map(float, self.fractions([field])[0])
+        return camera_ghosts(self.model, self.path.backend, (along, across))
 
     def spot(self, field: Field | FieldText = (0.0, 0.0), defocus: float | str = 0.0) -> SpotView:
         """Compute the spot at a field, on the line CCD moved downstream.

@@ -18,6 +18,7 @@ from typing import Any
 
 import numpy as np
 
+from optics.numerics.backend import one_blas_thread
 from optics.numerics.quadrature import gauss, nodes_for
 from optics.waves.diffraction import Grid, PupilField, image
 from optics.waves.optical_transfer import LEAST_ACROSS
@@ -246,6 +247,7 @@ def spectral_mtfs(
     return tuple(replace(mtf, error=change) for mtf, change in zip(after, changes, strict=True))
 
 
+@one_blas_thread()  # small matrices: threads would only wait for each other
 def spectral_psfs(
     optics: CameraOptics,
     fields: Sequence[Field] | np.ndarray,

@@ -32,6 +32,7 @@ from scenes.models.camera_model import (
     focal_plane_body,
     pupil_diameter,
 )
+from scenes.models.meshes import body_outline
 from scenes.specs.camera import BandSpec, CameraSpec, LineSpec
 from twin.camera.camera_optics import CameraOptics, rim
 from twin.framework.record import Quantity, Record
@@ -97,7 +98,7 @@ def obstacles(model: CameraModel) -> dict[str, Aperture]:
         if spec.mirrors[name].light == "passes":
             continue  # the plate of a stop lies outside its hole
         # the clear apertures of the other mirrors include the margin
-        out[name] = _body(model, name, Circle(edge.bounds[1] + margin) if name == spec.stop else edge)
+        out[name] = body_outline(model, name, Circle(edge.bounds[1] + margin) if name == spec.stop else edge)
     lines: list[tuple[LineSpec | BandSpec, float, int]] = [
         (spec.line, 0.0, spec.line.rows),
         *((band, band.offset, 1) for band in spec.bands.values()),
@@ -108,26 +109,6 @@ def obstacles(model: CameraModel) -> dict[str, Aperture]:
     centre = model.image_body.inverse().apply(model.focal_plane.translation)
     out[IMAGE] = Rectangle(half, 0.5 * (high - low), (float(centre[0]), float(centre[1] + 0.5 * (high + low))))
     return out
-
-
-def _body(model: CameraModel, name: str, edge: Aperture) -> Aperture:
-    """Return the outline of a camera's surface: outer edge and hole of its file, or ``edge`` if the file gives none."""
-    edges = model.edges.get(name, ())
-    outlines = [
-        edge_spec.shape
-        for edge_spec in edges
-        if not edge_spec.blocks and not edge_spec.rotation and isinstance(edge_spec.shape, Aperture)
-    ]
-    if outlines:
-        edge = outlines[0]
-    holes = [
-        edge_spec.shape
-        for edge_spec in edges
-        if edge_spec.blocks and isinstance(edge_spec.shape, Circle) and not any(edge_spec.shape.centre)
-    ]
-    if holes and isinstance(edge, Circle) and not any(edge.centre) and edge.inner < holes[0].radius < edge.radius:
-        edge = Circle(edge.radius, edge.centre, holes[0].radius)
-    return edge
 
 
 @dataclass(frozen=True)

@@ -30,6 +30,7 @@ def layout_figure(model: CameraModel, backend: Backend) -> Figure:
     heights = [b[3] - b[2] for b in boxes]
     scale = 9.6 / (high - low)  # inches of the page per metre
     figure = new_figure(min(scale * sum(heights) + 1.5, 12.0))
+    sizes = _sizes(model)
     axes = figure.subplots(2, 1, sharex=True, gridspec_kw={"height_ratios": heights})
     for panel, (axis, name, title), box in zip(axes, _VIEWS, boxes, strict=True):
         _view(panel, model, backend, axis, low)
@@ -38,9 +39,31 @@ def layout_figure(model: CameraModel, backend: Backend) -> Figure:
         panel.set_aspect("equal")
         panel.set_title(title, loc="left")
         panel.set_ylabel(f"{name} [m]")
+        _measure(panel, sizes[axis], sizes[2])
         plain_axes(panel)
     axes[1].set_xlabel("z along the parent axis [m]")
     return figure
+
+
+def _measure(axes: Axes, across: np.ndarray, along: np.ndarray) -> None:
+    """Write the overall length and height of the parts in a view, with arrows from end to end, metres."""
+    (left, right), (low, high) = axes.get_xlim(), axes.get_ylim()
+    place = low + 0.03 * (high - low), right - 0.012 * (right - left)
+    for start, end, text, where in (
+        ((along[0], place[0]), (along[1], place[0]), plain(float(np.ptp(along)), 4), (0.5 * np.sum(along), place[0])),
+        (
+            (place[1], across[0]),
+            (place[1], across[1]),
+            plain(float(np.ptp(across)), 4),
+            (place[1], 0.5 * np.sum(across)),
+        ),
+    ):
+        axes.annotate(
+            "", start, end, arrowprops={"arrowstyle": "<->", "color": GREY, "lw": 0.7, "shrinkA": 0, "shrinkB": 0}
+        )
+        upright = 90 if start[0] == end[0] else 0
+        box = {"facecolor": "white", "edgecolor": "none", "pad": 0.6}
+        axes.text(float(where[0]), float(where[1]), f"{text} m", rotation=upright, ha="center", va="center", fontsize=7.5, color=GREY, bbox=box)
 
 
 def _fields(axis: int) -> list[tuple[float, float]]:
@@ -97,17 +120,7 @@ def _view(axes: Axes, model: CameraModel, backend: Backend, axis: int, first: fl
             axes.plot(line[:, 2], line[:, axis], color=colour, lw=width, ls=style, alpha=0.9)
     edges = obstacles(model)
     for name in (*model.mirrors, IMAGE):
-        edge, pose = edges.get(name, model.apertures.get(name)), model.image_body
-        assert edge is not None
-        low, high = edge.bounds[2 * axis], edge.bounds[2 * axis + 1]
-        other = edge.centre[1 - axis]
-        across = np.linspace(low, high, 80)
-        x, y = (across, np.full(80, other)) if axis == 0 else (np.full(80, other), across)
-        if name == IMAGE:
-            z = np.zeros(80)
-            drawn = pose.apply(np.stack([x, y, z], axis=-1))
-        else:
-            drawn = model.mirror_pose(name).apply(np.stack([x, y, model.surfaces[name].sag(x, y)], axis=-1))
+        drawn = _drawn(model, name, axis)
         if name not in edges and name != IMAGE and model.spec.mirrors[name].light == "passes":  # no body is there
             axes.plot(drawn[:, 2], drawn[:, axis], color=GREY, lw=0.8, ls=(0, (1, 2)), zorder=3)
         else:
@@ -116,9 +129,46 @@ def _view(axes: Axes, model: CameraModel, backend: Backend, axis: int, first: fl
     axes.axhline(0.0, color=LIGHT, lw=0.7, ls=(0, (8, 3, 2, 3)), zorder=0)
 
 
+def _drawn(model: CameraModel, name: str, axis: int) -> np.ndarray:
+    """Return the section of a surface through the middle of its aperture along ``axis``, (80, 3), metres."""
+    edge, pose = obstacles(model).get(name, model.apertures.get(name)), model.image_body
+    assert edge is not None
+    across = np.linspace(edge.bounds[2 * axis], edge.bounds[2 * axis + 1], 80)
+    other = np.full(80, edge.centre[1 - axis])
+    x, y = (across, other) if axis == 0 else (other, across)
+    if name == IMAGE:
+        return pose.apply(np.stack([x, y, np.zeros(80)], axis=-1))
+    return model.mirror_pose(name).apply(np.stack([x, y, model.surfaces[name].sag(x, y)], axis=-1))
+
+
+def _sizes(model: CameraModel) -> np.ndarray:
+    """Return the least and the largest x, y and z of mirrors, lenses and line CCDs, (3, 2), metres."""
+    drawn = np.concatenate([_drawn(model, name, axis) for name in obstacles(model) for axis in (0, 1)])
+    return np.stack([drawn.min(axis=0), drawn.max(axis=0)], axis=-1)
+
+
+def dimensions(model: CameraModel) -> list[tuple[str, str, float]]:
+    """Return the distances between the vertices of a camera and its overall sizes: from, to, metres.
+
+    Overall sizes are those of the clear apertures and the focal plane, along z, y and x.
+    """
+    names = [*model.mirrors, IMAGE]
+    places = [*(model.vertex(name) for name in model.mirrors), model.image_body.translation]
+    gaps = np.linalg.norm(np.diff(places, axis=0), axis=-1)
+    out = [(a, _title(b), float(gap)) for a, b, gap in zip(names, names[1:], gaps, strict=False)]
+    sizes = np.ptp(_sizes(model), axis=-1)
+    ends = (("length", 2), ("height, y", 1), ("width, x", 0))
+    return [*out, *(("overall", text, float(sizes[axis])) for text, axis in ends)]
+
+
+def _title(name: str) -> str:
+    """Return the name of a surface for readers."""
+    return "focal plane" if name == IMAGE else name
+
+
 def _label(axes: Axes, model: CameraModel, name: str, drawn: np.ndarray, axis: int) -> None:
     """Write the name of a surface beside its drawing."""
-    text = "focal plane" if name == IMAGE else f"{name}, stop" if name == model.spec.stop else name
+    text = f"{name}, stop" if name == model.spec.stop else _title(name)
     # beyond the end that is farther from the axis; in the top view all ends are alike, and neighbours alternate
     turn = name == IMAGE or model.mirrors.index(name) == 0
     end = drawn[int(np.argmax(np.abs(drawn[:, 1])))] if axis == 1 else drawn[-1 if turn else 0]

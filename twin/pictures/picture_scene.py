@@ -6,17 +6,31 @@ Bodies come from ``twin.pictures.scene_file``, so that a picture and ``scene.glb
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from io import BytesIO
 from typing import Any
 
 import numpy as np
 import trimesh
+from matplotlib.collections import PolyCollection
+from matplotlib.figure import Figure
 
 from scenes.models.instrument_model import Instrument
 from scenes.models.meshes import behind
 from scenes.specs.instrument import BASE
 from twin.pictures.light_paths import LightPaths
-from twin.pictures.scene_file import BLOCK, BRASS, DARK, GLASS, MIRROR, SILICON, build_scene, is_mirror
+from twin.pictures.scene_file import (
+    BLOCK,
+    BRASS,
+    DARK,
+    GLASS,
+    MIRROR,
+    SILICON,
+    beam_colour,
+    build_scene,
+    drawn_rays,
+    is_mirror,
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -211,6 +225,7 @@ def studio_parts(instrument: Instrument, paths: LightPaths, pixel: float) -> lis
         f"{BASE}/{camera}/{mirror}": behind(model, mirror)
         for camera, model in instrument.cameras.items()
         for mirror in model.mirrors
+        if model.spec.mirrors[mirror].light is None
     } | {solid.path: -1.0 for solid in instrument.solids if is_mirror(solid)}
     parts: list[Part] = []
     lowest = np.inf
@@ -237,6 +252,69 @@ def studio_parts(instrument: Instrument, paths: LightPaths, pixel: float) -> lis
             parts.append(Part(name, _edges(world, EDGE_PIXELS * pixel), _BSDF["edge"], matt=False))
     parts.append(Part(FLOOR, _floor(lowest - GAP), _BSDF["floor"]))
     return parts
+
+
+def still_png(instrument: Instrument, paths: LightPaths, size: tuple[int, int] = (1100, 660)) -> bytes:
+    """Draw an instrument by shaded facets, the farthest first, on a transparent ground; return the PNG file.
+
+    ``size`` is the largest width and height, pixels; each has two samples.
+    """
+    scene = build_scene(instrument, replace(paths, beams=()))
+    bodies = points_in_world(scene)
+    rays = [drawn_rays(beam) for beam in paths.beams]
+    whole = np.concatenate([*bodies.values(), *(ray.reshape(-1, 3) for ray in rays)])
+    extent = np.ptp(whole, axis=0)
+    order = [2, 0, 1] if np.argmax(extent) == 2 else [0, 1, 2]  # what is tall lies down
+    view = framed(whole[:, order], -65.0, 20.0, 20.0, size)
+    corners, colours = [], []
+    for name, vertices in bodies.items():
+        mesh = scene.geometry[scene.graph[name][1]]
+        triangles = _pieces(vertices[:, order][mesh.faces], float(np.linalg.norm(extent)) / _PIECES)
+        normal = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
+        facing = np.abs(normal @ view.forward) / np.maximum(np.linalg.norm(normal, axis=-1), np.finfo(float).tiny)
+        colour = np.tile(np.asarray(mesh.visual.material.baseColorFactor) / 255.0, (len(triangles), 1))
+        colour[:, :3] *= 0.45 + 0.55 * facing[:, None]
+        corners.append(triangles[:, [0, 1, 2, 2]])
+        colours.append(colour)
+    share = np.linspace(0.0, 1.0, _PIECES + 1)[:, None, None, None]
+    for beam, ray in zip(paths.beams, rays, strict=True):
+        points = ray[:, :-1, order] + share * (ray[:, 1:, order] - ray[:, :-1, order])
+        start, end = points[:-1].reshape(-1, 3), points[1:].reshape(-1, 3)
+        wide = np.cross(end - start, view.forward)
+        wide *= 0.6 * view.pixel_at(whole[:, order]) / np.maximum(np.linalg.norm(wide, axis=-1, keepdims=True), 1e-300)
+        corners.append(np.stack([start - wide, start + wide, end + wide, end - wide], axis=1))
+        colours.append(np.tile(beam_colour(instrument, beam), (len(start), 1)))
+    facets, colour = np.concatenate(corners), np.concatenate(colours)
+    far = np.argsort(-facets.mean(axis=1) @ view.forward)
+    flat = view.project(facets.reshape(-1, 3)).reshape(-1, 4, 2)
+    top, bottom = np.floor(np.min(flat[..., 1])) - 24.0, np.ceil(np.max(flat[..., 1])) + 24.0
+    figure = Figure(figsize=(size[0] / 100.0, (bottom - top) / 100.0), dpi=200)
+    axes = figure.add_axes((0.0, 0.0, 1.0, 1.0), xlim=(0, size[0]), ylim=(bottom, top))
+    axes.set_axis_off()
+    axes.add_collection(PolyCollection(list(flat[far]), facecolors=colour[far], linewidths=0.0, antialiased=False))
+    out = BytesIO()
+    figure.savefig(out, format="png", transparent=True, metadata={"Software": None})
+    return out.getvalue()
+
+
+_PIECES = 40
+"""Longest edge of a drawn facet, whose inverse is a fraction of the scene; facets are drawn in order of their middles.
+"""
+
+
+def _pieces(triangles: np.ndarray, longest: float) -> np.ndarray:
+    """Return triangles, (T, 3, 3), halved across their longest edges until no edge is longer than ``longest``."""
+    out = []
+    while len(triangles):
+        edges = np.linalg.norm(np.roll(triangles, -1, axis=1) - triangles, axis=-1)
+        out.append(triangles[np.max(edges, axis=1) <= longest])
+        rest = np.max(edges, axis=1) > longest
+        first = np.argmax(edges[rest], axis=1)
+        rows = np.arange(len(first))
+        a, b, c = (triangles[rest][rows, (first + k) % 3] for k in range(3))
+        middle = 0.5 * (a + b)
+        triangles = np.concatenate([np.stack([a, middle, c], axis=1), np.stack([middle, b, c], axis=1)])
+    return np.concatenate(out)
 
 
 def points_in_world(scene: trimesh.Scene) -> dict[str, np.ndarray]:

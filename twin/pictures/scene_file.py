@@ -9,7 +9,7 @@ The scene's ``extras`` contain ``motions``: body -> its motion relative to its p
 it. k times the motion is the matrix ``nominal`` (column by column) times the rotation by k ``rotate`` (rotation vector,
 radians) about ``pivot`` and the shift by k ``shift``, metres, in the body's nominal frame.
 
-The interactive viewer is part of the report's page and needs neither other files nor a network.
+The interactive viewer is part of the report's page, or a page of its own, and needs neither other files nor a network.
 """
 
 from __future__ import annotations
@@ -29,10 +29,12 @@ from trimesh.visual.material import PBRMaterial
 from optics.geometry.aperture import Circle, Rectangle
 from optics.geometry.solid import Coating, Solid, solid_mesh
 from optics.geometry.tree import AT_REST, Body, PlacedBodies, State
+from scenes.models.camera_model import lenses
 from scenes.models.instrument_model import Instrument
-from scenes.models.meshes import BOARD, CHIP, behind, board_size, mirror_mesh
+from scenes.models.meshes import BOARD, CHIP, behind, board_size, body_outline, lens_mesh, mirror_mesh
 from scenes.specs.baffle import Plate
 from scenes.specs.instrument import BASE, Channel
+from twin.framework.page import page_policy
 from twin.pictures.light_paths import RIM, Beam, LightPaths
 
 LINE_WIDTH = 0.002
@@ -76,7 +78,7 @@ IMAGING = (_metal(0, 114, 178, 0.0, 0.8), _metal(86, 180, 233, 0.0, 0.8))
 MONITOR = (_metal(213, 94, 0, 0.0, 0.8), _metal(230, 159, 0, 0.0, 0.8))
 
 
-def scene_bytes(instrument: Instrument, state: State, paths: LightPaths) -> bytes:
+def scene_bytes(instrument: Instrument, state: State, paths: LightPaths, tube: float = TUBE) -> bytes:
     """Return the contents of ``scene.glb``: the instrument in a perturbed state as binary glTF.
 
     Parameters
@@ -87,8 +89,10 @@ def scene_bytes(instrument: Instrument, state: State, paths: LightPaths) -> byte
         Perturbed state.
     paths : LightPaths
         Light paths in that state.
+    tube : float
+        Radius of the tubes by which rays are drawn, metres.
     """
-    scene = build_scene(instrument, paths)
+    scene = build_scene(instrument, paths, tube)
     scene.metadata["motions"] = motions(instrument, state, paths.placed)
     return bytes(scene.export(file_type="glb"))
 
@@ -166,9 +170,14 @@ def _body_meshes(instrument: Instrument, paths: LightPaths) -> dict[str, trimesh
     """Return path of each body -> mesh in the body's frame, metres, without thermal expansion."""
     out: dict[str, trimesh.Trimesh] = {}
     for camera, model in instrument.cameras.items():
-        for mirror in model.mirrors:
-            mesh = mirror_mesh(model.surfaces[mirror], model.apertures[mirror], behind(model, mirror))
-            out[f"{BASE}/{camera}/{mirror}"] = _painted(mesh, MIRROR)
+        lens_of = lenses(model.spec)
+        for name, surface in model.surfaces.items():
+            if lens_of.get(name) == name:
+                last = next(face for face, lens in reversed(lens_of.items()) if lens == name)
+                out[f"{BASE}/{camera}/{name}"] = _painted(lens_mesh(model, name, last), GLASS)
+            elif model.spec.mirrors[name].light is None:
+                outline = body_outline(model, name, model.apertures[name])
+                out[f"{BASE}/{camera}/{name}"] = _painted(mirror_mesh(surface, outline, behind(model, name)), MIRROR)
         plane = f"{BASE}/{camera}/focal_plane"
         line = model.spec.line.pixels * model.spec.line.pitch
         channels = [c for c in instrument.channels if c.camera == camera]
@@ -250,12 +259,27 @@ def _painted(mesh: trimesh.Trimesh, material: PBRMaterial) -> trimesh.Trimesh:
     return mesh
 
 
+def drawn_rays(beam: Beam) -> np.ndarray:
+    """Return the middle ray and the edge rays of a beam that are drawn, (5, K, 3), metres."""
+    return beam.vertices[[0, *(1 + k * RIM // 4 for k in range(4))]]
+
+
+def beam_colour(instrument: Instrument, beam: Beam) -> np.ndarray:
+    """Return red, green, blue and opacity of a beam, from 0 to 1, (4,)."""
+    return np.asarray(_beam_material(list(instrument.cameras).index(beam.camera), beam).baseColorFactor) / 255.0
+
+
+def _beam_material(camera: int, beam: Beam) -> PBRMaterial:
+    """Return the material of a beam of the camera of this index."""
+    return (MONITOR if beam.is_monitor else IMAGING)[camera % 2]
+
+
 def _tubes(beam: Beam, camera: int, radius: float) -> trimesh.Trimesh:
     """Return the middle ray and some edge rays of a beam as tubes of the given radius, metres, in the camera's colour.
 
     ``camera`` is the index of the camera.
     """
-    rays = beam.vertices[[0, *(1 + k * RIM // 4 for k in range(4))]]
+    rays = drawn_rays(beam)
     start, end = rays[:, :-1].reshape(-1, 3), rays[:, 1:].reshape(-1, 3)
     along = (end - start) / np.linalg.norm(end - start, axis=-1, keepdims=True)
     helper = np.where(np.abs(along[:, 1:2]) < 0.9, [[0.0, 1.0, 0.0]], [[1.0, 0.0, 0.0]])
@@ -271,8 +295,8 @@ def _tubes(beam: Beam, camera: int, radius: float) -> trimesh.Trimesh:
         [np.stack([k, next_k, k + TUBE_SIDES], 1), np.stack([next_k, next_k + TUBE_SIDES, k + TUBE_SIDES], 1)]
     )
     faces = sides + 2 * TUBE_SIDES * np.arange(len(start))[:, None, None]
-    palette = MONITOR if beam.is_monitor else IMAGING
-    return _painted(trimesh.Trimesh(vertices.reshape(-1, 3), faces.reshape(-1, 3), process=False), palette[camera % 2])
+    mesh = trimesh.Trimesh(vertices.reshape(-1, 3), faces.reshape(-1, 3), process=False)
+    return _painted(mesh, _beam_material(camera, beam))
 
 
 LIBRARY = "three.min.js"
@@ -313,6 +337,28 @@ def viewer_scripts(scene: bytes) -> Markup:
         f'<script type="application/gzip" id="viewer-library">{_packed(library.encode())}</script>\n'
         f'<script type="application/gzip" id="viewer-scene">{_packed(scene)}</script>\n'
         f"<script>{program}</script>\n"
+    )
+
+
+def viewer_page(title: str, scene: bytes, moved: str, still: Markup) -> str:
+    """Return a page of its own for the viewer, which needs neither other files nor a network.
+
+    Parameters
+    ----------
+    title : str
+        Title of the page.
+    scene : bytes
+        Binary glTF, from `scene_bytes`.
+    moved : str
+        Description of the moved bodies for readers; empty for none.
+    still : Markup
+        Figure for browsers without WebGL.
+    """
+    style = files("twin.framework").joinpath("sheet.css").read_text("utf-8")
+    page = Markup(_HERE.joinpath("view.html").read_text("utf-8"))
+    allowed, programs = page_policy(style, viewer_programs()), viewer_scripts(scene)
+    return page.format(
+        policy=allowed, title=title, style=Markup(style), viewer=viewer_markup(moved), still=still, scripts=programs
     )
 
 

@@ -123,8 +123,19 @@
     canvas.addEventListener('pointerleave', () => { controls.enableZoom = false; });
     const middle = box.getCenter(new THREE.Vector3());
     const home = () => {
-      const wide = Math.max(1, 1.25 / camera.aspect);
-      camera.position.copy(middle).add(new THREE.Vector3(0.35, -1.15, 0.55).multiplyScalar(size * 0.86 * wide));
+      const toward = new THREE.Vector3(0.35, -1.15, 0.55).normalize();
+      const right = new THREE.Vector3().crossVectors(camera.up, toward).normalize();
+      const up = new THREE.Vector3().crossVectors(toward, right);
+      const slope = Math.tan(camera.fov * Math.PI / 360);
+      let distance = 0;
+      for (let corner = 0; corner < 8; corner += 1) {
+        const { min, max } = box;
+        const point = new THREE.Vector3(corner & 1 ? max.x : min.x, corner & 2 ? max.y : min.y, corner & 4 ? max.z : min.z);
+        point.sub(middle);
+        const wide = Math.max(Math.abs(point.dot(up)), Math.abs(point.dot(right)) / camera.aspect);
+        distance = Math.max(distance, point.dot(toward) + wide / slope);
+      }
+      camera.position.copy(middle).addScaledVector(toward, 1.08 * distance);
       controls.target.copy(middle);
       controls.update();
     };
@@ -148,6 +159,7 @@
       draw();
     };
     slider.disabled = last === 1;
+    slider.parentElement.hidden = !moved.length;
     slider.value = last > 1 ? Math.round(slider.max * Math.log(first) / Math.log(last)) : 0;
     slider.addEventListener('input', exaggerate);
     light.addEventListener('change', () => {
@@ -162,7 +174,9 @@
     home();
     exaggerate();
     // the drawing that stood in for the view goes to what is folded about the light path
-    document.getElementById('light').after(fallback);
+    const folded = document.getElementById('light');
+    if (folded) folded.after(fallback);
+    else fallback.hidden = true;
     root.dataset.ready = 'yes';
   };
 
