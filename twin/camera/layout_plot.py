@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -17,7 +19,7 @@ from twin.framework.svg import BLUE, GREEN, GREY, INK, LIGHT, VERMILION, new_fig
 _END_COLOURS = (BLUE, GREEN, VERMILION)
 """Colours of the negative end of the field, its middle and its positive end."""
 
-_BEFORE = 0.16
+BEFORE = 0.16
 """Length of the incoming rays in the drawing, as a fraction of the layout's length."""
 
 _VIEWS = ((1, "y", "Side view, in the plane of symmetry"), (0, "x", "Top view, along the line"))
@@ -51,30 +53,32 @@ def _fields(axis: int) -> list[tuple[float, float]]:
     return [(s, 0.0) if axis == 0 else (0.0, s) for s in (-1.0, 0.0, 1.0)]
 
 
-def _rays(model: CameraModel, backend: Backend, axis: int) -> np.ndarray:
-    """Trace chief, lower and upper marginal ray of three fields to K surfaces, (1 + K, 3, 3, 3), metres.
+def section_rays(
+    model: CameraModel, backend: Backend, axis: int, fields: Sequence[tuple[float, float]] | None = None
+) -> np.ndarray:
+    """Trace chief, lower and upper marginal ray of F fields to K surfaces, (1 + K, F, 3, 3), metres.
 
     The axes are launch point and surfaces, fields, rays and coordinates x, y, z. The plane of the rays is along
-    ``axis``: 0 for the line, 1 for the track.
+    ``axis``: 0 for the line, 1 for the track. By default the fields are both ends and the middle along ``axis``.
     """
     stop = np.zeros((3, 2))
     stop[1:, axis] = -INSIDE, INSIDE
-    return ray_paths(model, backend, _fields(axis), stop).points
+    return ray_paths(model, backend, _fields(axis) if fields is None else fields, stop).points
 
 
 def _extent(model: CameraModel, backend: Backend, axis: int) -> tuple[float, float, float, float]:
     """Return the limits of a drawing: smallest and largest z and transverse coordinate, with a margin, metres."""
-    rays = _rays(model, backend, axis)
+    rays = section_rays(model, backend, axis)
     points = rays[1:]
     z = points[..., 2]
     length = float(np.ptp(z))
     room = 0.05 * length
-    first = float(z.min()) - _BEFORE * length
-    across = np.concatenate([points[..., axis], _begun(rays, first)[:1, ..., axis]])
+    first = float(z.min()) - BEFORE * length
+    across = np.concatenate([points[..., axis], begun(rays, first)[:1, ..., axis]])
     return (first, float(z.max()) + 2.0 * room, float(across.min()) - room, float(across.max()) + room)
 
 
-def _begun(points: np.ndarray, first: float) -> np.ndarray:
+def begun(points: np.ndarray, first: float) -> np.ndarray:
     """Return rays, (1 + K, ..., 3) points on K surfaces, extended to begin at z = ``first`` metres."""
     start, then = points[0], points[1]
     share = (first - start[..., 2:]) / (then - start)[..., 2:]
@@ -83,7 +87,7 @@ def _begun(points: np.ndarray, first: float) -> np.ndarray:
 
 def _view(axes: Axes, model: CameraModel, backend: Backend, axis: int, first: float) -> None:
     """Draw the side view or the top view of the layout with its rays."""
-    points = _begun(_rays(model, backend, axis), first)
+    points = begun(section_rays(model, backend, axis), first)
     half = np.degrees((model.spec.field.x, model.spec.field.y)[axis])
     for share, colour in zip((-1.0, 0.0, 1.0), _END_COLOURS, strict=True):
         axes.plot([], [], color=colour, label=f"field {plain(share * half)}\N{DEGREE SIGN}")
@@ -95,25 +99,28 @@ def _view(axes: Axes, model: CameraModel, backend: Backend, axis: int, first: fl
             line = points[:, k, ray]
             style = (0, (5, 2)) if ray == 0 else "-"
             axes.plot(line[:, 2], line[:, axis], color=colour, lw=width, ls=style, alpha=0.9)
-    edges = obstacles(model)
-    for name in (*model.mirrors, IMAGE):
-        edge, pose = edges.get(name, model.apertures.get(name)), model.image_body
-        assert edge is not None
-        low, high = edge.bounds[2 * axis], edge.bounds[2 * axis + 1]
-        other = edge.centre[1 - axis]
-        across = np.linspace(low, high, 80)
-        x, y = (across, np.full(80, other)) if axis == 0 else (np.full(80, other), across)
-        if name == IMAGE:
-            z = np.zeros(80)
-            drawn = pose.apply(np.stack([x, y, z], axis=-1))
-        else:
-            drawn = model.mirror_pose(name).apply(np.stack([x, y, model.surfaces[name].sag(x, y)], axis=-1))
-        if name not in edges and name != IMAGE and model.spec.mirrors[name].light == "passes":  # no body is there
+    for name, drawn in section_lines(model, axis).items():
+        if name != IMAGE and model.spec.mirrors[name].light == "passes":  # no body is there
             axes.plot(drawn[:, 2], drawn[:, axis], color=GREY, lw=0.8, ls=(0, (1, 2)), zorder=3)
         else:
             axes.plot(drawn[:, 2], drawn[:, axis], color=INK, lw=2.6, solid_capstyle="butt", zorder=3)
         _label(axes, model, name, drawn[:, [2, axis]], axis)
     axes.axhline(0.0, color=LIGHT, lw=0.7, ls=(0, (8, 3, 2, 3)), zorder=0)
+
+
+def section_lines(model: CameraModel, axis: int, points: int = 80) -> dict[str, np.ndarray]:
+    """Return surface, or ``IMAGE`` -> its section along ``axis`` (0: line, 1: track), (points, 3) points in metres."""
+    edges, lines = obstacles(model), {}
+    for name in (*model.mirrors, IMAGE):
+        edge = edges.get(name, model.apertures.get(name))
+        assert edge is not None
+        across = np.linspace(edge.bounds[2 * axis], edge.bounds[2 * axis + 1], points)
+        other = np.full(points, edge.centre[1 - axis])
+        x, y = (across, other) if axis == 0 else (other, across)
+        pose = model.image_body if name == IMAGE else model.mirror_pose(name)
+        sag = np.zeros(points) if name == IMAGE else model.surfaces[name].sag(x, y)
+        lines[name] = pose.apply(np.stack([x, y, sag], axis=-1))
+    return lines
 
 
 def _label(axes: Axes, model: CameraModel, name: str, drawn: np.ndarray, axis: int) -> None:

@@ -25,8 +25,9 @@ from optics.numerics.backend import BackendUnavailable, cores, kernel_threads, o
 from optics.numerics.llvm import LibraryMissing
 from scenes.yaml.errors import InputError
 from twin.live.camera_pictures import CameraPictures
-from twin.live.live_bench import IMPOSSIBLE, LiveBench, course_text, job_text
+from twin.live.live_bench import IMPOSSIBLE, LiveBench
 from twin.live.messages import AskedState, AskedView, BlindState, Opened, packed
+from twin.live.saved_files import camera_file, course_text, job_text
 from twin.live.source import read_source
 from twin.pictures.light_paths import trace_light_paths
 from twin.pictures.scene_file import scene_bytes
@@ -110,7 +111,7 @@ class RequestHandler:
         """Return the message with a state and its images, and with the reference images if the page lacks them."""
         asked, known = question
         message, after = self.bench.state(asked)
-        images = {} if after is None else {"after": after}
+        images = {**({} if after is None else {"after": after}), **message.pop("pictures", {})}
         key = (asked.noise, asked.frames, asked.seed)
         if key != known:
             images["before"] = self.bench.before(asked)
@@ -122,10 +123,9 @@ class RequestHandler:
         """Return the message with a picture of a camera as SVG."""
         message: dict[str, Any] = {"type": "view", "n": asked.n, "view": asked.view, "camera": asked.camera}
         try:
-            state = self.bench.states(asked.state)
-            message["svg"] = self.pictures.draw(
-                asked.view, asked.camera, asked.field, state, asked.state.frames, self.bench.seed_of(asked.state.seed)
-            )
+            state, now = self.bench.states(asked.state), self.bench.perturbed(asked.state).experiment
+            field, seed = self.bench.field(asked.state) or (asked.field, 0.0), self.bench.seed_of(asked.state.seed)
+            message["svg"] = self.pictures.draw(asked.view, asked.camera, field, state, asked.state.frames, seed, now)
         except IMPOSSIBLE as error:
             message["problem"] = str(error)[:1000]
         return json.dumps(message)
@@ -137,6 +137,10 @@ class RequestHandler:
     def _job(self, asked: AskedState) -> str:
         """Return the message with a job file that describes a state."""
         return self._file("job.yaml", lambda: job_text(self.bench, asked))
+
+    def _camera(self, asked: AskedState) -> str:
+        """Return the message with the file of the camera as the knobs design it."""
+        return self._file("camera.yaml", lambda: camera_file(self.bench, asked))
 
     def _course(self, kept: Sequence[tuple[float, AskedState]]) -> str:
         """Return the message with a job file that contains the recorded states as a time series."""
@@ -152,7 +156,7 @@ class RequestHandler:
         return json.dumps(message)
 
 
-Kind = Literal["state", "view", "hidden", "job", "course", "factors"]
+Kind = Literal["state", "view", "hidden", "job", "course", "camera", "factors"]
 BeforeKey = tuple[bool, int, int]
 Condition = Literal["starts", "runs", "stopped", "ended"]
 EXIT_TIMEOUT = 3.0
