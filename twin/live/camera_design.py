@@ -27,6 +27,7 @@ from twin.camera.camera_optics import INSIDE, CameraOptics
 from twin.camera.camera_results import Field, Spot
 from twin.camera.layout_plot import BEFORE, begun, section_lines, section_rays
 from twin.live.knobs import Knob
+from twin.monitor.image_quality import MOST_BLUR
 
 DESIGN, FIELD = "design", "field"
 """First parts of the names of knobs: of the camera's prescription, and of the field point."""
@@ -40,6 +41,8 @@ ray and stop's edge in the picture of a wider one, and smallest number of rays o
 """
 AIRY = 0.61
 """Radius of the Airy disk in wavelengths over the numerical aperture."""
+BLURRED = f"image quality is computed up to {MOST_BLUR:g} waves rms"
+"""Message where a camera is too far from sharp."""
 DEGREE = math.pi / 180.0
 
 
@@ -180,14 +183,14 @@ def changed_camera(spec: CameraSpec, values: Mapping[str, float]) -> CameraSpec:
 
 
 def with_own_focal_length(spec: CameraSpec, backend: Backend) -> CameraSpec:
-    """Return the camera with the traced focal length along the line as the stated one.
+    """Return the camera with the effective focal length of its surfaces as the stated one, in focus or not.
 
     Raises
     ------
     InputError
         Light does not reach the image, or has no focus.
     """
-    traced = derive_camera(spec, backend, check_stated=False).line_principal_distance
+    traced = abs(derive_camera(spec, backend, check_stated=False).paraxial.focal_length)
     return CameraSpec.model_construct(**{**dict(spec), "focal_length": float(f"{traced:.6g}")})
 
 
@@ -244,6 +247,8 @@ def optics_data(optics: CameraOptics, field: Field) -> tuple[dict[str, Any], dic
         },
     }
     try:
+        if wave.rms > MOST_BLUR:
+            raise ValueError(BLURRED)
         mtf = optics.mtf(field, np.linspace(0.0, 2.0 * optics.nyquist, FREQUENCIES))
         along, across = mtf.at(mtf.nyquist)
         curves = {"values": _rounded(mtf.values, 5), "limit": _rounded(mtf.limit, 5)}
@@ -252,6 +257,8 @@ def optics_data(optics: CameraOptics, field: Field) -> tuple[dict[str, Any], dic
     except (PhysicalError, ValueError) as error:
         data["mtf"] = {"problem": str(error)}
     try:
+        if wave.rms > MOST_BLUR:
+            raise ValueError(BLURRED)
         half = image_width(spot)
         image = point_image(optics, field, spot, np.linspace(-half, half, PIXELS))
         data["psf"] = {"half_um": 1e6 * half, "strehl": wave.strehl}

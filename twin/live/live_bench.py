@@ -27,7 +27,7 @@ from scenes.yaml.errors import InputError
 from twin.camera.camera_optics import CameraOptics
 from twin.camera.camera_results import Field
 from twin.framework.random_streams import stream
-from twin.live.camera_design import DESIGN, CameraDesign, changed_camera, optics_data, with_own_focal_length
+from twin.live.camera_design import BLURRED, DESIGN, CameraDesign, changed_camera, optics_data, with_own_focal_length
 from twin.live.knobs import Knob, checked_knob, knobs_of, perturbation
 from twin.live.messages import LARGEST_SEED, MOST_FRAMES, AskedState, BlindState
 from twin.main_job.monitor_reading import stated
@@ -60,10 +60,6 @@ IMAGES: Mapping[str, tuple[list[str], str]] = {
 
 The mapping is from a quantity's name to its path in quality.json and its unit.
 """
-
-
-BLURRED = f"image quality is computed up to {MOST_BLUR:g} waves rms"
-"""Warning on the page of a camera that is too far from sharp."""
 
 
 class LiveBench:

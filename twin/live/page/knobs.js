@@ -8,7 +8,7 @@ const element = (tag, properties = {}, ...children) => {
   return out;
 };
 const field = (properties = {}) => element('input', { type: 'text', className: 'number', inputMode: 'decimal', autocomplete: 'off', ...properties });
-const NAMES = { rotate: 'rotate', shift: 'shift', figure: 'figure', scale: 'scale', temperature: 'temperature', gradient: 'gradient' };
+const NAMES = { rotate: 'rotate', shift: 'shift', figure: 'figure', scale: 'scale', temperature: 'temperature', gradient: 'gradient', design: '', field: '' };
 // the number as the slider steps it, without the tail of a binary fraction
 const tidy = (value, step) => Number(value.toFixed(Math.max(0, Math.min(12, 2 - Math.floor(Math.log10(step))))));
 
@@ -178,7 +178,7 @@ export class Knobs {
         kind = knob.kind;
         const head = element('h3', {}, NAMES[kind]);
         if (kind === 'rotate' && this.nodes[node].pivots.length > 1) head.append(' about ', this.pivot(node));
-        list.append(head);
+        if (NAMES[kind]) list.append(head);
       }
       list.append(this.row(knob).box);
     }

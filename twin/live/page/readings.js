@@ -71,6 +71,8 @@ export class Readings {
   }
 
   take(told) {
+    // image quality follows when the knobs rest
+    if (this.told?.quality && !told.quality && !told.warnings?.length) told.quality = this.told.quality;
     this.told = told;
     const judged = this.hello.judged;
     const values = this.rows.map((row) => {
