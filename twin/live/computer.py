@@ -17,6 +17,7 @@ import time
 from collections import OrderedDict
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
+from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any, Literal
@@ -230,7 +231,14 @@ class Computer:
         self._process = context.Process(
             target=compute, args=(child_pipe, self._what, self._backend, self._run), daemon=True
         )
-        self._process.start()
+        # Ctrl-C reaches the whole process group; the server ends this process by closing the pipe. The process inherits
+        # the mask, so that Ctrl-C does not interrupt its imports either; the start of the tracker would unblock it.
+        resource_tracker.ensure_running()
+        mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+        try:
+            self._process.start()
+        finally:
+            signal.pthread_sigmask(signal.SIG_SETMASK, mask)
         child_pipe.close()
         try:
             while True:
@@ -387,8 +395,6 @@ def compute(pipe: Connection, what: str, backend: str, run: int | None) -> None:
     run : int | None
         Number of a study's run.
     """
-    # Ctrl-C reaches the whole process group; the server ends this process by closing the pipe
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
     _end_with(os.getppid())
     with one_blas_thread():
         try:

@@ -29,7 +29,7 @@ class Row {
     [this.low, this.high, this.steps] = [field(), field(), field()];
     this.ends = element('div', { className: 'ends', hidden: true },
       element('label', {}, 'from ', this.low), element('label', {}, 'to ', this.high), element('label', {}, 'step ', this.steps));
-    const name = element('span', { className: 'label', title: `${label} [${unit}]` }, label.split(' ').slice(long ? 0 : 1).join(' ') || label, ' ', element('small', {}, unit));
+    const name = element('span', { className: 'label', title: `${label} [${unit}]` }, label.split(' ').slice(long ? 0 : 1).join(' ') || label, ' ', element('small', {}, unit.replace('percent', '%')));
     this.box = element('div', { className: long ? 'knob long' : 'knob' }, name, this.slider, this.number, reset, more, this.ends);
     this.first = value;
     this.range(low_, extent, this.step);

@@ -66,7 +66,7 @@ export class Readings {
     const select = byId('strip-what');
     const chosen = select.value;
     select.replaceChildren(...this.rows.map((row, k) => new Option(row.name, String(k))));
-    const angle = this.rows.findIndex((row) => row.key === 'change_arcsec');
+    const angle = this.rows.findIndex((row) => ['change_arcsec', 'wfe_rms_waves'].includes(row.key));
     select.value = chosen || String(angle >= 0 ? angle : 0);
   }
 
