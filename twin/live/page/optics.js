@@ -106,7 +106,7 @@ export class Optics {
   circle(pen, middle, radius, colour) {
     pen.strokeStyle = colour;
     pen.beginPath();
-    pen.arc(middle, middle, radius - 0.5, 0, 2 * Math.PI);
+    pen.arc(middle, middle, Math.max(0, radius - 0.5), 0, 2 * Math.PI);
     pen.stroke();
   }
 
