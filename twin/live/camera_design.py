@@ -246,9 +246,9 @@ def optics_data(optics: CameraOptics, field: Field) -> tuple[dict[str, Any], dic
             "f_number": float(np.mean(np.abs(first.principal_distance))) / optics.model.entrance_pupil,
         },
     }
+    if wave.rms > MOST_BLUR:
+        return {**data, "mtf": {"problem": BLURRED}, "psf": {"problem": BLURRED}}, images
     try:
-        if wave.rms > MOST_BLUR:
-            raise ValueError(BLURRED)
         mtf = optics.mtf(field, np.linspace(0.0, 2.0 * optics.nyquist, FREQUENCIES))
         along, across = mtf.at(mtf.nyquist)
         curves = {"values": _rounded(mtf.values, 5), "limit": _rounded(mtf.limit, 5)}
@@ -257,8 +257,6 @@ def optics_data(optics: CameraOptics, field: Field) -> tuple[dict[str, Any], dic
     except (PhysicalError, ValueError) as error:
         data["mtf"] = {"problem": str(error)}
     try:
-        if wave.rms > MOST_BLUR:
-            raise ValueError(BLURRED)
         half = image_width(spot)
         image = point_image(optics, field, spot, np.linspace(-half, half, PIXELS))
         data["psf"] = {"half_um": 1e6 * half, "strehl": wave.strehl}

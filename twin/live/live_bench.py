@@ -172,8 +172,7 @@ class LiveBench:
             nodes = {**dict.fromkeys(self.design.nodes, unmoved), **nodes}
         common = {
             "instrument": twin.name,
-            # image quality of a vignetted camera takes longer than a knob should
-            "design": None if self.design is None else {"camera": self.design.name, "quick": self._is_quick},
+            "design": None if self.design is None else self.design.name,
             "cameras": list(twin.cameras),
             "nodes": nodes,
             "knobs": [asdict(knob) for knob in self.knobs.values()],
@@ -208,11 +207,6 @@ class LiveBench:
     def _parameters(self) -> Sequence[parameters.Parameter]:
         """Parameters of a camera shown on the page, such as ``d_alpha`` and ``d_f``."""
         return tuple(parameters.CAMERA_PARAMETERS.values()) if self.monitored else parameters.ESTIMATED
-
-    @property
-    def _is_quick(self) -> bool:
-        """True if no edges vignette the cameras."""
-        return not any(model.edges for model in self.twin.experiment.instrument.cameras.values())
 
     @cached_property
     def _designed(self) -> dict[str, Any]:

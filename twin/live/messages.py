@@ -56,8 +56,8 @@ class AskedState(_PageMessage):
     time : int | None
         Index of a time in the job's time series (``course``); None for the job's single state.
     quality : bool
-        Whether image quality is computed for an instrument without a monitor; where it takes long, the page asks for
-        it when the knobs rest.
+        Whether image quality is computed for an instrument without a monitor; the page of a single camera asks for it
+        when the knobs rest.
     """
 
     type: Literal["state"] = "state"

@@ -112,7 +112,7 @@ class Live {
     return {
       type: 'state', n: this.n, t: this.touched, knobs, pivots, noise: byId('noise').checked,
       frames: whole('frames', 1, 64, this.hello.frames), seed: whole('seed', 0, 9007199254740991, this.hello.seed), time,
-      quality: this.resting || (this.hello.design?.quick ?? true),
+      quality: this.resting || !this.hello.design,
     };
   }
 
@@ -303,7 +303,7 @@ class Live {
     const delay = recent.length ? `${Math.round(recent[recent.length >> 1])} ms` : '';
     this.status(`${delay} · computed in ${Math.round(told.ms)} ms${rate > 1 ? ` · ${rate.toFixed(0)} a second` : ''}`);
     document.body.dataset.shown = told.n;
-    if (!this.hello.design?.quick && this.hello.design && !this.resting && !told.problem) {
+    if (this.hello.design && !this.resting && !told.problem) {
       clearTimeout(this.rest);
       this.rest = setTimeout(() => { this.resting = true; this.dirty = true; this.ask(); }, AFTER_QUIET);
     }
