@@ -155,10 +155,16 @@ def file_with_plane(camera: CameraSpec, plane: FocalPlane, name: str) -> str:
         data["image"]["tilt"] = format_quantity(plane.tilt, ANGLE)
     else:
         data["image"].pop("tilt", None)
-    for band in (data.get("bands") or {}).values():
-        sheet = str(band["detector"])
-        if "/" in sheet or sheet.endswith((".yaml", ".yml")):
-            band["detector"] = str((Path(source.file).parent / sheet).resolve())
+    sheets_by_path(data.get("bands") or {}, Path(source.file).parent)
     out = io.StringIO()
     yaml.dump(data, out)
     return out.getvalue()
+
+
+def sheets_by_path(bands: Any, folder: Path) -> Any:
+    """Return the bands of a camera's file, changed in place: data sheets beside it have their absolute path."""
+    for band in bands.values():
+        sheet = str(band["detector"])
+        if "/" in sheet or sheet.endswith((".yaml", ".yml")):
+            band["detector"] = str((folder / sheet).resolve())
+    return bands

@@ -260,7 +260,7 @@ def runner() -> Iterator[Runner]:
 @pytest.mark.second
 @pytest.mark.parametrize("name", BY_NAME)
 def test_a_command_computes_what_it_did(name, runner) -> None:
-    if name in ("live", "operate"):
+    if name in ("live", "live_camera", "operate"):
         pytest.importorskip("uvicorn", reason="the extra `live` is not installed")
     outcome = check(BY_NAME[name], runner)
     assert outcome.comparison.far == [], "\n".join(line[:400] for line in outcome.lines()[:40])

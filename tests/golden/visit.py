@@ -24,6 +24,14 @@ ASKED = (
     {"type": "save", "what": "job", "state": {**KNOBS, "n": 4}},
 )
 """Messages of the live page."""
+CHANGED = {"type": "state", "knobs": {"design/M2 radius": 0.01, "design/M1 conic": 0.001, "field x": 0.05}}
+ASKED_OF_CAMERA = (
+    {**CHANGED, "n": 1},
+    {**CHANGED, "n": 2, "quality": False},
+    {"type": "state", "n": 3, "knobs": {"design/M1 thickness": -5000.0}},
+    {"type": "save", "what": "camera", "state": {**CHANGED, "n": 4}},
+)
+"""Messages of the page of a single camera."""
 
 
 PLACE = re.compile(r"(http://\S+:(\d+))/\?token=(\S+)")
@@ -31,13 +39,14 @@ PLACE = re.compile(r"(http://\S+:(\d+))/\?token=(\S+)")
 
 
 def live(address: str, cookie: str, out: Path) -> None:
-    """Keep the greeting of the live twin and its answers to ASKED."""
+    """Keep the greeting of the live twin and its answers to ASKED, or to ASKED_OF_CAMERA."""
     from websockets.sync.client import connect
 
     place = address.replace("http", "ws") + "/live"
     with connect(place, additional_headers={"Cookie": cookie}, origin=address, max_size=2**24) as line:  # type: ignore[arg-type]
-        _keep(line.recv(120), out / "hello")
-        for k, asked in enumerate(ASKED):
+        hello = line.recv(120)
+        _keep(hello, out / "hello")
+        for k, asked in enumerate(ASKED_OF_CAMERA if json.loads(hello)["design"] else ASKED):
             line.send(json.dumps(asked))
             answer: Any = json.dumps({"type": "process"})
             while isinstance(answer, str) and json.loads(answer)["type"] in ("process", "hello", "progress"):

@@ -18,8 +18,9 @@ from twin.framework.provenance import program_digest
 from twin.live.camera_pictures import CameraPictures
 from twin.live.computer import RequestHandler
 from twin.live.knobs import KINDS, knob_name, perturbation
-from twin.live.live_bench import LiveBench, course_text, job_text
+from twin.live.live_bench import LiveBench
 from twin.live.messages import AskedState, AskedView, BlindState
+from twin.live.saved_files import course_text, job_text
 from twin.main_job.monitor_reading import stated
 from twin.main_job.render_job import render_job
 from twin.monitor.time_series import series_states
@@ -260,9 +261,9 @@ def test_an_unknown_knob_names_the_nearest(bench):
 @pytest.mark.parametrize("view", ["wavefront", "spot", "mtf", "focus", "target"])
 def test_pictures_of_a_camera(bench, view):
     pictures = CameraPictures(bench.twin.experiment)
-    assert pictures.draw(view, "forward", 0.5, bench.twin.state, 1, 1).startswith("<svg")
+    assert pictures.draw(view, "forward", (0.5, 0.0), bench.twin.state, 1, 1).startswith("<svg")
     with pytest.raises(ValueError, match="no camera"):
-        pictures.draw(view, "sideward", 0.5, {}, 1, 1)
+        pictures.draw(view, "sideward", (0.5, 0.0), {}, 1, 1)
 
 
 @pytest.mark.second

@@ -8,8 +8,10 @@ import re
 import numpy as np
 import pytest
 
+from scenes.specs.load import load_camera
 from scenes.specs.resolved import resolve
 from tests.twin.live_page import CHROMIUM, FLAGS, Command, Page, running
+from twin.camera.camera_optics import CameraOptics
 from twin.framework.run_folder import RunFolder, write_manifest
 from twin.main_job.monitor_reading import stated
 from twin.main_job.render_job import render_job
@@ -189,3 +191,41 @@ def test_the_page_comes_back_after_a_restart(browser):
         assert page.page.evaluate(f"liveTwin.knobs.knobs['{DESPACE}']") == 2.0
         assert page.page.evaluate("liveTwin.last.readings") == before
     page.close()
+
+
+def test_a_camera_is_designed_and_saved(browser, backend, tmp_path):
+    """Turned, undone, redone, at a design without light, and saved, on a phone's width."""
+    rms = "liveTwin.last.optics.wavefront.rms_waves"
+    with running("gf7", "--port", "0") as command:
+        page = Page(browser, command.address, 390, 844)
+        page.ready()
+        page.unfold("design", "design/M1", "design/M2")
+        first = page.page.evaluate(rms)
+        page.drag("design/M2 radius", 20.0)
+        page.still()
+        turned = page.page.evaluate(rms)
+        assert turned > first + 0.1
+        assert f"{turned:.4f} waves rms" in page.page.inner_text("#optics-wavefront")
+        # the middle of every canvas is drawn on
+        for name in ("layout", "wavefront", "spot", "psf", "mtf"):
+            pixels = f"""(() => {{ const c = document.querySelector('#optics-{name} canvas');
+                return new Set(c.getContext('2d').getImageData(0, 0, c.width, c.height).data).size; }})()"""
+            assert page.page.evaluate(pixels) > 3, name
+        page.page.click("#undo")
+        page.still()
+        assert page.page.evaluate(rms) == first
+        page.page.click("#redo")
+        page.still()
+        assert page.page.evaluate(rms) == turned
+        with page.page.expect_download() as waited:
+            page.page.click("#save-camera")
+        waited.value.save_as(tmp_path / "camera.yaml")
+        saved = CameraOptics.alone(load_camera(tmp_path / "camera.yaml"), backend)
+        assert saved.wavefront((0.0, 0.0)).rms == pytest.approx(turned, rel=1e-9)
+        page.number("design/M1 conic").fill("90")
+        page.still()
+        assert "this state is impossible; shown is the last good state" in page.page.inner_text("#problem")
+        assert f"{turned:.4f} waves rms" in page.page.inner_text("#optics-wavefront")
+        assert page.page.evaluate("document.documentElement.scrollWidth <= innerWidth")
+        assert page.wrong == []
+        page.close()

@@ -4,8 +4,14 @@ from __future__ import annotations
 
 import asyncio
 import json
+import os
+import signal
+import subprocess
+import sys
 import threading
+import time
 from contextlib import contextmanager, suppress
+from pathlib import Path
 
 import pytest
 
@@ -48,6 +54,27 @@ def test_values_of_a_studys_factors_stay_when_the_process_is_started_again() -> 
     with computer("scenes/examples/study_aperture.yaml") as process:
         process.start()
         asyncio.run(session(process))
+
+
+def test_an_interrupt_while_the_process_imports_is_one_line() -> None:
+    """Ctrl-C of a terminal reaches both processes; the second is there before it has imported anything."""
+    command = [sys.executable, "-m", "twin.live", "gf7", "--port", "0"]
+    with subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, start_new_session=True) as made:
+        end = time.monotonic() + 60.0
+        while not any("spawn_main" in line for line in _children(made.pid)) and time.monotonic() < end:
+            time.sleep(0.01)
+        time.sleep(0.3)
+        os.killpg(made.pid, signal.SIGINT)
+        assert made.communicate(timeout=60)[1] == b"interrupted: nothing was kept\n"
+        assert made.returncode == 130
+
+
+def _children(pid: int) -> list[str]:
+    """The command lines of a process's children."""
+    with suppress(OSError):
+        names = Path(f"/proc/{pid}/task/{pid}/children").read_text("utf-8").split()
+        return [Path(f"/proc/{name}/cmdline").read_text("utf-8") for name in names]
+    return []
 
 
 def test_a_process_that_cannot_start_says_why() -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -17,7 +19,7 @@ from twin.framework.svg import BLUE, GREEN, GREY, INK, LIGHT, VERMILION, new_fig
 _END_COLOURS = (BLUE, GREEN, VERMILION)
 """Colours of the negative end of the field, its middle and its positive end."""
 
-_BEFORE = 0.16
+BEFORE = 0.16
 """Length of the incoming rays in the drawing, as a fraction of the layout's length."""
 
 _VIEWS = ((1, "y", "Side view, in the plane of symmetry"), (0, "x", "Top view, along the line"))
@@ -63,7 +65,17 @@ def _measure(axes: Axes, across: np.ndarray, along: np.ndarray) -> None:
         )
         upright = 90 if start[0] == end[0] else 0
         box = {"facecolor": "white", "edgecolor": "none", "pad": 0.6}
-        axes.text(float(where[0]), float(where[1]), f"{text} m", rotation=upright, ha="center", va="center", fontsize=7.5, color=GREY, bbox=box)
+        axes.text(
+            float(where[0]),
+            float(where[1]),
+            f"{text} m",
+            rotation=upright,
+            ha="center",
+            va="center",
+            fontsize=7.5,
+            color=GREY,
+            bbox=box,
+        )
 
 
 def _fields(axis: int) -> list[tuple[float, float]]:
@@ -74,30 +86,32 @@ def _fields(axis: int) -> list[tuple[float, float]]:
     return [(s, 0.0) if axis == 0 else (0.0, s) for s in (-1.0, 0.0, 1.0)]
 
 
-def _rays(model: CameraModel, backend: Backend, axis: int) -> np.ndarray:
-    """Trace chief, lower and upper marginal ray of three fields to K surfaces, (1 + K, 3, 3, 3), metres.
+def section_rays(
+    model: CameraModel, backend: Backend, axis: int, fields: Sequence[tuple[float, float]] | None = None
+) -> np.ndarray:
+    """Trace chief, lower and upper marginal ray of F fields to K surfaces, (1 + K, F, 3, 3), metres.
 
     The axes are launch point and surfaces, fields, rays and coordinates x, y, z. The plane of the rays is along
-    ``axis``: 0 for the line, 1 for the track.
+    ``axis``: 0 for the line, 1 for the track. By default the fields are both ends and the middle along ``axis``.
     """
     stop = np.zeros((3, 2))
     stop[1:, axis] = -INSIDE, INSIDE
-    return ray_paths(model, backend, _fields(axis), stop).points
+    return ray_paths(model, backend, _fields(axis) if fields is None else fields, stop).points
 
 
 def _extent(model: CameraModel, backend: Backend, axis: int) -> tuple[float, float, float, float]:
     """Return the limits of a drawing: smallest and largest z and transverse coordinate, with a margin, metres."""
-    rays = _rays(model, backend, axis)
+    rays = section_rays(model, backend, axis)
     points = rays[1:]
     z = points[..., 2]
     length = float(np.ptp(z))
     room = 0.05 * length
-    first = float(z.min()) - _BEFORE * length
-    across = np.concatenate([points[..., axis], _begun(rays, first)[:1, ..., axis]])
+    first = float(z.min()) - BEFORE * length
+    across = np.concatenate([points[..., axis], begun(rays, first)[:1, ..., axis]])
     return (first, float(z.max()) + 2.0 * room, float(across.min()) - room, float(across.max()) + room)
 
 
-def _begun(points: np.ndarray, first: float) -> np.ndarray:
+def begun(points: np.ndarray, first: float) -> np.ndarray:
     """Return rays, (1 + K, ..., 3) points on K surfaces, extended to begin at z = ``first`` metres."""
     start, then = points[0], points[1]
     share = (first - start[..., 2:]) / (then - start)[..., 2:]
@@ -106,7 +120,7 @@ def _begun(points: np.ndarray, first: float) -> np.ndarray:
 
 def _view(axes: Axes, model: CameraModel, backend: Backend, axis: int, first: float) -> None:
     """Draw the side view or the top view of the layout with its rays."""
-    points = _begun(_rays(model, backend, axis), first)
+    points = begun(section_rays(model, backend, axis), first)
     half = np.degrees((model.spec.field.x, model.spec.field.y)[axis])
     for share, colour in zip((-1.0, 0.0, 1.0), _END_COLOURS, strict=True):
         axes.plot([], [], color=colour, label=f"field {plain(share * half)}\N{DEGREE SIGN}")
@@ -119,8 +133,7 @@ def _view(axes: Axes, model: CameraModel, backend: Backend, axis: int, first: fl
             style = (0, (5, 2)) if ray == 0 else "-"
             axes.plot(line[:, 2], line[:, axis], color=colour, lw=width, ls=style, alpha=0.9)
     edges = obstacles(model)
-    for name in (*model.mirrors, IMAGE):
-        drawn = _drawn(model, name, axis)
+    for name, drawn in section_lines(model, axis).items():
         if name not in edges and name != IMAGE and model.spec.mirrors[name].light == "passes":  # no body is there
             axes.plot(drawn[:, 2], drawn[:, axis], color=GREY, lw=0.8, ls=(0, (1, 2)), zorder=3)
         else:
@@ -129,21 +142,11 @@ def _view(axes: Axes, model: CameraModel, backend: Backend, axis: int, first: fl
     axes.axhline(0.0, color=LIGHT, lw=0.7, ls=(0, (8, 3, 2, 3)), zorder=0)
 
 
-def _drawn(model: CameraModel, name: str, axis: int) -> np.ndarray:
-    """Return the section of a surface through the middle of its aperture along ``axis``, (80, 3), metres."""
-    edge, pose = obstacles(model).get(name, model.apertures.get(name)), model.image_body
-    assert edge is not None
-    across = np.linspace(edge.bounds[2 * axis], edge.bounds[2 * axis + 1], 80)
-    other = np.full(80, edge.centre[1 - axis])
-    x, y = (across, other) if axis == 0 else (other, across)
-    if name == IMAGE:
-        return pose.apply(np.stack([x, y, np.zeros(80)], axis=-1))
-    return model.mirror_pose(name).apply(np.stack([x, y, model.surfaces[name].sag(x, y)], axis=-1))
-
-
 def _sizes(model: CameraModel) -> np.ndarray:
     """Return the least and the largest x, y and z of mirrors, lenses and line CCDs, (3, 2), metres."""
-    drawn = np.concatenate([_drawn(model, name, axis) for name in obstacles(model) for axis in (0, 1)])
+    bodies = obstacles(model)
+    sections = (section_lines(model, axis) for axis in (0, 1))
+    drawn = np.concatenate([points for lines in sections for name, points in lines.items() if name in bodies])
     return np.stack([drawn.min(axis=0), drawn.max(axis=0)], axis=-1)
 
 
@@ -164,6 +167,21 @@ def dimensions(model: CameraModel) -> list[tuple[str, str, float]]:
 def _title(name: str) -> str:
     """Return the name of a surface for readers."""
     return "focal plane" if name == IMAGE else name
+
+
+def section_lines(model: CameraModel, axis: int, points: int = 80) -> dict[str, np.ndarray]:
+    """Return surface, or ``IMAGE`` -> its section along ``axis`` (0: line, 1: track), (points, 3) points in metres."""
+    edges, lines = obstacles(model), {}
+    for name in (*model.mirrors, IMAGE):
+        edge = edges.get(name, model.apertures.get(name))
+        assert edge is not None
+        across = np.linspace(edge.bounds[2 * axis], edge.bounds[2 * axis + 1], points)
+        other = np.full(points, edge.centre[1 - axis])
+        x, y = (across, other) if axis == 0 else (other, across)
+        pose = model.image_body if name == IMAGE else model.mirror_pose(name)
+        sag = np.zeros(points) if name == IMAGE else model.surfaces[name].sag(x, y)
+        lines[name] = pose.apply(np.stack([x, y, sag], axis=-1))
+    return lines
 
 
 def _label(axes: Axes, model: CameraModel, name: str, drawn: np.ndarray, axis: int) -> None:

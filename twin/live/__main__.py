@@ -51,7 +51,8 @@ def main(
     """Open an instrument as a page in the browser.
 
     The page has sliders for every body, the spots on the CCDs, the readings of all estimators beside the truth, a strip
-    chart, and the instrument in three dimensions.
+    chart, and the instrument in three dimensions. A single camera has sliders for radii, conic constants, distances and
+    the field point, too; the page draws its optics and saves its file.
 
     Every state is computed as by the main job: the page shows what twin.render writes for the same knobs, seed
     and frames; the page saves that job, and recorded states as a course.

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from functools import lru_cache
+
 import numpy as np
 from matplotlib.figure import Figure
 
@@ -11,6 +14,7 @@ from scenes.models.camera_sharpness import field_text
 from scenes.specs.job import TargetsSpec
 from scenes.specs.resolved import ResolvedJob, resolve_job
 from scenes.yaml.errors import InputError
+from twin.camera.camera_results import Field
 from twin.camera.camera_view import CameraView, draw_mtf, draw_spot, draw_wavefront
 from twin.framework.random_streams import stream
 from twin.framework.svg import AFTER, BEFORE, BLUE, GRAY, GREY, INK, VERMILION, look, to_svg
@@ -30,7 +34,7 @@ UM = "\N{MICRO SIGN}m"
 
 
 class CameraPictures:
-    """Drawing of an instrument's cameras in perturbed and nominal state; unchanging data are cached.
+    """Drawing of an instrument's cameras in their present and in the nominal state; unchanging data are cached.
 
     Parameters
     ----------
@@ -40,9 +44,18 @@ class CameraPictures:
 
     def __init__(self, experiment: MonitorExperiment) -> None:
         self.experiment = experiment
-        self._benches: dict[str, tuple[TargetCamera, TargetsSpec]] = {}
+        self._bench = lru_cache(maxsize=4)(_new_bench)
 
-    def draw(self, view: str, camera: str, field: float, state: State, frames: int, seed: int) -> str:
+    def draw(
+        self,
+        view: str,
+        camera: str,
+        field: Field,
+        state: State,
+        frames: int,
+        seed: int,
+        now: MonitorExperiment | None = None,
+    ) -> str:
         """Return a picture of a camera in a state, beside the nominal one, as SVG.
 
         Parameters
@@ -51,14 +64,16 @@ class CameraPictures:
             ``wavefront``, ``spot``, ``mtf``, ``focus`` or ``target``.
         camera : str
             Name of the camera.
-        field : float
-            Field along the line, as a fraction of the half field; a target is always at the centre of the line.
+        field : Field
+            Field point, as fractions of the half angles; a target is always at the centre of the line.
         state : State
             Body -> motion.
         frames : int
             Number of frames of the target.
         seed : int
             Seed of their noise.
+        now : MonitorExperiment, optional
+            Instrument with another design of the camera, which has the state.
 
         Raises
         ------
@@ -67,25 +82,27 @@ class CameraPictures:
         ValueError
             The camera's light is lost in this state.
         """
-        instrument = self.experiment.instrument
-        if camera not in instrument.cameras:
+        both = [(self.experiment, {}), (now or self.experiment, state)]
+        if camera not in self.experiment.instrument.cameras:
             raise ValueError(f"no camera {camera!r}")
         with look(f"live-{view}"):
             figure = Figure(figsize=SIZE, layout="constrained")
             if view == "target":
-                self._target(figure, camera, state, frames, seed)
+                self._target(figure, camera, both, frames, seed)
             else:
-                views = [CameraView.within(instrument, camera, self.experiment.backend, one) for one in ({}, state)]
+                views = [CameraView.within(one.instrument, camera, one.backend, moved) for one, moved in both]
                 {"wavefront": _wavefront, "spot": _spot, "mtf": _mtf, "focus": _focus}[view](figure, views, field)
             return to_svg(figure)
 
-    def _target(self, figure: Figure, camera: str, state: State, frames: int, seed: int) -> None:
+    def _target(
+        self, figure: Figure, camera: str, both: Sequence[tuple[MonitorExperiment, State]], frames: int, seed: int
+    ) -> None:
         """Draw the knife edge before and after, and the MTF from both images."""
-        bench, settings = self._bench(camera)
-        pattern = bench.ccd.pattern(stream(seed, 3, 0))
         shots: list[tuple[np.ndarray, EdgeReading]] = []
-        for when, one in enumerate(({}, state)):
-            view_of_target = bench.views(one)[LINE_POSITION]
+        for when, (experiment, state) in enumerate(both):
+            bench, settings = self._bench(experiment, camera)
+            pattern = bench.ccd.pattern(stream(seed, 3, 0))
+            view_of_target = bench.views(state)[LINE_POSITION]
             imager = view_of_target.edge(DIRECTIONS[0], settings.angle)
             photons = (
                 view_of_target.ccd.white_photons(settings.white)
@@ -121,14 +138,11 @@ class CameraPictures:
         curve.set_title("MTF with the pixel, along the line")
         curve.legend(fontsize=7)
 
-    def _bench(self, camera: str) -> tuple[TargetCamera, TargetsSpec]:
-        """Return the camera prepared for imaging test targets, and the settings of the targets."""
-        if camera not in self._benches:
-            experiment = self.experiment
-            instrument, resolved = experiment.instrument, _with_targets(experiment.resolved)
-            bench = target_camera(resolved, instrument, camera, experiment.backend)
-            self._benches[camera] = bench, resolved.targets
-        return self._benches[camera]
+
+def _new_bench(experiment: MonitorExperiment, camera: str) -> tuple[TargetCamera, TargetsSpec]:
+    """Return the camera prepared for imaging test targets, and the settings of the targets."""
+    resolved = _with_targets(experiment.resolved)
+    return target_camera(resolved, experiment.instrument, camera, experiment.backend), resolved.targets
 
 
 def _with_targets(resolved: ResolvedJob) -> ResolvedJob:
@@ -143,14 +157,15 @@ def _with_targets(resolved: ResolvedJob) -> ResolvedJob:
         return resolved
     render = resolved.job.render.model_copy(update={"images": ("spots", "knife_edge")})
     try:
-        return resolve_job(resolved.job.model_copy(update={"render": render}))
+        made = resolve_job(resolved.job.model_copy(update={"render": render}))
     except InputError as error:
         raise ValueError(f"no targets can be imaged: {error}") from error
+    return made.model_copy(update={"cameras": resolved.cameras})
 
 
-def _wavefront(figure: Figure, views: list[CameraView], field: float) -> None:
+def _wavefront(figure: Figure, views: list[CameraView], field: Field) -> None:
     """Draw the wavefront of the nominal and of the perturbed camera."""
-    waves = [one.wavefront((field, 0.0), points=65) for one in views]
+    waves = [one.wavefront(field, points=65) for one in views]
     most = max(float(np.nanmax(np.abs(wave.map))) for wave in waves)
     meshes = []
     for axes, wave, name in zip(figure.subplots(1, 2), waves, ("as designed", "now"), strict=True):
@@ -160,9 +175,9 @@ def _wavefront(figure: Figure, views: list[CameraView], field: float) -> None:
     figure.colorbar(meshes[0], ax=figure.axes, label=f"waves of {1e9 * waves[0].wavelength:.0f} nm", shrink=0.85)
 
 
-def _spot(figure: Figure, views: list[CameraView], field: float) -> None:
+def _spot(figure: Figure, views: list[CameraView], field: Field) -> None:
     """Draw the spot diagram of the nominal and of the perturbed camera."""
-    spots = [one.spot((field, 0.0)) for one in views]
+    spots = [one.spot(field) for one in views]
     half = max(max(1.15 * spot.airy, 1.1 * spot.farthest) for spot in spots)
     for axes, spot, name in zip(figure.subplots(1, 2), spots, ("as designed", "now"), strict=True):
         draw_spot(axes, spot, half)
@@ -171,22 +186,22 @@ def _spot(figure: Figure, views: list[CameraView], field: float) -> None:
         axes.set_ylabel(f"along the track [{UM}]")
 
 
-def _mtf(figure: Figure, views: list[CameraView], field: float) -> None:
+def _mtf(figure: Figure, views: list[CameraView], field: Field) -> None:
     """Draw the MTF of the nominal and of the perturbed camera."""
     for axes, one, name in zip(figure.subplots(1, 2, sharey=True), views, ("as designed", "now"), strict=True):
-        mtf = one.mtf((field, 0.0))
+        mtf = one.mtf(field)
         draw_mtf(axes, mtf)
         along, across = mtf.at(mtf.nyquist)
         axes.set_title(f"optics {name}: {along:.3f} along, {across:.3f} across at Nyquist")
     figure.axes[0].legend(fontsize=7)
 
 
-def _focus(figure: Figure, views: list[CameraView], field: float) -> None:
+def _focus(figure: Figure, views: list[CameraView], field: Field) -> None:
     """Draw the MTF at the Nyquist frequency through focus, of the nominal and of the perturbed camera."""
     axes = figure.subplots()
     shift = np.linspace(-FOCUS, FOCUS, STEPS)
     for one, name, style in zip(views, ("as designed", "now"), ((0, (3, 2)), "-"), strict=True):
-        pupil = one.pupils([(field, 0.0)])[0]
+        pupil = one.pupils([field])[0]
         colour = np.array([one.model.spec.wavelength])
         frequency = one.nyquist * np.eye(2)
         values = np.abs(polychromatic_transfer(pupil, frequency, colour, np.ones(1), shift))
@@ -195,6 +210,6 @@ def _focus(figure: Figure, views: list[CameraView], field: float) -> None:
     axes.axvline(0.0, color=INK, lw=0.6)
     axes.set_xlabel(f"the line CCD moved downstream by [{UM}]")
     axes.set_ylabel("MTF of the optics at Nyquist")
-    axes.set_title(f"through focus, field {field_text(views[0].model.spec, (field, 0.0))}")
+    axes.set_title(f"through focus, field {field_text(views[0].model.spec, field)}")
     axes.set_ylim(bottom=0.0)
     axes.legend(fontsize=7)

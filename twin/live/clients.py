@@ -437,8 +437,8 @@ class LiveApi:
                 self.states += 1
             case "reveal":
                 client.queue_text(await self._ask("hidden", asked))
-            case "save" if asked.what == "job":
-                client.queue_text(await self._ask("job", asked.state))
+            case "save" if asked.what != "course":
+                client.queue_text(await self._ask(asked.what, asked.state))
             case "save":
                 client.queue_text(await self._ask("course", list(client.recorded or ())))
             case _:

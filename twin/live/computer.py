@@ -17,6 +17,7 @@ import time
 from collections import OrderedDict
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
+from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any, Literal
@@ -25,8 +26,9 @@ from optics.numerics.backend import BackendUnavailable, cores, kernel_threads, o
 from optics.numerics.llvm import LibraryMissing
 from scenes.yaml.errors import InputError
 from twin.live.camera_pictures import CameraPictures
-from twin.live.live_bench import IMPOSSIBLE, LiveBench, course_text, job_text
+from twin.live.live_bench import IMPOSSIBLE, LiveBench
 from twin.live.messages import AskedState, AskedView, BlindState, Opened, packed
+from twin.live.saved_files import camera_file, course_text, job_text
 from twin.live.source import read_source
 from twin.pictures.light_paths import trace_light_paths
 from twin.pictures.scene_file import scene_bytes
@@ -110,7 +112,7 @@ class RequestHandler:
         """Return the message with a state and its images, and with the reference images if the page lacks them."""
         asked, known = question
         message, after = self.bench.state(asked)
-        images = {} if after is None else {"after": after}
+        images = {**({} if after is None else {"after": after}), **message.pop("pictures", {})}
         key = (asked.noise, asked.frames, asked.seed)
         if key != known:
             images["before"] = self.bench.before(asked)
@@ -122,10 +124,9 @@ class RequestHandler:
         """Return the message with a picture of a camera as SVG."""
         message: dict[str, Any] = {"type": "view", "n": asked.n, "view": asked.view, "camera": asked.camera}
         try:
-            state = self.bench.states(asked.state)
-            message["svg"] = self.pictures.draw(
-                asked.view, asked.camera, asked.field, state, asked.state.frames, self.bench.seed_of(asked.state.seed)
-            )
+            state, now = self.bench.states(asked.state), self.bench.perturbed(asked.state).experiment
+            field, seed = self.bench.field(asked.state) or (asked.field, 0.0), self.bench.seed_of(asked.state.seed)
+            message["svg"] = self.pictures.draw(asked.view, asked.camera, field, state, asked.state.frames, seed, now)
         except IMPOSSIBLE as error:
             message["problem"] = str(error)[:1000]
         return json.dumps(message)
@@ -137,6 +138,10 @@ class RequestHandler:
     def _job(self, asked: AskedState) -> str:
         """Return the message with a job file that describes a state."""
         return self._file("job.yaml", lambda: job_text(self.bench, asked))
+
+    def _camera(self, asked: AskedState) -> str:
+        """Return the message with the file of the camera as the knobs design it."""
+        return self._file("camera.yaml", lambda: camera_file(self.bench, asked))
 
     def _course(self, kept: Sequence[tuple[float, AskedState]]) -> str:
         """Return the message with a job file that contains the recorded states as a time series."""
@@ -152,7 +157,7 @@ class RequestHandler:
         return json.dumps(message)
 
 
-Kind = Literal["state", "view", "hidden", "job", "course", "factors"]
+Kind = Literal["state", "view", "hidden", "job", "course", "camera", "factors"]
 BeforeKey = tuple[bool, int, int]
 Condition = Literal["starts", "runs", "stopped", "ended"]
 EXIT_TIMEOUT = 3.0
@@ -226,7 +231,14 @@ class Computer:
         self._process = context.Process(
             target=compute, args=(child_pipe, self._what, self._backend, self._run), daemon=True
         )
-        self._process.start()
+        # Ctrl-C reaches the whole process group; the server ends this process by closing the pipe. The process inherits
+        # the mask, so that Ctrl-C does not interrupt its imports either; the start of the tracker would unblock it.
+        resource_tracker.ensure_running()
+        mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+        try:
+            self._process.start()
+        finally:
+            signal.pthread_sigmask(signal.SIG_SETMASK, mask)
         child_pipe.close()
         try:
             while True:
@@ -383,8 +395,6 @@ def compute(pipe: Connection, what: str, backend: str, run: int | None) -> None:
     run : int | None
         Number of a study's run.
     """
-    # Ctrl-C reaches the whole process group; the server ends this process by closing the pipe
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
     _end_with(os.getppid())
     with one_blas_thread():
         try:

@@ -187,15 +187,7 @@ def perturbation(
     out: dict[str, dict[str, Any]] = {node: _without_knobs(what) for node, what in first.items()}
     by_axis: dict[tuple[str, str], dict[str, float]] = {}
     for name, value in values.items():
-        knob = knobs.get(name)
-        if knob is None:
-            raise InputError(unknown("no such knob", name, knobs).at())
-        if not abs(value) <= knob.limit:
-            raise InputError(
-                Issue(
-                    f"{name} is too large", found=f"{value:g} {knob.unit}", allowed=f"up to {knob.limit:g} {knob.unit}"
-                )
-            )
+        knob = checked_knob(name, value, knobs)
         if value != 0.0:
             by_axis.setdefault((knob.node, knob.kind), {})[knob.axis] = value
     for (node, kind), numbers in by_axis.items():
@@ -205,6 +197,23 @@ def perturbation(
         if node in out and pivot != DEFAULT_PIVOT and {"rotate", "scale"} & set(out[node]):
             out[node]["pivot"] = pivot
     return out
+
+
+def checked_knob(name: str, value: float, knobs: Mapping[str, Knob]) -> Knob:
+    """Return the knob of a name.
+
+    Raises
+    ------
+    InputError
+        The knob does not exist, or the value exceeds its limit.
+    """
+    knob = knobs.get(name)
+    if knob is None:
+        raise InputError(unknown("no such knob", name, knobs).at())
+    if not abs(value) <= knob.limit:
+        found, allowed = f"{value:g} {knob.unit}".strip(), f"up to {knob.limit:g} {knob.unit}".strip()
+        raise InputError(Issue(f"{name} is too large", found=found, allowed=allowed))
+    return knob
 
 
 def _without_knobs(what: Mapping[str, Any]) -> dict[str, Any]:

@@ -11,7 +11,6 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
 from functools import cached_property, lru_cache
-from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -22,20 +21,22 @@ from analysis.spots.spot_positions import SpotError
 from optics.geometry.tree import PlacedBodies, State
 from scenes.models.disturbances import Component, state_of
 from scenes.models.obstruction import Clearances
-from scenes.specs.course import DEFAULT_PIVOT, FEWEST, MOST, CourseSpec, moment
-from scenes.specs.job import JobSpec, checked_nodes
-from scenes.yaml.spec import validate
-from scenes.yaml.yaml_file import YamlFile, dump_yaml
-from twin.framework.provenance import Provenance, versions
+from scenes.specs.course import DEFAULT_PIVOT, CourseSpec, moment
+from scenes.specs.job import checked_nodes
+from scenes.yaml.errors import InputError
+from twin.camera.camera_optics import CameraOptics
+from twin.camera.camera_results import Field
 from twin.framework.random_streams import stream
-from twin.live.knobs import AXES, Knob, knobs_of, perturbation
+from twin.live.camera_design import BLURRED, DESIGN, CameraDesign, changed_camera, optics_data, with_own_focal_length
+from twin.live.knobs import Knob, checked_knob, knobs_of, perturbation
 from twin.live.messages import LARGEST_SEED, MOST_FRAMES, AskedState, BlindState
 from twin.main_job.monitor_reading import stated
 from twin.main_job.render_job import MIN_LIGHT, require_one_state
 from twin.main_job.render_results import JobRun, RenderRun
 from twin.main_job.systematics import contradiction, doubted
 from twin.monitor.crosstalk import crosstalk
-from twin.monitor.image_quality import quality_dicts
+from twin.monitor.image_quality import MOST_BLUR, quality_dicts
+from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.monitor.observation import StateReader
 from twin.pictures.scene_file import motions
 from twin.scripting.instrument_twin import InstrumentTwin
@@ -79,18 +80,29 @@ class LiveBench:
         named = job if job is not twin.resolved.job else None
         self.twin = twin if named is None else InstrumentTwin.of(twin.resolved.with_job(named), like=twin)
         self._reader = lru_cache(maxsize=4)(self._new_reader)
+        self._designed_twin = lru_cache(maxsize=2)(self._new_designed_twin)
+        self._clearances = lru_cache(maxsize=2)(Clearances.of)
         # the knobs do not move while a course is played
         self._perturbed_twin = lru_cache(maxsize=2)(self._new_perturbed_twin)
 
     @cached_property
     def knobs(self) -> dict[str, Knob]:
-        """All knobs (adjustable motions of bodies) by name."""
-        return knobs_of(self.twin.experiment.instrument.nodes, self.twin.resolved.job)
+        """All knobs by name: of the camera's design, if it has any, and adjustable motions of bodies."""
+        motions = knobs_of(self.twin.experiment.instrument.nodes, self.twin.resolved.job)
+        return motions if self.design is None else {**self.design.knobs, **motions}
 
     @cached_property
+    def design(self) -> CameraDesign | None:
+        """Knobs of the prescription, for an instrument that is one camera without a monitor; None for any other."""
+        if self.monitored or len(self.twin.cameras) > 1:
+            return None
+        (name, site), resolved = next(iter(self.twin.resolved.instrument.cameras.items())), self.twin.resolved
+        return CameraDesign.of(name, site.camera, resolved.cameras[site.camera], self.twin.experiment.backend)
+
+    @property
     def clearances(self) -> Clearances:
         """Object that computes the distances between bodies that may collide."""
-        return Clearances.of(self.twin.experiment.instrument)
+        return self._clearances(self.twin.experiment.instrument)
 
     @cached_property
     def _crosstalk(self) -> Any:
@@ -131,6 +143,7 @@ class LiveBench:
         if not self.monitored:
             self._designed  # noqa: B018
             self.clearances  # noqa: B018
+            advance("ranges of the knobs")
             self.state(self.initial_state)
             return
         experiment.nominal_focus  # noqa: B018
@@ -154,8 +167,12 @@ class LiveBench:
             }
             for path, info in experiment.instrument.nodes.items()
         }
+        if self.design is not None:
+            unmoved = {"pivots": [DEFAULT_PIVOT], "pivot": DEFAULT_PIVOT}
+            nodes = {**dict.fromkeys(self.design.nodes, unmoved), **nodes}
         common = {
             "instrument": twin.name,
+            "design": None if self.design is None else self.design.name,
             "cameras": list(twin.cameras),
             "nodes": nodes,
             "knobs": [asdict(knob) for knob in self.knobs.values()],
@@ -194,30 +211,53 @@ class LiveBench:
     @cached_property
     def _designed(self) -> dict[str, Any]:
         """Image quality of the nominal instrument."""
-        return self._quality({})
+        return self._quality(self.twin.experiment, {})
 
-    def _quality(self, state: State) -> dict[str, Any]:
+    def _quality(self, experiment: MonitorExperiment, state: State) -> dict[str, Any]:
         """Return the image quality of a perturbed state, as the content of quality.json."""
-        job, experiment = self.twin.resolved.job, self.twin.experiment
-        obstructed = job.render.obstructed
+        obstructed = self.twin.resolved.job.render.obstructed
         return quality_dicts(experiment.instrument, experiment.backend, [state], obstructed)[0]
 
     def perturbed(self, asked: AskedState) -> InstrumentTwin:
-        """Return the instrument perturbed by the knobs.
+        """Return the instrument with the design and the perturbations of the knobs.
 
         Raises
         ------
         InputError
-            A knob does not exist, or a job's file could not have its value.
+            A knob does not exist, a job's file could not have its value, or the designed camera forms no image.
         """
-        return self._perturbed_twin(tuple(asked.knobs.items()), tuple(asked.pivots.items()))
+        design = {} if self.design is None else self.design.knobs
+        drawn = tuple(
+            (name, checked_knob(name, v, design).kind, v) for name, v in asked.knobs.items() if name in design
+        )
+        motions = tuple(item for item in asked.knobs.items() if item[0] not in design)
+        changed = tuple((name, value) for name, kind, value in drawn if kind == DESIGN and value)
+        return self._perturbed_twin(changed, motions, tuple(asked.pivots.items()))
 
     def _new_perturbed_twin(
-        self, knobs: Sequence[tuple[str, float]], pivots: Sequence[tuple[str, str]]
+        self,
+        design: tuple[tuple[str, float], ...],
+        motions: Sequence[tuple[str, float]],
+        pivots: Sequence[tuple[str, str]],
     ) -> InstrumentTwin:
-        return self.twin.with_perturbations(
-            perturbation(dict(knobs), dict(pivots), self.knobs, self._job_perturbations)
+        return self._designed_twin(design).with_perturbations(
+            perturbation(dict(motions), dict(pivots), self.knobs, self._job_perturbations)
         )
+
+    def _new_designed_twin(self, design: Sequence[tuple[str, float]]) -> InstrumentTwin:
+        if self.design is None or not design:
+            return self.twin
+        reference, camera = self.design.reference, changed_camera(self.design.spec, dict(design))
+        try:
+            return self.twin.with_cameras({reference: camera})
+        except InputError as error:
+            if "stated focal length" not in str(error):
+                raise
+        return self.twin.with_cameras({reference: with_own_focal_length(camera, self.twin.experiment.backend)})
+
+    def field(self, asked: AskedState) -> Field | None:
+        """Return the field point that the knobs set, as fractions of the half angles; None without such knobs."""
+        return None if self.design is None else self.design.field(asked.knobs)
 
     @cached_property
     def _job_perturbations(self) -> Mapping[str, Any]:
@@ -254,12 +294,19 @@ class LiveBench:
     def _traced(self, asked: AskedState) -> dict[str, Any]:
         """Return the page's data for a state of an instrument without a monitor.
 
-        They are true changes, image quality and motions.
+        They are true changes, image quality if requested, motions, and the optics at the field point.
         """
-        experiment, state = self.twin.experiment, self.states(asked)
+        experiment, state = self.perturbed(asked).experiment, self.states(asked)
         placed = experiment.instrument.assembly.place([state])
-        quality = self._quality(state)
-        cameras = quality["cameras"].items()
+        optics: dict[str, Any] = {}
+        if self.design is not None:
+            # as `twin.camera` analyses the camera's file, without the bodies around it
+            view = CameraOptics.within(experiment.instrument, self.design.name, experiment.backend, state, False)
+            data, pictures = optics_data(view, self.design.field(asked.knobs))
+            optics = {"optics": data, "pictures": pictures}
+        blurred = bool(optics) and optics["optics"]["wavefront"]["rms_waves"] > MOST_BLUR
+        quality = self._quality(experiment, state) if asked.quality and not blurred else {}
+        cameras = quality.get("cameras", {}).items()
         run = JobRun(
             resolved=self.twin.resolved,
             experiment=experiment,
@@ -267,12 +314,16 @@ class LiveBench:
             frames=asked.frames,
             seed=self.seed_of(asked.seed),
             truth=experiment.sight.truth([state], placed),
-            warnings=tuple(f"image quality of {name}: {own['reason']}" for name, own in cameras if "reason" in own),
+            warnings=(
+                *(f"image quality of {name}: {own['reason']}" for name, own in cameras if "reason" in own),
+                *([BLURRED] if blurred else []),
+            ),
         )
-        overlaps = self.clearances.overlaps(placed)
+        overlaps = self._clearances(experiment.instrument).overlaps(placed)
         return {
+            **optics,
             "truth": run.truth_dict(),
-            "quality": quality,
+            **({"quality": quality} if quality else {}),
             "motions": motions(experiment.instrument, state, placed),
             "warnings": list(run.warnings),
             "collisions": [f"{o.first} overlaps {o.second} by {1e3 * o.depth:.3g} mm" for o in overlaps],
@@ -462,158 +513,3 @@ def _course_data(course: CourseSpec) -> dict[str, Any]:
 def _label(parameter: Parameter) -> Mapping[str, str]:
     """Return key, symbol, unit and meaning of a camera parameter, for the page."""
     return {"key": parameter.key, "symbol": parameter.symbol, "unit": parameter.unit, "meaning": parameter.meaning}
-
-
-HEAD = "# Recorded with python -m twin.live; repeat it: python -m twin.render THIS_FILE\n"
-"""Comment in the first line of a saved file."""
-
-
-def _head() -> str:
-    """Return the comment that states where a file was recorded."""
-    made, by = Provenance.here(), versions()
-    kernels = ", ".join(dict.fromkeys(f"{one.name} {one.version} for {one.kernels}" for one in made.blas))
-    return (
-        f"{HEAD}# made by space-camera-twin {by['space-camera-twin']}, source {made.source}, Python {by['python']}, "
-        f"numpy {by['numpy']}, Dr.Jit {by['drjit']}, on {made.processor}; {kernels}\n"
-    )
-
-
-GUESSED = (
-    "# Saved while motions were hidden: this job holds the guess of the knobs alone, so that twin.render gives the\n"
-    "# spots of the guess and not those that were shown.\n"
-)
-"""Comment at the top of a job file that was saved while motions were hidden, which it does not contain."""
-
-
-def job_text(bench: LiveBench, asked: AskedState) -> str:
-    """Return a self-contained job file of one state; for a job with a time series, that at the selected time.
-
-    Parameters
-    ----------
-    bench : LiveBench
-        Instrument that is evaluated.
-    asked : AskedState
-        State of the knobs to be saved.
-
-    Raises
-    ------
-    InputError
-        A job's file could not have a value.
-    """
-    resolved = bench.perturbed(asked).resolved.with_render(asked.frames, bench.seed_of(asked.seed))
-    plain = resolved.plain()
-    if asked.time is not None and resolved.job.course is not None:
-        plain["job"]["course"]["detail"] = moment(resolved.job.course.times[asked.time])
-    hidden = GUESSED if isinstance(asked, BlindState) else ""
-    return _head() + hidden + dump_yaml(plain)
-
-
-def course_text(bench: LiveBench, kept: Sequence[tuple[float, AskedState]]) -> str:
-    """Return a job file with the recorded states as a time series (``course``), timed to the millisecond.
-
-    Parameters
-    ----------
-    bench : LiveBench
-        Instrument that is evaluated.
-    kept : Sequence[tuple[float, AskedState]]
-        (seconds since the recording began, state) in the order in which they were shown.
-
-    Raises
-    ------
-    ValueError
-        There are too few states, or something changed that a job's time series cannot change.
-    """
-    steps = _limited_times(kept)
-    if len(steps) < FEWEST:
-        raise ValueError(f"a course has at least {FEWEST} different times; move a knob while recording")
-    first = steps[0][1]
-    if any(step.time is not None for _, step in steps):
-        raise ValueError("a course of the job was shown; it is in the job's own file")
-    if any(step.pivots != first.pivots for _, step in steps):
-        raise ValueError(
-            "a course rotates each body about one pivot at all times; record again without changing pivots"
-        )
-    knobs = bench.knobs
-    fixed, moving = _split([dict(step.knobs) for _, step in steps], knobs)
-    resolved = bench.twin.resolved.with_render(first.frames, bench.seed_of(first.seed))
-    plain = resolved.plain()
-    job = plain["job"]
-    job["perturb"] = perturbation(fixed, first.pivots, knobs, job.get("perturb", {}))
-    job["course"] = {"times": [f"{time!r} s" for time, _ in steps], **_courses(moving, first.pivots, knobs, len(steps))}
-    validate(JobSpec, YamlFile("", job, {}))
-    return _head() + dump_yaml(plain)
-
-
-def _limited_times(kept: Sequence[tuple[float, AskedState]]) -> list[tuple[float, AskedState]]:
-    """Return states at ascending times in milliseconds, at most as many as a job's time series may have.
-
-    The first and the last state are among them.
-    """
-    out: list[tuple[float, AskedState]] = []
-    for seconds, state in kept:
-        rounded = round(seconds, 3)
-        if out and rounded <= out[-1][0]:
-            out[-1] = (out[-1][0], state)
-        else:
-            out.append((rounded, state))
-    if len(out) <= MOST:
-        return out
-    chosen = sorted({round(k * (len(out) - 1) / (MOST - 1)) for k in range(MOST)})
-    return [out[k] for k in chosen]
-
-
-def _split(
-    states: Sequence[Mapping[str, float]], knobs: Mapping[str, Knob]
-) -> tuple[dict[str, float], dict[str, list[float]]]:
-    """Separate knobs that change over the recorded states from constant ones.
-
-    Returns
-    -------
-    tuple of dict
-        Constant knob -> its value, and changing knob -> its values at each time.
-
-    Raises
-    ------
-    ValueError
-        The figure of a surface changes, which a job's time series cannot contain.
-    """
-    names = dict.fromkeys(name for state in states for name in state)
-    moving = {}
-    fixed = {}
-    for name in names:
-        values = [state.get(name, 0.0) for state in states]
-        if all(a == b for a, b in pairwise(values)):
-            fixed[name] = values[0]
-        elif knobs[name].kind == "figure":
-            raise ValueError(f"{name}: a course holds motions and temperatures, not figures; save the job instead")
-        else:
-            moving[name] = values
-    if not moving:
-        raise ValueError("nothing moved while recording; save the job instead")
-    # a body's constant motion belongs to its course, too
-    bodies = {(knobs[name].node, knobs[name].kind) for name in moving}
-    for name in list(fixed):
-        if (knobs[name].node, knobs[name].kind) in bodies:
-            moving[name] = [fixed.pop(name)] * len(states)
-    return fixed, moving
-
-
-def _courses(
-    moving: Mapping[str, Sequence[float]], pivots: Mapping[str, str], knobs: Mapping[str, Knob], count: int
-) -> dict[str, Any]:
-    """Return the entries ``temperature`` and ``motion`` of a job's time series (``course``) for changing knobs."""
-    out: dict[str, dict[str, dict[str, Any]]] = {}
-    for name in moving:
-        knob = knobs[name]
-        heat = knob.kind in ("temperature", "gradient")
-        key = {"temperature": "change"}.get(knob.kind, knob.kind)
-        body = out.setdefault("temperature" if heat else "motion", {}).setdefault(knob.node, {})
-        if key in body:
-            continue
-        axes = AXES if knob.kind in ("rotate", "shift", "gradient") else ("",)
-        columns = [moving.get(f"{knob.node} {knob.kind} {axis}".strip(), [0.0] * count) for axis in axes]
-        rows = [[f"{value!r} {knob.unit}" for value in row] for row in zip(*columns, strict=True)]
-        body[key] = rows if len(axes) > 1 else [row[0] for row in rows]
-        if not heat and pivots.get(knob.node, DEFAULT_PIVOT) != DEFAULT_PIVOT:
-            body["pivot"] = pivots[knob.node]
-    return out

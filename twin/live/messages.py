@@ -55,6 +55,9 @@ class AskedState(_PageMessage):
         Seed of the noise.
     time : int | None
         Index of a time in the job's time series (``course``); None for the job's single state.
+    quality : bool
+        Whether image quality is computed for an instrument without a monitor; the page of a single camera asks for it
+        when the knobs rest.
     """
 
     type: Literal["state"] = "state"
@@ -66,6 +69,7 @@ class AskedState(_PageMessage):
     frames: Annotated[int, Field(ge=1, le=MOST_FRAMES)] = 1
     seed: Annotated[int, Field(ge=0, le=LARGEST_SEED)] = 1
     time: Annotated[int, Field(ge=0, le=1000)] | None = None
+    quality: bool = True
 
 
 class BlindState(AskedState):
@@ -94,7 +98,7 @@ class AskedView(_PageMessage):
     camera : str
         Name of the camera.
     field : float
-        Field along the line, as a fraction of the half field.
+        Field along the line, as a fraction of the half field; where the field point has knobs, these set it.
     """
 
     type: Literal["view"] = "view"
@@ -147,18 +151,18 @@ class Record(_PageMessage):
 
 
 class Save(_PageMessage):
-    """Request for a job file of a state, or for a job with the recorded states as a time series (``course``).
+    """Request for a file: of a state, of the recorded states as a time series (``course``), or of a changed camera.
 
     Attributes
     ----------
     what : str
-        ``job`` or ``course``.
+        ``job``, ``course`` or ``camera``.
     state : AskedState
         State of the knobs.
     """
 
     type: Literal["save"] = "save"
-    what: Literal["job", "course"]
+    what: Literal["job", "course", "camera"]
     state: AskedState
 
 

@@ -25,7 +25,9 @@ from optics.numerics.number_tree import FrozenMap
 from scenes.models.camera_design import with_plane
 from scenes.models.camera_model import focal_plane_body
 from scenes.models.camera_sharpness import blur_warnings
+from scenes.models.instrument_builder import build_instrument
 from scenes.models.job_state import motions_of
+from scenes.specs.camera import CameraSpec
 from scenes.specs.course import noll
 from scenes.specs.job import JobSpec, PerturbationSpec, checked_nodes, with_tables
 from scenes.specs.load import INSTRUMENTS, find_disturbances, is_path, library_names
@@ -181,6 +183,13 @@ class _Bench:
     def stating(self, resolved: ResolvedJob) -> _Bench:
         """Return the model of the same instrument with the disturbance prior of the job ``resolved``."""
         return _Bench(resolved, self.name, self)
+
+    def building(self, resolved: ResolvedJob) -> _Bench:
+        """Return the model of an instrument with other cameras, which is not calibrated and not cached on disk."""
+        bench = _Bench(resolved, self.name, self)
+        built = build_instrument(resolved.instrument, resolved.cameras, self.backend)
+        bench.experiment = self.experiment.with_instrument(built).stating(resolved)
+        return bench
 
 
 @dataclass(frozen=True, eq=False)
@@ -342,6 +351,22 @@ class InstrumentTwin:
         twin = self._with_job({**self._plain, "perturb": {**self._plain.get("perturb", {}), **self._by_path(perturb)}})
         job = checked_nodes(twin.resolved.job, self._nodes)
         return InstrumentTwin(twin.resolved.with_job(job), twin._bench)
+
+    def with_cameras(self, cameras: Mapping[str, CameraSpec]) -> InstrumentTwin:
+        """Return this instrument with other prescriptions of its cameras; perturbations stay.
+
+        Parameters
+        ----------
+        cameras : Mapping[str, CameraSpec]
+            Reference in the instrument's file -> prescription; other cameras keep theirs.
+
+        Raises
+        ------
+        InputError
+            The light of a camera does not reach its image, or bodies overlap.
+        """
+        resolved = self.resolved.model_copy(update={"cameras": FrozenMap({**self.resolved.cameras, **cameras})})
+        return InstrumentTwin(resolved, self._bench.building(resolved))
 
     def with_disturbances(self, disturbances: str | Mapping[str, Any]) -> InstrumentTwin:
         """Return this instrument with another disturbance prior, on which `posterior` and all total sigmas are based.

@@ -8,7 +8,7 @@ const element = (tag, properties = {}, ...children) => {
   return out;
 };
 const field = (properties = {}) => element('input', { type: 'text', className: 'number', inputMode: 'decimal', autocomplete: 'off', ...properties });
-const NAMES = { rotate: 'rotate', shift: 'shift', figure: 'figure', scale: 'scale', temperature: 'temperature', gradient: 'gradient' };
+const NAMES = { rotate: 'rotate', shift: 'shift', figure: 'figure', scale: 'scale', temperature: 'temperature', gradient: 'gradient', design: '', field: '' };
 // the number as the slider steps it, without the tail of a binary fraction
 const tidy = (value, step) => Number(value.toFixed(Math.max(0, Math.min(12, 2 - Math.floor(Math.log10(step))))));
 
@@ -29,7 +29,7 @@ class Row {
     [this.low, this.high, this.steps] = [field(), field(), field()];
     this.ends = element('div', { className: 'ends', hidden: true },
       element('label', {}, 'from ', this.low), element('label', {}, 'to ', this.high), element('label', {}, 'step ', this.steps));
-    const name = element('span', { className: 'label', title: `${label} [${unit}]` }, label.split(' ').slice(long ? 0 : 1).join(' ') || label, ' ', element('small', {}, unit));
+    const name = element('span', { className: 'label', title: `${label} [${unit}]` }, label.split(' ').slice(long ? 0 : 1).join(' ') || label, ' ', element('small', {}, unit.replace('percent', '%')));
     this.box = element('div', { className: long ? 'knob long' : 'knob' }, name, this.slider, this.number, reset, more, this.ends);
     this.first = value;
     this.range(low_, extent, this.step);
@@ -178,7 +178,7 @@ export class Knobs {
         kind = knob.kind;
         const head = element('h3', {}, NAMES[kind]);
         if (kind === 'rotate' && this.nodes[node].pivots.length > 1) head.append(' about ', this.pivot(node));
-        list.append(head);
+        if (NAMES[kind]) list.append(head);
       }
       list.append(this.row(knob).box);
     }

@@ -2,6 +2,7 @@
 import { Knobs } from './knobs.js';
 import { check, readNumber, stepped } from './numbers.js';
 import { Spots } from './spots.js';
+import { Optics } from './optics.js';
 import { Readings } from './readings.js';
 import { Scene } from './scene.js';
 
@@ -32,6 +33,7 @@ class Live {
     this.knobs = new Knobs(byId('knobs'), () => this.changed(), () => this.settled(), (values) => this.build(values));
     this.spots = new Spots();
     this.readings = new Readings();
+    this.optics = new Optics();
     this.scene = new Scene(byId('scene'));
     this.listen();
     this.connect();
@@ -52,6 +54,7 @@ class Live {
       this.say({ type: 'record', on: byId('record').getAttribute('aria-pressed') !== 'true' });
     });
     byId('save-job').addEventListener('click', () => this.say({ type: 'save', what: 'job', state: this.state() }));
+    byId('save-camera').addEventListener('click', () => this.say({ type: 'save', what: 'camera', state: this.state() }));
     byId('save-course').addEventListener('click', () => this.say({ type: 'save', what: 'course', state: this.state() }));
     for (const id of ['view-camera', 'view-what', 'view-field']) {
       byId(id).addEventListener('input', () => { this.askedView = ''; this.askView(); });
@@ -67,6 +70,8 @@ class Live {
   }
 
   changed() {
+    clearTimeout(this.rest);
+    this.resting = false;
     if (!this.touched) this.touched = performance.now();
     this.dirty = true;
     this.ask();
@@ -107,6 +112,7 @@ class Live {
     return {
       type: 'state', n: this.n, t: this.touched, knobs, pivots, noise: byId('noise').checked,
       frames: whole('frames', 1, 64, this.hello.frames), seed: whole('seed', 0, 9007199254740991, this.hello.seed), time,
+      quality: this.resting || !this.hello.design,
     };
   }
 
@@ -239,6 +245,9 @@ class Live {
     this.knobs.build(hello, values);
     this.spots.build(hello);
     this.readings.build(hello);
+    this.optics.build(hello);
+    byId('save-camera').hidden = !hello.design;
+    byId('view-field').parentElement.hidden = Boolean(hello.design);
     if (!same || hello.factors.length) this.scene.load();
     const select = byId('view-camera');
     select.replaceChildren(...hello.cameras.map((name) => new Option(name, name)));
@@ -270,11 +279,13 @@ class Live {
     this.spots.take(told, images);
     if (!told.problem) {
       this.readings.take(told);
+      this.optics.take(told, images);
       this.scene.place(told.motions ?? {});
     }
     requestAnimationFrame(() => {
       this.spots.draw();
       this.readings.draw();
+      this.optics.draw();
       // the next task comes after this frame's painting
       setTimeout(() => this.painted(told), 0);
     });
@@ -292,6 +303,10 @@ class Live {
     const delay = recent.length ? `${Math.round(recent[recent.length >> 1])} ms` : '';
     this.status(`${delay} · computed in ${Math.round(told.ms)} ms${rate > 1 ? ` · ${rate.toFixed(0)} a second` : ''}`);
     document.body.dataset.shown = told.n;
+    if (this.hello.design && !this.resting && !told.problem) {
+      clearTimeout(this.rest);
+      this.rest = setTimeout(() => { this.resting = true; this.dirty = true; this.ask(); }, AFTER_QUIET);
+    }
     this.askView();
   }
 

@@ -66,11 +66,13 @@ export class Readings {
     const select = byId('strip-what');
     const chosen = select.value;
     select.replaceChildren(...this.rows.map((row, k) => new Option(row.name, String(k))));
-    const angle = this.rows.findIndex((row) => row.key === 'change_arcsec');
+    const angle = this.rows.findIndex((row) => ['change_arcsec', 'wfe_rms_waves'].includes(row.key));
     select.value = chosen || String(angle >= 0 ? angle : 0);
   }
 
   take(told) {
+    // image quality follows when the knobs rest
+    if (this.told?.quality && !told.quality && !told.warnings?.length) told.quality = this.told.quality;
     this.told = told;
     const judged = this.hello.judged;
     const values = this.rows.map((row) => {
