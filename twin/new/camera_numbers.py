@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from math import atan, degrees, isfinite, sqrt, tan
+from os.path import commonprefix
 
 from optics.numerics.number_tree import FrozenMap
 from scenes.specs.camera import CameraSpec, MirrorSpec
@@ -13,8 +14,11 @@ from scenes.yaml.errors import InputError, Issue
 from scenes.yaml.units import LENGTH, format_quantity, parse_quantity
 from scenes.yaml.yaml_file import dump_yaml
 
+_NONE: Mapping[str, float] = FrozenMap()
 DIFFRACTION_LIMIT = 0.0714
 """Wavefront error of a Strehl ratio of 0.8, waves rms (Marechal)."""
+INDEX = 2e-4
+"""Tolerance of the refractive index of a melt."""
 RADIUS = 1e-4
 """Relative tolerance of a radius, as good test plates and bars measure it."""
 _CCD_BEYOND_LINE = 1e-3
@@ -99,7 +103,8 @@ class CameraNumbers:
         out: list[OpticalElement] = []
         for face, one in zip(self.faces, self._powered.values(), strict=True):
             if one.light == "refracts" and not one.enters_glass:
-                out[-1] = replace(out[-1], others=(face.name,))
+                label = commonprefix([out[-1].label, face.label]).rstrip("_-")
+                out[-1] = replace(out[-1], others=(face.name,), label=label or out[-1].label)
             else:
                 out.append(replace(face, lens=one.enters_glass))
         return tuple(out)
@@ -123,6 +128,14 @@ class CameraNumbers:
     def face_names(self) -> tuple[str, ...]:
         """Bodies of all faces."""
         return tuple(face.name for face in self.faces)
+
+    @staticmethod
+    def shift_key(element: OpticalElement, axis: int) -> str:
+        """Return the key of a study's factor that shifts an element; the faces of a lens get the same shift."""
+        if not element.others:
+            return f"motion: {element.name} shift {'xyz'[axis]}"
+        keys = (f"[job, perturb, {name}, shift, {axis}]" for name in (element.name, *element.others))
+        return f"keys: [{', '.join(keys)}]"
 
     def bodies(self, names: Iterable[str]) -> str:
         """Return the whole paths of bodies as a list in a file."""
@@ -152,6 +165,11 @@ class CameraNumbers:
         return f"{1e6 * RADIUS:g} ppm"
 
     @property
+    def index_limit(self) -> str:
+        """Tolerance `INDEX` of a refractive index."""
+        return f"{INDEX:.1e}"
+
+    @property
     def _depth(self) -> float:
         """Depth of focus 2 lambda F^2, metres."""
         return 2.0 * self.camera.wavelength * (self.camera.focal_length / self.camera.entrance_pupil) ** 2
@@ -161,14 +179,18 @@ class CameraNumbers:
         """A quarter of the depth of focus."""
         return _rounded(0.25 * self._depth)
 
-    def _image(self, shifts: dict[str, float], radii: dict[str, float]) -> float:
-        """Return the paraxial focus on the axis, metres, with faces shifted (metres) and radii changed (relative)."""
+    def _image(
+        self, shifts: Mapping[str, float], radii: Mapping[str, float] = _NONE, indices: Mapping[str, float] = _NONE
+    ) -> float:
+        """Return the paraxial focus on the axis, metres, with faces shifted (metres) and radii (relative) and indices
+        of glasses changed.
+        """
         height, slope, before, place, way = 1.0, 0.0, 1.0, 0.0, 1.0
         for name, one in self._powered.items():
             vertex = one.z + shifts.get(name, 0.0)
             height, place = height + slope * (vertex - place), vertex
             way = way if one.light == "refracts" else -way
-            after = way * (self.camera.index_behind(name) if one.light == "refracts" else abs(before))
+            after = way * (self.camera.index_behind(name) + indices.get(name, 0.0) if one.light == "refracts" else abs(before))
             power = (after - before) / (one.radius * (1.0 + radii.get(name, 0.0)))
             slope, before = (before * slope - height * power) / after, after
         return place - height / slope
@@ -176,13 +198,16 @@ class CameraNumbers:
     def _defocus(self, element: OpticalElement, shift: float) -> float:
         """Return by how much the focus moves, metres, where an element moves along the axis."""
         names = {name.removeprefix(self.prefix): shift for name in (element.name, *element.others)}
-        return abs(self._image(names, {}) - self._image({}, {}))
+        return abs(self._image(names) - self._image({}))
 
     def _all_defocus(self, decentre: str) -> float:
-        """Return the sum of the focus shifts of all despaces and radii at their limits, metres."""
-        shift = parse_quantity(decentre, LENGTH)
-        radii = (abs(self._image({}, {name: RADIUS}) - self._image({}, {})) for name in self._powered)
-        return sum(self._defocus(one, shift) for one in self.moved) + sum(radii)
+        """Return the sum of the focus shifts of all despaces, radii and indices at their limits, metres."""
+        shift, focus = parse_quantity(decentre, LENGTH), self._image({})
+        radii = (self._image({}, {name: RADIUS}) for name in self._powered)
+        glasses = (name for name, one in self._powered.items() if one.enters_glass)
+        indices = (self._image({}, {}, {name: INDEX}) for name in glasses)
+        changed = sum(abs(image - focus) for image in (*radii, *indices))
+        return changed + sum(self._defocus(one, shift) for one in self.moved)
 
     def seat(self, decentre: str) -> str:
         """Return the focus shift of all limits together, by which a focal plane may be off before it is adjusted."""

@@ -43,7 +43,7 @@ def numbers_of(reference: str, folder: Path) -> CameraNumbers:
         "" if alone else f"{mounted}/",
         instrument.monitor is not None,
         sharpness(camera, backend).worst,
-        bool(derive_camera(camera, backend).first_order.scale[0, 0, 0] > 0.0),
+        bool(derive_camera(camera, backend).first_order.scale[0, 0, 0] < 0.0),
     )
 
 
