@@ -20,6 +20,7 @@ from optics.camera.seidel import seidel
 from optics.camera.telescope_types import TELESCOPES
 from optics.camera.triplet import GLASSES, triplet
 
+
 def _two_mirrors(aperture: float, f_number: float, primary: float, behind: float) -> list[tuple[float, float]]:
     """Return radii and distances of a primary and a convex secondary whose focus lies ``behind`` the primary."""
     first = primary * aperture

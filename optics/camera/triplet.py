@@ -1,8 +1,8 @@
 """First design of a Cooke triplet: curvatures and air spaces by least squares of real rays, for one focal length.
 
 The start is a triplet of F/5 in the glasses N-SK16 and F2 that design programs ship as an example. Its third-order and
-chromatic sums are small; curvatures, air spaces and focus then minimise the ray errors of the wanted aperture, field and
-wavelength, so that higher orders balance. Lengths are in focal lengths; the focal length is exact at every step.
+chromatic sums are small. Curvatures, air spaces and focus then minimise the ray errors of the wanted aperture, field
+and wavelength, so that higher orders balance. Lengths are in focal lengths; the focal length is exact at every step.
 """
 
 from __future__ import annotations
@@ -87,7 +87,9 @@ _STEPS = 150
 
 def _indices(wavelength: float) -> np.ndarray:
     """Return the index before the first face and behind each face, (7,)."""
-    behind = (1.0 if not isinstance(name, str) else float(refractive_index(name, wavelength, "vacuum")) for name in GLASSES)
+    behind = (
+        1.0 if not isinstance(name, str) else float(refractive_index(name, wavelength, "vacuum")) for name in GLASSES
+    )
     return np.array([1.0, *behind])
 
 

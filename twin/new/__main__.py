@@ -7,8 +7,6 @@ if __name__ == "__main__":
 
     end_quietly()
 
-import os
-import re
 import sys
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -27,7 +25,7 @@ if TYPE_CHECKING:
     from twin.new.camera_numbers import CameraNumbers
 
 app = cli.program(no_args_is_help=True)
-app.command("camera")(new_camera)
+app.command("camera", help=(new_camera.__doc__ or "").replace("scenes.lens new", "twin.new camera"))(new_camera)
 
 
 @dataclass(frozen=True)
@@ -82,7 +80,9 @@ QUESTIONS = {
     "boresight": Question("Largest change of the line of sight", "2 arcsec"),
 }
 NEW = {
-    "job": NewFile("a job: one perturbation of the camera, or of an instrument with its monitor", "render", ("decentre", "tilt")),
+    "job": NewFile(
+        "a job: one perturbation of the camera, or of an instrument with its monitor", "render", ("decentre", "tilt")
+    ),
     "tolerance": NewFile(
         "a tolerance budget with a compensator",
         "tolerance",
@@ -100,16 +100,21 @@ NEW = {
     ),
     "instrument": NewFile("an instrument: the camera with a monitor to begin with", "uncertainty", ()),
     "operation": NewFile(
-        "a plan of operation; a camera alone gets the monitor of `twin.new instrument`", "operate simulate", ("boresight",)
+        "a plan of operation; a camera alone gets the monitor of `twin.new instrument`",
+        "operate simulate",
+        ("boresight",),
     ),
 }
 """Kinds of files by name, beside `camera`."""
 Camera = Annotated[
     str | None,
-    typer.Option(help="The camera or instrument: a name in the library (gf7), or the path of a file.", show_default=False),
+    typer.Option(
+        help="The camera or instrument: a name in the library (gf7), or the path of a file.", show_default=False
+    ),
 ]
 Out = Annotated[
-    Path | None, typer.Option(readable=False, help="The file to write, .yaml. Default: standard output.", show_default=False)
+    Path | None,
+    typer.Option(readable=False, help="The file to write, .yaml. Default: standard output.", show_default=False),
 ]
 Force = Annotated[bool, typer.Option("--force", help="Replace the file if it exists.")]
 

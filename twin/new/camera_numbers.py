@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import takewhile
 from math import atan, degrees, isfinite, sqrt, tan
-from os.path import commonprefix
 
 from optics.numerics.number_tree import FrozenMap
 from scenes.specs.camera import CameraSpec, MirrorSpec
@@ -46,6 +46,11 @@ class OpticalElement:
     others: tuple[str, ...] = ()
     lens: bool = False
     curved: bool = True
+
+    @property
+    def bodies(self) -> tuple[str, ...]:
+        """All bodies of the element."""
+        return (self.name, *self.others)
 
     @property
     def carry(self) -> str:
@@ -103,7 +108,8 @@ class CameraNumbers:
         out: list[OpticalElement] = []
         for face, one in zip(self.faces, self._powered.values(), strict=True):
             if one.light == "refracts" and not one.enters_glass:
-                label = commonprefix([out[-1].label, face.label]).rstrip("_-")
+                alike = takewhile(lambda pair: pair[0] == pair[1], zip(out[-1].label, face.label, strict=False))
+                label = "".join(letter for letter, _ in alike).rstrip("_-")
                 out[-1] = replace(out[-1], others=(face.name,), label=label or out[-1].label)
             else:
                 out.append(replace(face, lens=one.enters_glass))
@@ -122,7 +128,7 @@ class CameraNumbers:
     @property
     def moved_faces(self) -> tuple[str, ...]:
         """Bodies of `moved`."""
-        return tuple(name for one in self.moved for name in (one.name, *one.others))
+        return tuple(name for one in self.moved for name in one.bodies)
 
     @property
     def face_names(self) -> tuple[str, ...]:
@@ -134,7 +140,7 @@ class CameraNumbers:
         """Return the key of a study's factor that shifts an element; the faces of a lens get the same shift."""
         if not element.others:
             return f"motion: {element.name} shift {'xyz'[axis]}"
-        keys = (f"[job, perturb, {name}, shift, {axis}]" for name in (element.name, *element.others))
+        keys = (f"[job, perturb, {name}, shift, {axis}]" for name in element.bodies)
         return f"keys: [{', '.join(keys)}]"
 
     def bodies(self, names: Iterable[str]) -> str:
@@ -148,8 +154,9 @@ class CameraNumbers:
 
     @property
     def requirement(self) -> str:
-        """Wavefront error to require: the diffraction limit, added to that of the design in squares if it leaves less
-        than half of its square for errors of making.
+        """Wavefront error to require: the diffraction limit, or its root sum square with a design that leaves no margin.
+
+        A design leaves no margin if its mean square error exceeds half of the limit's.
         """
         margin = 2.0 * self.worst**2 <= DIFFRACTION_LIMIT**2
         return f"{DIFFRACTION_LIMIT if margin else sqrt(DIFFRACTION_LIMIT**2 + self.worst**2):.3g}"
@@ -182,22 +189,25 @@ class CameraNumbers:
     def _image(
         self, shifts: Mapping[str, float], radii: Mapping[str, float] = _NONE, indices: Mapping[str, float] = _NONE
     ) -> float:
-        """Return the paraxial focus on the axis, metres, with faces shifted (metres) and radii (relative) and indices
-        of glasses changed.
+        """Return the paraxial focus on the axis, metres, with changes of faces by name.
+
+        Faces are shifted (metres), radii change by a share, refractive indices of glasses by a number.
         """
         height, slope, before, place, way = 1.0, 0.0, 1.0, 0.0, 1.0
         for name, one in self._powered.items():
             vertex = one.z + shifts.get(name, 0.0)
             height, place = height + slope * (vertex - place), vertex
             way = way if one.light == "refracts" else -way
-            after = way * (self.camera.index_behind(name) + indices.get(name, 0.0) if one.light == "refracts" else abs(before))
+            after = way * (
+                self.camera.index_behind(name) + indices.get(name, 0.0) if one.light == "refracts" else abs(before)
+            )
             power = (after - before) / (one.radius * (1.0 + radii.get(name, 0.0)))
             slope, before = (before * slope - height * power) / after, after
         return place - height / slope
 
     def _defocus(self, element: OpticalElement, shift: float) -> float:
         """Return by how much the focus moves, metres, where an element moves along the axis."""
-        names = {name.removeprefix(self.prefix): shift for name in (element.name, *element.others)}
+        names = {name.removeprefix(self.prefix): shift for name in element.bodies}
         return abs(self._image(names) - self._image({}))
 
     def _all_defocus(self, decentre: str) -> float:
@@ -271,7 +281,9 @@ class CameraNumbers:
     @property
     def monitor_field(self) -> str:
         """Field angle of a monitor's area CCDs, degrees: beside the end of the line."""
-        half = max(0.5 * self.camera.line.pixels * self.camera.line.pitch, self.camera.focal_length * tan(self.camera.field.x))
+        half = max(
+            0.5 * self.camera.line.pixels * self.camera.line.pitch, self.camera.focal_length * tan(self.camera.field.x)
+        )
         return f"{degrees(atan((half + _CCD_BEYOND_LINE) / self.camera.focal_length)):.5g}"
 
     @property

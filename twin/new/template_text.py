@@ -1,4 +1,4 @@
-"""Text of a new file: its template filled with the numbers of a camera, and checked as the command that reads it does."""
+"""Text of a new file: its template, filled with the numbers of a camera and checked by the model of its kind."""
 
 from __future__ import annotations
 
