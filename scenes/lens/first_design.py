@@ -87,7 +87,7 @@ def _source(kind: str) -> str:
             "ratios of a known layout; conics and focus minimise the traced wavefront error about the field's middle."
         )
     if kind == "triplet":
-        return "curvatures, air spaces and focus minimise ray errors over the field, at 0.89 and 1.12 of the wavelength too."
+        return "curvatures, air spaces and focus minimise ray errors over the field, also at 0.89 and 1.12 wavelengths."
     if kind == "korsch":
         return "ratios of a known layout with a flat field; conics cancel spherical aberration, coma and astigmatism."
     return "first-order layout; conics cancel third-order aberrations (Seidel sums, see the report)."

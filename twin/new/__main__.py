@@ -137,15 +137,19 @@ def main() -> None:
     """
 
 
+def _is_terminal() -> bool:
+    """Return whether somebody can answer questions."""
+    return sys.stdin.isatty() and sys.stderr.isatty()
+
+
 def _answers(questions: tuple[str, ...], given: Mapping[str, str | None], numbers: CameraNumbers) -> dict[str, str]:
     """Return the answer to every question: the option, what the user types in a terminal, or the default."""
-    asks = sys.stdin.isatty() and sys.stderr.isatty()
     out = {}
     for name in questions:
         question, value = QUESTIONS[name], given[name]
         if value is None:
             default = str(getattr(numbers, question.default, question.default))
-            value = typer.prompt(question.text, default=default, err=True) if asks else default
+            value = typer.prompt(question.text, default=default, err=True) if _is_terminal() else default
         out[name] = value
     return out
 
@@ -156,7 +160,7 @@ def _write_new(kind: str, camera: str | None, out: Path | None, force: bool, giv
     with cli.explained(errors):
         from scenes.yaml.errors import InputError, Issue
 
-        if camera is None and not (sys.stdin.isatty() and sys.stderr.isatty()):
+        if camera is None and not _is_terminal():
             raise InputError(Issue("which camera is it for?", allowed="--camera NAME or FILE"))
         if camera is None:
             camera = typer.prompt("Camera or instrument: name in the library, or file", err=True)

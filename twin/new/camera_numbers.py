@@ -154,9 +154,9 @@ class CameraNumbers:
 
     @property
     def requirement(self) -> str:
-        """Wavefront error to require: the diffraction limit, or its root sum square with a design that leaves no margin.
+        """Wavefront error to require: the diffraction limit, or its root sum square with a design without margin.
 
-        A design leaves no margin if its mean square error exceeds half of the limit's.
+        A design has no margin if its mean square error exceeds half of the limit's.
         """
         margin = 2.0 * self.worst**2 <= DIFFRACTION_LIMIT**2
         return f"{DIFFRACTION_LIMIT if margin else sqrt(DIFFRACTION_LIMIT**2 + self.worst**2):.3g}"
@@ -302,8 +302,11 @@ class CameraNumbers:
         Raises
         ------
         InputError
-            The camera has lenses or a separate stop, with which no monitor is modelled.
+            It is an instrument, or a camera with lenses or a separate stop, with which no monitor is modelled.
         """
+        if self.name != self.mounted or self.monitored:
+            problem = "a new monitor is for a camera, and this is an instrument"
+            raise InputError(Issue(problem, self.reference, allowed=f"its camera {self.camera.name}"))
         lens = next((name for name, one in self.camera.mirrors.items() if one.light == "refracts"), None)
         stop = self.camera.mirrors[self.camera.stop].light == "passes"
         if lens or stop:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 import os
+import re
 from collections.abc import Mapping
 from importlib.resources import files
 from pathlib import Path
@@ -37,7 +39,7 @@ def numbers_of(reference: str, folder: Path) -> CameraNumbers:
     alone = len(instrument.cameras) == 1
     return CameraNumbers(
         camera,
-        os.path.relpath(reference, folder) if is_path(reference) else reference,
+        _quoted(os.path.relpath(reference, folder)) if is_path(reference) else reference,
         instrument.name,
         mounted,
         "" if alone else f"{mounted}/",
@@ -80,6 +82,11 @@ def checked_text(kind: str, numbers: CameraNumbers, values: Mapping[str, str]) -
     model = next(one for one in file_kinds() if one.name == kind).model
     validate(model, parse_yaml(text))
     return text
+
+
+def _quoted(path: str) -> str:
+    """Return a path as YAML reads it back, in quotes where it needs them."""
+    return path if re.fullmatch(r"[\w./][\w./ +-]*", path) else json.dumps(path, ensure_ascii=False)
 
 
 def _times(quantity: str, factor: float) -> str:
