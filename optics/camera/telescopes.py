@@ -80,8 +80,10 @@ def first_design(
         raise ValueError(f"aperture must be positive and the F-number 0.5 to 1000, got {aperture} m and {f_number}")
     what, focal = TELESCOPES[kind], f_number * aperture
     if what.lenses:
-        rows = zip(*triplet(focal, f_number, wavelength, half_field), GLASSES, strict=True)
-        return _camera([OpticalSurface(*row[:2], 0.0, row[2]) for row in rows], what.stop, aperture, wavelength)
+        radii, gaps = triplet(focal, f_number, wavelength, half_field)
+        faces = zip(radii.tolist(), gaps.tolist(), GLASSES, strict=True)
+        lens = [OpticalSurface(radius, gap, material=behind) for radius, gap, behind in faces]
+        return _camera(lens, what.stop, aperture, wavelength)
     primary = min(max(f_number / 3.0, 1.5), 3.0) if primary_f_number is None else primary_f_number
     back = 0.5 * aperture if behind is None else behind
     if what.ratios:

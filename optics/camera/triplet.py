@@ -12,7 +12,7 @@ from scipy.optimize import least_squares
 
 from optics.materials.glass import refractive_index
 
-GLASSES = ("N-SK16", 1.0, "F2", 1.0, "N-SK16", 1.0)
+GLASSES: tuple[str | float, ...] = ("N-SK16", 1.0, "F2", 1.0, "N-SK16", 1.0)
 """Medium behind each of the six faces."""
 STOP = 3
 """Index of the face that is the stop: the rear of the flint lens."""

@@ -91,7 +91,7 @@ def test_a_new_study_and_a_new_budget_run(telescope: str, cameras: Path, tmp_pat
     """The requirement of a budget leaves room for the design, and the range of the compensator for its limits."""
     camera = cameras / f"{telescope}.yaml"
     budget = tmp_path / "budget.yaml"
-    assert new("tolerance", camera, budget, "--samples", "4").exit_code == 0
+    assert new("tolerance", camera, budget, "--samples", "20").exit_code == 0
     done = invoke(tolerance_app, budget, "--out", tmp_path / "tolerance", "--workers", "1", "--json")
     assert done.exit_code == 0, done.stderr
     found = json.loads(done.stdout)

@@ -205,7 +205,7 @@ def _command(kind: str) -> Callable[..., None]:
 
     new = NEW[kind]
     command.__doc__ = f"Write {new.about}.\n\n    python -m twin.new {kind} --camera my.yaml --out {kind}.yaml\n"
-    options = [("camera", Camera, None), ("out", Out, None)]
+    options: list[tuple[str, Any, Any]] = [("camera", Camera, None), ("out", Out, None)]
     for name in new.questions:
         question = QUESTIONS[name]
         shown = question.shown or question.default
