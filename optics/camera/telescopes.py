@@ -1,65 +1,24 @@
-"""First designs of reflecting telescopes: layouts by first-order optics, conic constants by third-order optics.
+"""First designs of telescopes: layouts by first-order optics, conic constants by third-order optics.
 
 The layout of two mirrors follows from the focal lengths of primary and system and from the distance of the focus behind
 the primary (Schroeder, Astronomical Optics, 2nd ed., 2000, chapter 2). Layouts of three mirrors are similar to two
 designs in the ratios of their radii and distances: an anastigmat with its pupil on the axis after Korsch (J. Opt. Soc.
 Am. 62, 1291, 1972), and an off-axis one with its stop at the secondary. Conic constants make the first Seidel sums
-vanish, which are linear in them.
+vanish, which are linear in them. A triplet of lenses is that of `optics.camera.triplet`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
 from optics.camera.image_quality import wavefront
 from optics.camera.prescription import MIRROR, Camera, OpticalSurface
 from optics.camera.seidel import seidel
-
-KORSCH = ((-2.5 / 6, -0.9375 / 6), (-2.5 / 18, 2.39583333333333 / 6), (-1.25 / 6, -1.375 / 6))
-"""Radius and distance to the next vertex, in focal lengths, of three mirrors: flat Petzval surface, F/2.5 at F/12."""
-OFF_AXIS = ((-2.14706, -0.416667), (-0.706952, 0.416667), (-1.050288, -0.945003))
-"""As KORSCH: stop at the secondary, flat field, exit pupil far away; the first and the third vertex coincide."""
-OFF_AXIS_BIAS = np.radians(55.2)
-"""Field angle of the off-axis layout times its F-number, radians: beams and mirrors pass beside each other."""
-
-
-@dataclass(frozen=True)
-class TelescopeType:
-    """Kind of telescope that `first_design` makes.
-
-    Attributes
-    ----------
-    title : str
-        Name for the description of a camera.
-    conics : tuple of float or None
-        Conic constant of each mirror; None where a Seidel sum determines it.
-    ratios : tuple, optional
-        Radii and distances of three mirrors in focal lengths; without them the layout is that of one or two mirrors.
-    bias : float
-        Angle of the field's middle from the axis times the F-number, radians.
-    stop : int
-        Index of the mirror that is the stop.
-    """
-
-    title: str
-    conics: tuple[float | None, ...]
-    ratios: tuple[tuple[float, float], ...] = ()
-    bias: float = 0.0
-    stop: int = 0
-
-
-TELESCOPES = {
-    "prime-focus": TelescopeType("Paraboloid with its prime focus", (None,)),
-    "cassegrain": TelescopeType("Classical Cassegrain telescope", (-1.0, None)),
-    "dall-kirkham": TelescopeType("Dall-Kirkham telescope", (None, 0.0)),
-    "ritchey-chretien": TelescopeType("Ritchey-Chretien telescope", (None, None)),
-    "korsch": TelescopeType("Three-mirror anastigmat after Korsch", (None, None, None), KORSCH, np.radians(6.0)),
-    "off-axis": TelescopeType("Off-axis three-mirror anastigmat", (None,) * 3, OFF_AXIS, float(OFF_AXIS_BIAS), 1),
-}
-"""Kinds of telescopes by name."""
+from optics.camera.telescope_types import TELESCOPES
+from optics.camera.triplet import GLASSES, triplet
 
 
 def _two_mirrors(aperture: float, f_number: float, primary: float, behind: float) -> list[tuple[float, float]]:
@@ -78,6 +37,7 @@ def first_design(
     wavelength: float,
     primary_f_number: float | None = None,
     behind: float | None = None,
+    half_field: float = np.radians(0.5),
 ) -> Camera:
     """Design a telescope to begin with: its focal length is exact, its conics cancel third-order aberrations.
 
@@ -95,11 +55,13 @@ def first_design(
         F-number of the primary of two mirrors; by default a third of that of the telescope, within 1.5 and 3.
     behind : float, optional
         Distance of the focus behind the primary of two mirrors, metres; by default half of the aperture.
+    half_field : float
+        Half angle of the field over which a triplet is corrected, radians.
 
     Returns
     -------
     Camera
-        Mirrors in the order of the light, centred on one axis; the stop is the mirror of the kind.
+        Surfaces in the order of the light, centred on one axis; the stop is that of the kind.
 
     Raises
     ------
@@ -117,6 +79,11 @@ def first_design(
     if not (aperture > 0.0 and 0.5 <= f_number <= 1000.0):
         raise ValueError(f"aperture must be positive and the F-number 0.5 to 1000, got {aperture} m and {f_number}")
     what, focal = TELESCOPES[kind], f_number * aperture
+    if what.lenses:
+        radii, gaps = triplet(focal, f_number, wavelength, half_field)
+        faces = zip(radii.tolist(), gaps.tolist(), GLASSES, strict=True)
+        lens = [OpticalSurface(radius, gap, material=behind) for radius, gap, behind in faces]
+        return _camera(lens, what.stop, aperture, wavelength)
     primary = min(max(f_number / 3.0, 1.5), 3.0) if primary_f_number is None else primary_f_number
     back = 0.5 * aperture if behind is None else behind
     if what.ratios:
@@ -143,9 +110,9 @@ def first_design(
     return _optimised(camera, what.bias / f_number) if what.stop else camera
 
 
-def _camera(mirrors: Sequence[OpticalSurface], stop: int, aperture: float, wavelength: float) -> Camera:
-    """Return the camera of mirrors whose stop is filled by a beam of a diameter on the axis."""
-    surfaces = list(mirrors)
+def _camera(given: Sequence[OpticalSurface], stop: int, aperture: float, wavelength: float) -> Camera:
+    """Return the camera of surfaces whose stop is filled by a beam of a diameter on the axis."""
+    surfaces = list(given)
     surfaces[stop] = replace(surfaces[stop], diameter=aperture)
     camera = Camera(surfaces, wavelength, stop)
     surfaces[stop] = replace(surfaces[stop], diameter=aperture**2 / camera.entrance_pupil_diameter)

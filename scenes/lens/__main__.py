@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from rich.console import Console
 
+from optics.camera.telescope_types import TELESCOPES
 from scenes.yaml.errors import InputError, Issue, Problem, printable
 from scenes.yaml.standard_output import BAD_INPUT, FAILURE, print_error, to_stdout
 from scenes.yaml.units import ANGLE, LENGTH, Kind, parse_quantity
@@ -198,12 +199,11 @@ def read(
 @app.command()
 def new(
     kind: Annotated[
-        str,
-        typer.Argument(
-            help="prime-focus, cassegrain, dall-kirkham, ritchey-chretien, korsch or off-axis (both of three mirrors)."
-        ),
+        str, typer.Argument(help=f"{'; '.join(f'{name}: {one.title}' for name, one in TELESCOPES.items())}.")
     ],
-    out: Annotated[Path, typer.Option(readable=False, help="The camera's file to write, .yaml.")],
+    out: Annotated[
+        Path | None, typer.Option(readable=False, help="The camera's file to write, .yaml. Default: standard output.")
+    ] = None,
     aperture: Annotated[str, typer.Option(help="Diameter of the entrance pupil.")] = "0.5 m",
     f_number: Annotated[float, typer.Option(min=0.5, max=1000.0, help="Focal length over the aperture.")] = 10.0,
     wavelength: Annotated[str, typer.Option(help="Design wavelength.")] = "650 nm",
@@ -221,18 +221,20 @@ def new(
     ] = None,
     force: Force = False,
 ) -> None:
-    """Write the camera file of a new reflecting telescope, which the other commands read at once.
+    """Write the camera file of a new telescope, which the other commands read at once.
 
         python -m scenes.lens new ritchey-chretien --aperture "0.4 m" --f-number 8 --out my_camera.yaml
 
         python -m twin.camera my_camera.yaml
 
     First-order optics give the layout with exactly this focal length, third-order optics the conic constants; those of
-    the off-axis anastigmat minimise the traced wavefront error. Exit code 2 if there is no such telescope.
+    the off-axis anastigmat minimise the traced wavefront error, and the lenses of the triplet its ray errors over the
+    field. Exit code 2 if there is no such telescope.
     """
     errors = Console(stderr=True)
     with _explained(errors):
-        _check_out(out, (".yaml", ".yml"), force)
+        if out is not None:
+            _check_out(out, (".yaml", ".yml"), force)
         sizes = [_quantity("--aperture", aperture, LENGTH), _quantity("--wavelength", wavelength, LENGTH)]
         half, step = _quantity("--field", field, ANGLE), _quantity("--pitch", pitch, LENGTH)
         back = _quantity("--behind", behind, LENGTH)
@@ -245,13 +247,15 @@ def new(
         assert sizes[1] is not None
         assert step is not None
         try:
-            text = first_camera(kind, _camera_name(out), sizes[0], f_number, sizes[1], half, step, primary, back)
+            name = _camera_name(Path(kind) if out is None else out)
+            text = first_camera(kind, name, sizes[0], f_number, sizes[1], half, step, primary, back)
         except ValueError as error:
             raise InputError(Issue(str(error))) from None
         validate(CameraSpec, parse_yaml(text))
-        _write(out, text.encode())
-    with to_stdout(errors, f"the camera is complete in {out}"):
-        sys.stdout.write(f"{out}\nanalyse it: python -m twin.camera {out}\n")
+        if out is not None:
+            _write(out, text.encode())
+    with to_stdout(errors, "" if out is None else f"the camera is complete in {out}"):
+        sys.stdout.write(text if out is None else f"{out}\nanalyse it: python -m twin.camera {out}\n")
 
 
 @app.command()

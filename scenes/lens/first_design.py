@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from optics.camera.prescription import Camera
-from optics.camera.telescopes import TELESCOPES, first_design
+from optics.camera.prescription import MIRROR, Camera
+from optics.camera.telescope_types import TELESCOPES
+from optics.camera.telescopes import first_design
 
-HALF_FIELDS = {"dall-kirkham": 0.02, "korsch": 0.5, "off-axis": 1.0}
+HALF_FIELDS = {"dall-kirkham": 0.02, "korsch": 0.5, "off-axis": 1.0, "triplet": 0.5}
 """Half fields along the line, degrees, over which a kind is sharp at F/10; 0.05 for the others."""
 
 MARGIN = 1.1
@@ -51,9 +52,9 @@ def first_camera(
     ValueError
         There is no such telescope.
     """
-    camera = first_design(kind, aperture, f_number, wavelength, primary_f_number, behind)
-    what = TELESCOPES[kind]
     half = np.radians(HALF_FIELDS.get(kind, 0.05)) if half_field is None else half_field
+    camera = first_design(kind, aperture, f_number, wavelength, primary_f_number, behind, half)
+    what = TELESCOPES[kind]
     bias = what.bias / f_number
     focal = f_number * aperture
     pixels = 2 * int(focal * np.tan(half) / pitch)
@@ -70,8 +71,8 @@ def first_camera(
         f"field_bias: {np.degrees(bias):.10g} deg          # angle of the middle of the field from the axis",
         f"field: {{x: {np.degrees(half):.6g} deg, y: {np.degrees(0.1 * half):.6g} deg}}    # half angles",
         f"wavelength: {1e9 * wavelength:.10g} nm",
-        f"stop: M{what.stop + 1}",
-        "mirrors:                           # in the order of the light",
+        f"stop: {_surface(camera, what.stop)}",
+        f"mirrors:                           # {'faces of lenses, ' * what.lenses}in the order of the light",
         *_mirrors(camera, half, bias, aperture),
         f"image: {{z: {1e3 * camera.vertices[-1]:.15g} mm}}",
         f"line: {{pixels: {max(pixels, 2)}, pitch: {1e6 * pitch:.6g} um}}",
@@ -85,13 +86,20 @@ def _source(kind: str) -> str:
         return (
             "ratios of a known layout; conics and focus minimise the traced wavefront error about the field's middle."
         )
+    if kind == "triplet":
+        return "curvatures, air spaces and focus minimise ray errors over the field, also at 0.89 and 1.12 wavelengths."
     if kind == "korsch":
         return "ratios of a known layout with a flat field; conics cancel spherical aberration, coma and astigmatism."
     return "first-order layout; conics cancel third-order aberrations (Seidel sums, see the report)."
 
 
+def _surface(camera: Camera, k: int) -> str:
+    """Return the name of a surface: M1, M2, ... of mirrors, L1_front, L1_back, ... of lenses."""
+    return f"M{k + 1}" if camera.surfaces[k].material == MIRROR else f"L{k // 2 + 1}_{('front', 'back')[k % 2]}"
+
+
 def _mirrors(camera: Camera, half: float, bias: float, aperture: float) -> list[str]:
-    """Return the lines of the mirrors, and of the shadow of a mirror that stands in the entering beam."""
+    """Return the lines of the surfaces, and of the shadow of a mirror that stands in the entering beam."""
     out = []
     z = camera.vertices
     centred = camera.stop == 0 and len(camera.surfaces) > 1
@@ -103,8 +111,9 @@ def _mirrors(camera: Camera, half: float, bias: float, aperture: float) -> list[
             f"edges: [{{blocks: circle, radius: {1e3 * MARGIN * radius:.5g} mm}}]}}   # of M2 and its mount"
         )
     for k, surface in enumerate(camera.surfaces):
+        behind = f"light: refracts, {'glass' if isinstance(surface.material, str) else 'index'}: {surface.material}"
+        last = f"conic: {surface.conic:.12g}" if surface.material == MIRROR else behind
         out.append(
-            f"  M{k + 1}: {{z: {1e3 * z[k]:.15g} mm, radius: {1e3 * surface.radius:.15g} mm, "
-            f"conic: {surface.conic:.12g}}}"
+            f"  {_surface(camera, k)}: {{z: {1e3 * z[k]:.15g} mm, radius: {1e3 * surface.radius:.15g} mm, {last}}}"
         )
     return out

@@ -23,6 +23,7 @@ from analysis.arrays import Array
 from optics.numerics.array_math import covariance_root
 from scenes.models.disturbances import Component, DisturbancePrior, causes_of, drawn_motions, states_of
 from scenes.specs.operation import OperationSetup
+from scenes.yaml.spec import Inline
 from scenes.yaml.yaml_file import dump_yaml
 from twin.framework.procedure import Advance
 from twin.framework.random_streams import stream
@@ -428,7 +429,22 @@ def write_simulated(
     if columns:
         tables.append({"kind": "temperature", "files": TEMPERATURES, "time": "UTC", "columns": columns})
     tables.append({"kind": "monitor", "files": PASSES, "time": "UTC", "name": "run"})
-    folder.write_text(TELEMETRY, dump_yaml({"instrument": plan.operation.instrument, "readings": tables}))
+    folder.write_text(TELEMETRY, dump_yaml({"instrument": _portable_instrument(plan), "readings": tables}))
+
+
+def _portable_instrument(plan: OperationSetup) -> str | dict[str, Any]:
+    """Return the reference of a plan to its instrument, or the whole instrument if the plan contains it."""
+    reference = plan.operation.instrument
+    if not isinstance(reference, Inline):
+        return reference
+    job = plan.model
+    plain = job.instrument.plain()
+    plain.pop("disturbances", None)
+    for name, site in job.instrument.cameras.items():
+        plain["cameras"][name]["camera"] = job.cameras[site.camera].plain()
+    if job.detector is not None:
+        plain["monitor"]["area_ccd"]["detector"] = job.detector.plain()
+    return plain
 
 
 def sensed_temperatures(reference: float, what: Simulation, life: Life) -> dict[str, np.ndarray]:
