@@ -86,8 +86,8 @@ def test_coupling_of_focus_and_line_level(angle):
     plan = shim_plan(RigidMotion.of([0, tilt, 0], [0, 0, 0]), make_mount(angle))
     in_mount = frame.T @ [0, tilt, 0]
     kept = frame @ (in_mount * [1, 1, 0])
-    assert plan.turn == pytest.approx(in_mount[2], abs=1e-9)
-    assert abs(plan.turn) == pytest.approx(tilt * np.sin(angle), abs=1e-9)
+    assert plan.rotation == pytest.approx(in_mount[2], abs=1e-9)
+    assert abs(plan.rotation) == pytest.approx(tilt * np.sin(angle), abs=1e-9)
     assert plan.level_coupling == pytest.approx(kept[2], abs=0.01 * ARCMIN)
     assert plan.level_coupling == pytest.approx(-tilt * np.sin(angle) * np.cos(angle), abs=0.01 * ARCMIN)
     # and of the tilt itself only cos^2 comes about

@@ -417,7 +417,7 @@ def test_a_run_that_has_changed_places_with_the_old_one(tmp_path):
     target = a_run(tmp_path / "run")
     act = "from twin.framework import run_folder as r; (folder.target / 'late.txt').write_text('mine'); "
     act += "r.write_manifest(folder, 'twin.test', 1.0, 1.0); "
-    act += "os.rename(folder.path / r._WAITING, folder.path / r.MANIFEST); r.put_in_place.__globals__['exchange']("
+    act += "os.rename(folder.path / r._WAITING, folder.path / r.MANIFEST); r.replace_folder.__globals__['exchange']("
     kill_a_run(target, act + "folder.path, folder.target)")
     assert everything(target) == {"half.txt", MANIFEST}
     a_run(tmp_path / "other")
