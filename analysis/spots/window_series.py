@@ -51,7 +51,8 @@ _LEARNT_FRAMES = 6
 """Number of frames, evenly spaced, from which the priors are learnt: time grows with its cube."""
 _STEP = 1e-4
 _MOST_STEPS = 40
-_CAUSES = ("temporal noise", "shape", "response pattern", "dark pattern")
+CAUSES = ("temporal noise", "shape", "response pattern", "dark pattern")
+"""Causes of the covariance, keys of `WindowSeries.parts`."""
 
 
 @dataclass(frozen=True)
@@ -224,7 +225,7 @@ def _terms(state: _State, pixels: _Pixels, prior: SeriesPrior) -> dict[str, Arra
     noise = np.diag(prior.gain_dn_per_e * np.maximum(pixels.level - pixels.offset, 0.0) + prior.read_dn**2)
     return dict(
         zip(
-            _CAUSES,
+            CAUSES,
             (noise, shape, prior.prnu**2 * light[:, None] * light[None] * pixels.same, prior.dark_dn**2 * pixels.same),
             strict=True,
         )
@@ -308,7 +309,7 @@ def fit_window_series(
         sigma = np.sqrt(np.diagonal(solver.covariance)[: 2 * len(state.flux) - 2].min())
         if moved < _SETTLED * sigma and (prior is not None or turn > max(_RELEARN)):
             return _result(np.asarray(images, np.float64), pixels, state, learnt, terms, solver, left)
-        pixels = replace(pixels, level=pixels.value - np.diagonal(terms[_CAUSES[0]]) * left)
+        pixels = replace(pixels, level=pixels.value - np.diagonal(terms[CAUSES[0]]) * left)
     raise SpotError(
         {0: "positions and shape do not converge; is there one spot in all windows, away from their edges?"}
     )

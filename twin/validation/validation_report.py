@@ -14,6 +14,7 @@ from twin.framework.page import links, report_page, reproduce
 from twin.framework.report import Report, Section, answer
 from twin.framework.run_folder import RunFolder, write_manifest
 from twin.validation.check import AGREED, PAPERS, SIGMAS, VERDICTS, CheckResult, Verdict
+from twin.validation.row_names import REAL
 from twin.validation.runner import GroupRun, Validation
 
 PROGRAM = "twin.validate"
@@ -31,7 +32,7 @@ def summary_files(validation: Validation) -> dict[str, bytes]:
         for a in run.artefacts
         if isinstance(a, SvgFigure | PngFigure)
     }
-    lines = [*_head(validation), *_tables(validation), *_chosen(validation), *_corrections(validation)]
+    lines = [*_head(validation), *_tables(validation), *_chosen(validation), *_corrections(validation), *_files(validation)]
     if figures:
         lines += ["## Figures", ""]
     for name, artefact in figures.items():
@@ -41,7 +42,8 @@ def summary_files(validation: Validation) -> dict[str, bytes]:
 
 
 def _head(validation: Validation) -> Iterator[str]:
-    yield "# What the simulation says of the papers"
+    real = {r.paper for r in validation.results} == {REAL}
+    yield "# Measured data of others" if real else "# What the simulation says of the papers"
     yield ""
     took = duration_text(validation.seconds)
     yield f"Made by `{command(validation)}` in {took}; its validation.html has every row in full."
@@ -125,13 +127,35 @@ def _corrections(validation: Validation) -> Iterator[str]:
     yield ""
 
 
+def _files(validation: Validation) -> Iterator[str]:
+    """Yield the lines that list the files of measured data, if there are rows on them."""
+    if all(result.paper != REAL for result in validation.results):
+        return
+    from twin.validation.real.data import published
+
+    yield from ("## Where the data are published", "")
+    yield "None of these files is part of the project; `--real DIR` names a folder that contains them."
+    yield from ("", "| file | published in | SHA-256 |", "|---|---|---|")
+    for name, (checksum, place) in published().items():
+        yield f"| `{name}` | {place} | `{checksum}` |"
+    yield from ("", *(_choices_text()), "")
+
+
+def _choices_text() -> Iterator[str]:
+    from twin.validation.group import load_printed
+
+    yield "## Choices that were made on these files"
+    yield ""
+    yield from (f"- {choice}" for choice in load_printed(REAL).content.data["choices"])
+
+
 def _cell(text: str) -> str:
     """Escape text for a cell of a Markdown table."""
     return text.replace("|", "\\|").replace("\n", " ")
 
 
-_LOOKS = "confirmed", "reproduced", "consistent", "corrected", "refuted", "undecided", "silent", "failed"
-MARKS: dict[Verdict, tuple[str, str]] = dict(zip(VERDICTS, zip("=⊜∼≈≠±?✕", _LOOKS, strict=True), strict=True))
+_LOOKS = "confirmed", "reproduced", "consistent", "corrected", "refuted", "undecided", "silent", "failed", "silent"
+MARKS: dict[Verdict, tuple[str, str]] = dict(zip(VERDICTS, zip("=⊜∼≈≠±?✕–", _LOOKS, strict=True), strict=True))
 """Verdict -> its character and CSS class in the report; the character shows the meaning without colour."""
 
 
