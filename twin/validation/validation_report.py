@@ -32,7 +32,9 @@ def summary_files(validation: Validation) -> dict[str, bytes]:
         for a in run.artefacts
         if isinstance(a, SvgFigure | PngFigure)
     }
-    lines = [*_head(validation), *_tables(validation), *_chosen(validation), *_corrections(validation), *_files(validation)]
+    lines = [*_head(validation), *_tables(validation), *_chosen(validation), *_corrections(validation)]
+    if any(result.paper == REAL for result in validation.results):
+        lines += _measured_data(validation)
     if figures:
         lines += ["## Figures", ""]
     for name, artefact in figures.items():
@@ -70,6 +72,9 @@ def _tables(validation: Validation) -> Iterator[str]:
         rows = [result for result in validation.results if result.paper == number]
         if not rows:
             continue
+        if number == REAL:
+            yield from _real_table(title, rows)
+            continue
         yield f"## Paper {number}: {title}"
         yield ""
         yield "| check | what is compared | claim | sides | measured | tolerance | finds | alternative | verdict |"
@@ -80,6 +85,36 @@ def _tables(validation: Validation) -> Iterator[str]:
             cells = (names, about, claim_text(r), comparison_text(r), _measured(r), *_limits(r), r.verdict)
             yield "| " + " | ".join(_cell(cell) for cell in cells) + " |"
         yield ""
+
+
+def _real_table(title: str, rows: Sequence[CheckResult]) -> Iterator[str]:
+    """Yield the lines of the table of rows on measured data."""
+    yield f"## {title}"
+    yield ""
+    yield "| row | statement | printed by others | measured here | sigma | verdict | what would have refuted it |"
+    yield "|---|---|---:|---:|---:|---|---|"
+    for r in rows:
+        unit = "" if r.unit == "1" or r.measured is None else f" {r.unit}"
+        refuted = ""
+        if r.power is not None and r.claim is not None:
+            side = {
+                "two-sided": "off by more than",
+                "at most": "above it by more than",
+                "at least": "below it by more than",
+            }
+            refuted = f"{side[r.comparison]} {plain(r.power, 2)}{unit} ({r.because}); the alternative, {r.against}, is "
+            refuted += f"{plain(r.tells or 0.0, 2)}{unit} away"
+        about = f"{r.equation}: {r.statement}"
+        cells = (f"`{r.id}`", about, claim_text(r), f"{measured_text(r)}{unit}", sigma_text(r), r.verdict, refuted)
+        yield "| " + " | ".join(_cell(cell) for cell in cells) + " |"
+    yield ""
+    yield "## Numbers of each row"
+    yield ""
+    for r in rows:
+        # the last line is the comparison, which the table has
+        lines = r.how.splitlines() if r.power is None else r.how.splitlines()[:-1]
+        yield from (f"- `{r.id}`: {_cell(' '.join(lines))}" for _ in lines[:1])
+    yield ""
 
 
 def _measured(result: CheckResult) -> str:
@@ -127,26 +162,33 @@ def _corrections(validation: Validation) -> Iterator[str]:
     yield ""
 
 
-def _files(validation: Validation) -> Iterator[str]:
-    """Yield the lines that list the files of measured data, if there are rows on them."""
-    if all(result.paper != REAL for result in validation.results):
-        return
+def _measured_data(validation: Validation) -> Iterator[str]:
+    """Yield the lines with the tables of rows on measured data, the data's files, and the choices made on them."""
+    from twin.validation.group import load_printed
     from twin.validation.real.data import published
 
+    tables = (a for run in validation.runs for a in run.artefacts if run.group.prefix.startswith(REAL))
+    for table in tables:
+        if not isinstance(table, Table):
+            continue
+        yield from (f"## {table.title}", "", table.caption, "")
+        yield "| " + " | ".join(table.heads) + " |"
+        yield "|" + "---|" * len(table.heads)
+        digits = table.decimals or (None,) * len(table.heads)
+        for row in table.rows:
+            cells = (
+                c if d is None or not isinstance(c, float) else fixed(c, d) for c, d in zip(row, digits, strict=True)
+            )
+            yield "| " + " | ".join(_cell(str(cell)) for cell in cells) + " |"
+        yield ""
     yield from ("## Where the data are published", "")
     yield "None of these files is part of the project; `--real DIR` names a folder that contains them."
     yield from ("", "| file | published in | SHA-256 |", "|---|---|---|")
     for name, (checksum, place) in published().items():
         yield f"| `{name}` | {place} | `{checksum}` |"
-    yield from ("", *(_choices_text()), "")
-
-
-def _choices_text() -> Iterator[str]:
-    from twin.validation.group import load_printed
-
-    yield "## Choices that were made on these files"
-    yield ""
+    yield from ("", "## Choices that were made on these files", "")
     yield from (f"- {choice}" for choice in load_printed(REAL).content.data["choices"])
+    yield ""
 
 
 def _cell(text: str) -> str:
@@ -212,7 +254,12 @@ def _papers(validation: Validation) -> Iterator[Section]:
     for number, title in PAPERS.items():
         results = [result for result in validation.results if result.paper == number]
         if results:
-            yield Section(f"Paper {number}", (title,), (_paper_table(number, results),), name=f"paper-{number}")
+            yield Section(
+                "Measured data" if number == REAL else f"Paper {number}",
+                (title,),
+                (_paper_table(number, results),),
+                name=f"paper-{number}",
+            )
 
 
 def _paper_table(paper: str, results: Sequence[CheckResult]) -> Table:

@@ -56,7 +56,11 @@ def _rows(context: Context, paths: list[Path], name: str, edges: dict[str, EdgeM
         worst = int(np.argmax(np.abs(values - other)))
         facts = {"values": values, "other": other, "difference": values - other, "doubt": edge.doubt or "none"}
         yield context.row(
-            f"real.edges.{name}.sfr_order_{order}", float(abs(values - other)[worst]), float(sigmas[worst]), 0.0, **facts
+            f"real.edges.{name}.sfr_order_{order}",
+            float(abs(values - other)[worst]),
+            float(sigmas[worst]),
+            0.0,
+            **facts,
         )
         yield context.row(
             f"real.edges.{name}.sfr50_order_{order}", half * cosine, half_sigma * cosine, cosine=100 * (1 - cosine)

@@ -192,7 +192,9 @@ def _rows(context: Context, paths: list[Path]) -> Iterator[CheckResult]:
             "prnu": [light.fit.prior.prnu for light in group],
         }  # fmt: skip
         yield context.row(f"real.spots.{name}", chi / degrees, float(np.sqrt(2.0 / degrees)), 1.0, **facts)
-        yield context.row(f"real.spots.{name}_noise_alone", noise_only / degrees, float(np.sqrt(2.0 / degrees)), 1.0, **facts)
+        yield context.row(
+            f"real.spots.{name}_noise_alone", noise_only / degrees, float(np.sqrt(2.0 / degrees)), 1.0, **facts
+        )
         if kind == FIDUCIAL:
             steps = [_rms(np.diff(light.fit.position, axis=0)) for light in group]
             yield context.row("real.spots.successive", *mean_of(np.array(steps)), steps=steps)
@@ -204,7 +206,9 @@ def _rows(context: Context, paths: list[Path]) -> Iterator[CheckResult]:
             chi, free = _gaussian(group, NoiseModel(mean.gain_dn_per_e, mean.read_dn / mean.gain_dn_per_e))
             yield context.row("real.spots.gaussian", chi / free, float(np.sqrt(2.0 / free)), 1.0)
     if degrees_all:
-        yield context.row("real.spots.all", chi_all / degrees_all, float(np.sqrt(2.0 / degrees_all)), 1.0, degrees=degrees_all)
+        yield context.row(
+            "real.spots.all", chi_all / degrees_all, float(np.sqrt(2.0 / degrees_all)), 1.0, degrees=degrees_all
+        )
     else:
         yield context.check("real.spots.all").skipped("there are no two lights of the same times")
     pixels = np.array([light.fit.reduced_chi_square for light in lights])
