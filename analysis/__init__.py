@@ -14,6 +14,7 @@ Input that cannot be used raises a ValueError that says what is allowed.
 
 Spots and detectors
     fit_spot                  centre of a spot with its covariance
+    fit_window_series         positions of a spot in a series of small windows, its shape learnt from them
     photon_transfer           gain, noise and non-uniformity from dark and flat frames
     NoiseModel                noise of a linear detector (EMVA 1288)
     SpotTemplate              calibrated shape of a spot
@@ -116,6 +117,7 @@ if TYPE_CHECKING:
     from analysis.spots.noise import NoiseModel
     from analysis.spots.photon_transfer import PhotonTransfer, photon_transfer
     from analysis.spots.spot_fit import SpotFit, fit_spot
+    from analysis.spots.window_series import SeriesPrior, WindowSeries, fit_window_series
     from analysis.spots.spot_template import SpotTemplate
     from analysis.statistics import proportion_interval, robust_sigma
     from analysis.turntable.dividing_error import AngleFit, chauvenet, fit_dividing_error
@@ -146,6 +148,7 @@ _MODULES = {
     "spots.noise": ("NoiseModel",),
     "spots.photon_transfer": ("PhotonTransfer", "photon_transfer"),
     "spots.spot_fit": ("SpotFit", "fit_spot"),
+    "spots.window_series": ("SeriesPrior", "WindowSeries", "fit_window_series"),
     "spots.spot_template": ("SpotTemplate",),
     "statistics": ("robust_sigma", "proportion_interval"),
     "turntable.dividing_error": ("AngleFit", "chauvenet", "fit_dividing_error"),
@@ -180,11 +183,13 @@ __all__ = [
     "RationalPolynomial",
     "Rays",
     "Recovery",
+    "SeriesPrior",
     "SmoothedSeries",
     "SpotFit",
     "SpotTemplate",
     "StereoPoints",
     "TimeLaw",
+    "WindowSeries",
     "adjust_block",
     "ansi_to_nm",
     "bar_mtf",
@@ -201,6 +206,7 @@ __all__ = [
     "fit_rpc",
     "fit_spot",
     "fit_wavefront_map",
+    "fit_window_series",
     "focus_vertex",
     "fringe_to_nm",
     "height_error",

@@ -7,6 +7,7 @@ if __name__ == "__main__":
 
     end_quietly()
 
+import os
 import time
 from collections.abc import Sequence
 from pathlib import Path
@@ -41,6 +42,15 @@ def main(
     only: Annotated[
         str | None,
         typer.Option(help="Check ids or their beginnings, separated by commas, e.g. 001.eq1,001.table1. Default: all."),
+    ] = None,
+    real: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="DIR",
+            readable=False,
+            help="Folder of measured data of others: runs the rows `real` instead of the papers'. Default of --only "
+            "real: TWIN_REAL, or ../shared/real beside the checkout.",
+        ),
     ] = None,
     fast: Annotated[
         bool,
@@ -91,6 +101,8 @@ def main(
     The run folder gets validation.json, a self-contained validation.html, a summary in summary/, and figures and
     tables in artefacts/.
 
+    - **skipped**: a row on measured data of others that are not in the folder.
+
     Examples: `python -m twin.validate --list` and `python -m twin.validate --only 004.eq2 --fast`
 
     Exit codes: 0 every verdict is as expected; 1 a verdict differs, a check failed, or the backend cannot be used; 2
@@ -100,7 +112,12 @@ def main(
     with cli.explained(errors):
         cli.check_backend(backend)
         from twin.validation import registry
+        from twin.validation.row_names import REAL
 
+        if real is not None and not real.is_dir():
+            raise cli.InputErrorText(f"--real {real}: no such folder; docs/real_data.md says what it contains")
+        only = REAL if only is None and real is not None else only
+        data = real or Path(os.environ.get("TWIN_REAL", Path(__file__).parents[2] / "shared" / "real"))
         try:
             registry.require_known(only)
             selections = registry.select(registry.GROUPS, only)
@@ -115,7 +132,7 @@ def main(
 
         folder = None if out is None else RunFolder(out, force)
         with exit_on_terminate():
-            validation = _run(selections, backend, seed, only, fast, folder, errors)
+            validation = _run(selections, backend, seed, only, fast, folder, errors, data)
     with to_stdout(errors, "" if folder is None else f"the report is complete in {folder.target}"):
         if as_json:
             from twin.validation.validation_report import verdict
@@ -140,6 +157,7 @@ def _run(
     fast: bool,
     folder: RunFolder | None,
     errors: Console,
+    real: Path,
 ) -> Validation:
     """Run the selected checks with a progress bar, and write the run folder if there is one."""
     from optics.numerics.backend import load_backend
@@ -170,9 +188,9 @@ def _run(
 
         if folder is None:
             with beat:
-                return run_checks(selections, tracer, seed, only, fast, show)
+                return run_checks(selections, tracer, seed, only, fast, show, real=real)
         with folder, beat:
-            validation = run_checks(selections, tracer, seed, only, fast, show, folder.path)
+            validation = run_checks(selections, tracer, seed, only, fast, show, folder.path, real)
             show(total, "write the run folder")
             write_validation(validation, folder)
         return validation
@@ -209,7 +227,7 @@ def _print_result(validation: Validation, target: Path | None) -> None:
     from twin.validation import check
     from twin.validation.validation_report import claim_text, comparison_text, measured_text, sigma_text, verdict
 
-    colours = ("green", "dark_sea_green4", "blue", "yellow", "cyan", "magenta", "dim", "bold red")
+    colours = ("green", "dark_sea_green4", "blue", "yellow", "cyan", "magenta", "dim", "bold red", "dim")
     styles = dict(zip(check.VERDICTS, colours, strict=True))
     table = cli.result_table()
     for head in ("check", "claim", "sides", "measured", "sigma", "unit", "verdict"):

@@ -46,7 +46,7 @@ def energy_centroid(
     frames: int,
     noise: NoiseModel,
     radius_px: float | None = None,
-    border_px: int = 4,
+    border_px: int | None = None,
     keep_maps: bool = True,
 ) -> SpotPositions:
     """Return the centroids of spots: the first moment of their light in a circular window that follows the centre.
@@ -67,14 +67,17 @@ def energy_centroid(
     radius_px : float or None
         Radius of the window in pixels; default a quarter of the image's smaller side. The window's edge is one pixel
         soft, so that the result is a smooth function of the image.
-    border_px : int
-        Width in pixels of the border of the image whose mean is the background.
+    border_px : int or None
+        Width in pixels of the border of the image whose mean is the background; default 4, in images of less than 24 px
+        a quarter of a side.
     keep_maps : bool
         True to keep the derivatives of the position with respect to every pixel, for covariances of differences.
     """
     image = spot_image.as_images(mean)
     count, height, width = image.shape
     radius = min(height, width) / 4.0 if radius_px is None else float(radius_px)
+    if border_px is None:
+        border_px = 4 if min(height, width) >= spot_image.SMALL else min(height, width) // 4
     if not 1 <= radius < min(height, width) / 2 or not 1 <= border_px < min(height, width) // 2:
         raise ValueError(
             f"energy centroid: radius_px {radius} or border_px {border_px} does not fit {height} x {width} px"
@@ -149,14 +152,14 @@ def gaussian_fit(
     noise : NoiseModel
         Noise of the detector.
     radius_px : float or None
-        Radius of the window in pixels; default an eighth of the image's smaller side. About the radius of the first
+        Radius of the window in pixels; default an eighth of the image's smaller side, at least 2. About the radius of the first
         dark ring is best.
     elliptical : bool
         Fit a, b and c instead of a alone.
     """
     image = spot_image.as_images(mean)
     count, height, width = image.shape
-    radius = min(height, width) / 8.0 if radius_px is None else float(radius_px)
+    radius = max(min(height, width) / 8.0, 2.0) if radius_px is None else float(radius_px)
     if not 2 <= radius < min(height, width) / 2:
         raise ValueError(f"gaussian fit: radius_px {radius} does not fit {height} x {width} px")
 

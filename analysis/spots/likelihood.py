@@ -81,7 +81,8 @@ def maximum_likelihood_fit(
     template : SpotTemplate
         T shapes; the spot with index b has the shape with index b modulo T.
     edge_px : float
-        Smallest distance of a centre from the image's outermost pixel centres.
+        Smallest distance of a centre from the image's outermost pixel centres; at most a quarter of a side in images of
+        less than 24 px.
     keep_maps : bool
         True to keep the derivatives of the position with respect to every pixel, for covariances of differences.
     threads : int
@@ -97,6 +98,8 @@ def maximum_likelihood_fit(
     if threads < 1 or max_iterations < 1:
         raise ValueError(f"maximum likelihood: threads {threads} and max_iterations {max_iterations} must be >= 1")
     rule = _Rule(template, noise, frames)
+    if min(height, width) < spot_image.SMALL:
+        edge_px = min(edge_px, min(height, width) / 4.0)
     which = np.arange(count) % template.count
 
     def measure(part: slice) -> SpotPositions:

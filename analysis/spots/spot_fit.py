@@ -71,7 +71,8 @@ def fit_spot(
     Parameters
     ----------
     image : (H, W) or (B, H, W) array_like
-        Grey values as recorded, one spot in each image of at least 24 x 24 px.
+        Grey values as recorded, one spot in each image of at least 6 x 6 px. In images of less than 24 px
+        one hot pixel can be taken for a spot; `fit_window_series` measures spots that such windows undersample.
     noise : NoiseModel
         Noise of the detector.
     frames : int
@@ -80,7 +81,7 @@ def fit_spot(
         Weighted least squares of a Gaussian, first moment in a window that follows the centre, or maximum-likelihood
         fit of a calibrated spot shape.
     radius : float, optional
-        Radius of the window of "gaussian" or "energy", in pixels. The default is an eighth ("gaussian") or a quarter
+        Radius of the window of "gaussian" or "energy", in pixels. The default is an eighth, at least 2, ("gaussian") or a quarter
         ("energy") of the smaller side of the image.
     template : SpotTemplate, optional
         Calibrated shape, for "ml" only.

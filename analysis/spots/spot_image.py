@@ -21,6 +21,10 @@ from analysis.spots.spot_positions import SpotError, SpotPositions
 from analysis.spots.spot_template import SpotTemplate
 
 _BIN = 4
+SMALL = 24
+"""Side of images, px, below which the first guess works on single pixels; a hot pixel then can be taken for a spot."""
+LEAST_SIDE = 6
+"""Smallest side of images, px."""
 # A 4 x 4 bin must stand this many sigmas above the background to be called a spot: with some 600 bins in an image the
 # chance that noise alone does so is below 1e-6.
 _DETECTION_SIGMAS = 6.0
@@ -37,13 +41,13 @@ def as_images(mean: ArrayLike) -> Array:
     Raises
     ------
     ValueError
-        An image is not finite, or smaller than 24 x 24 px.
+        An image is not finite, or smaller than 6 x 6 px.
     """
     image = np.asarray(mean, dtype=np.float64)
     if image.ndim == 2:
         image = image[None]
-    if image.ndim != 3 or image.shape[0] < 1 or min(image.shape[1:]) < 24:
-        raise ValueError(f"spots: mean images must be (B, H, W) of at least 24 x 24 px, found shape {image.shape}")
+    if image.ndim != 3 or image.shape[0] < 1 or min(image.shape[1:]) < LEAST_SIDE:
+        raise ValueError(f"spots: mean images must be (B, H, W) of at least 6 x 6 px, found shape {image.shape}")
     if not np.isfinite(image.sum()):
         raise ValueError("spots: mean images hold values that are not finite")
     return image
@@ -134,7 +138,7 @@ def coarse(image: Array, frames: int, noise: NoiseModel) -> tuple[Array, Array, 
     """Return a first guess of each spot: row, column, background, peak and area above half peak, (B,) each.
 
     Row and column are in px, good to about 0.5; background and peak above it in DN; the area in px^2. The guess works
-    on 4 x 4 bins, so that one hot pixel does not make a spot.
+    on 4 x 4 bins, so that one hot pixel does not make a spot, and on single pixels in images of less than 24 px.
 
     Dimensions: B spots, H rows, W columns.
 
@@ -153,7 +157,8 @@ def coarse(image: Array, frames: int, noise: NoiseModel) -> tuple[Array, Array, 
         A spot is saturated or absent.
     """
     count, height, width = image.shape
-    rows, columns = height // _BIN, width // _BIN
+    size = _BIN if min(height, width) >= SMALL else 1
+    rows, columns = height // size, width // size
     brightest = image.reshape(count, -1).max(axis=1)
     # The mean of frames of which some are clipped lies below the clipping level, hence the allowance of a few sigmas.
     reach = brightest + _SATURATION_SIGMAS * np.sqrt(noise.temporal_variance_dn2(brightest, 1))
@@ -167,15 +172,15 @@ def coarse(image: Array, frames: int, noise: NoiseModel) -> tuple[Array, Array, 
                 for n in np.flatnonzero(reach >= noise.saturation_dn)
             }
         )
-    bins = image[:, : rows * _BIN, : columns * _BIN].reshape(count, rows, _BIN, columns * _BIN).sum(axis=2)
-    bins = bins.reshape(count, rows, columns, _BIN).sum(axis=3) / _BIN**2
+    bins = image[:, : rows * size, : columns * size].reshape(count, rows, size, columns * size).sum(axis=2)
+    bins = bins.reshape(count, rows, columns, size).sum(axis=3) / size**2
     ring = np.ones((rows, columns), dtype=bool)
     ring[1:-1, 1:-1] = False
     background = np.median(bins[:, ring], axis=1)
     top = bins.reshape(count, -1).argmax(axis=1)
     peak = bins.reshape(count, -1).max(axis=1) - background
     variance = noise.temporal_variance_dn2(background, frames) + noise.fixed_variance_dn2(background)
-    absent = peak < _DETECTION_SIGMAS * np.sqrt(variance) / _BIN
+    absent = peak < _DETECTION_SIGMAS * np.sqrt(variance) / size
     reject(absent, f"no spot: nothing stands {_DETECTION_SIGMAS:g} sigma above the background")
     i, j = np.arange(rows), np.arange(columns)
     bright = bins - background[:, None, None]
@@ -184,10 +189,10 @@ def coarse(image: Array, frames: int, noise: NoiseModel) -> tuple[Array, Array, 
     bright *= (np.abs(i - (top // columns)[:, None]) <= 4)[:, :, None]
     bright *= (np.abs(j - (top % columns)[:, None]) <= 4)[:, None, :]
     total = bright.sum(axis=(1, 2))
-    centre = (_BIN - 1) / 2.0
-    row = _BIN * (bright.sum(axis=2) @ i) / total + centre
-    column = _BIN * (bright.sum(axis=1) @ j) / total + centre
-    area = np.count_nonzero(bright, axis=(1, 2)) * float(_BIN**2)
+    centre = (size - 1) / 2.0
+    row = size * (bright.sum(axis=2) @ i) / total + centre
+    column = size * (bright.sum(axis=1) @ j) / total + centre
+    area = np.count_nonzero(bright, axis=(1, 2)) * float(size**2)
     return row, column, background, peak, area
 
 

@@ -13,10 +13,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from analysis.orbit.rational_polynomial import RationalPolynomial
 from twin.orbit.export.quality_run import compare_product
 from twin.orbit.export.rational_polynomial import sensor_polynomial
 from twin.orbit.measured.platform_files import read_scene
+from twin.validation.real.scenes import delivered_form, ground_segment_polynomials
 
 REAL = Path(os.environ.get("TWIN_REAL", Path(__file__).parents[3] / "shared" / "real"))
 needed = pytest.mark.skipif(
@@ -43,17 +43,6 @@ def test_spot_6_lies_where_its_file_says() -> None:
     assert not scene.read.inertial_velocity
 
 
-def polynomials(root: ET.Element) -> RationalPolynomial:
-    """The ground segment's polynomials of the same file; rows and columns count from 1."""
-    model = root.find("Geoposition/Rational_Sensor_Model/Global_RFM")
-    row, column = (
-        np.array(model.findtext(f"Inverse_Model/F_{name}").split(), float).reshape(2, 20) for name in ("ROW", "COL")
-    )
-    axes = [model.find(f"RFM_Validity/{name}") for name in ("Row", "Col", "Lat", "Lon", "Alt")]
-    scale, offset = (np.array([float(one.findtext(key)) for one in axes]) for key in "AB")
-    return RationalPolynomial(offset - [1.0, 1.0, 0.0, 0.0, 0.0], scale, *row, *column)
-
-
 @pytest.mark.second
 @needed
 def test_a_pleiades_scene_meets_its_own_polynomials(tmp_path: Path) -> None:
@@ -61,40 +50,11 @@ def test_a_pleiades_scene_meets_its_own_polynomials(tmp_path: Path) -> None:
     from 160 to 240 m."""
     folder = REAL / "pleiades"
     root = ET.parse(next(folder.glob("PHRDIMAP*.XML"))).getroot()
-    model = root.find("Geometric_Data/Sensor_Model_Characteristics")
-    size, span = root.find("Raster_Dimensions"), model.find("UTC_Sensor_Model_Range")
-    points = "".join(
-        f"<Point><LOCATION_XYZ>{p.findtext('LOCATION_VALUES')}</LOCATION_XYZ>"
-        f"<VELOCITY_XYZ>{p.findtext('VELOCITY_VALUES')}</VELOCITY_XYZ><TIME>{p.findtext('UTC_TIME')}</TIME></Point>"
-        for p in model.iterfind("Sensor_Ephemeris/Point_List/Point")
-    )
-    attitude = model.find("Sensor_Attitudes")
-    turns = "".join(ET.tostring(attitude.find(f"Polynomial_Models/Q{k}"), "unicode") for k in range(4))
-    viewing = model.find("Sensor_Viewing_Model")
-    looks = "".join(
-        f"<{new}_{k}>{value}</{new}_{k}>"
-        for old, new in (("PsiX", "XLOS"), ("PsiY", "YLOS"))
-        for k, value in enumerate(viewing.findtext(f"Viewing_Directions/{old}_Model/COEFFICIENTS").split())
-    )
     path = tmp_path / "DIM_SCENE.XML"
-    path.write_text(f"""<Dimap_Document>
-      <Metadata_Identification><METADATA_FORMAT version="2.15">DIMAP</METADATA_FORMAT>
-        <METADATA_PROFILE>PHR_SENSOR</METADATA_PROFILE></Metadata_Identification>
-      <Raster_Data><Raster_Dimensions><NROWS>{size.findtext("NROWS")}</NROWS><NCOLS>{size.findtext("NCOLS")}</NCOLS>
-      </Raster_Dimensions></Raster_Data>
-      <Geometric_Data><Refined_Model><Time><Time_Range><START>{span.findtext("START")}</START>
-        <END>{span.findtext("END")}</END></Time_Range>
-        <Time_Stamp><LINE_PERIOD unit="ms">{model.findtext("SENSOR_LINE_PERIOD")}</LINE_PERIOD></Time_Stamp></Time>
-      <Ephemeris><Point_List>{points}</Point_List></Ephemeris>
-      <Attitudes><Polynomial_Quaternions><OFFSET>{attitude.findtext("OFFSET")}</OFFSET>
-        <SCALE>{attitude.findtext("SCALE")}</SCALE>{turns}</Polynomial_Quaternions></Attitudes>
-      <Geometric_Calibration><Instrument_Calibration><Swath_Range>
-        <FIRST_COL>{viewing.findtext("Position_In_Retina/FIRST_COL")}</FIRST_COL></Swath_Range>
-        <Polynomial_Look_Angles>{looks}</Polynomial_Look_Angles></Instrument_Calibration></Geometric_Calibration>
-      </Refined_Model></Geometric_Data></Dimap_Document>""")
+    path.write_text(delivered_form(root))
     scene = read_scene(path)
     assert scene.read.inertial_velocity
-    found = compare_product(scene.sensor, polynomials(root), str(path))
+    found = compare_product(scene.sensor, ground_segment_polynomials(root), str(path))
     assert found.heights == (160.0, 240.0)
     # the fit of the polynomials themselves: 0.0104 px by the product
     assert found.largest < 0.0125

@@ -22,6 +22,7 @@ from optics.numerics.number_tree import FrozenMap
 from scenes.yaml.errors import Problem, shown
 from scenes.yaml.spec import Number, Spec, Text
 from twin.framework.artefact import plain, significant
+from twin.validation.row_names import REAL
 
 FARTHEST = 100.0
 """Largest factor on an input, chosen because the paper does not print it, up to which the limit of its range is
@@ -231,7 +232,7 @@ def sentence(text: str, facts: Mapping[str, Any]) -> str:
 
 Verdict = Literal[
     "confirmed", "reproduced", "consistent", "confirmed with correction", "refuted", "undecided", "not checkable",
-    "failed",
+    "failed", "skipped",
 ]  # fmt: skip
 CONFIRMED: Verdict = "confirmed"
 REPRODUCED: Verdict = "reproduced"
@@ -241,6 +242,7 @@ REFUTED: Verdict = "refuted"
 UNDECIDED: Verdict = "undecided"
 NOT_CHECKABLE: Verdict = "not checkable"
 FAILED: Verdict = "failed"
+SKIPPED: Verdict = "skipped"
 VERDICTS: dict[Verdict, str] = {
     CONFIRMED: "The simulation gives the printed value or finds the printed statement to hold, within the check's "
     "tolerance plus three sigma, with inputs that were not chosen for it: it could have failed.",
@@ -255,6 +257,7 @@ VERDICTS: dict[Verdict, str] = {
     "would have passed as well.",
     NOT_CHECKABLE: "The paper does not print what a comparison needs; the reason is given.",
     FAILED: "The check could not be computed; this says nothing about the paper.",
+    SKIPPED: "The measured data that the row needs are absent.",
 }
 """Verdict of a check -> its meaning in words."""
 
@@ -267,8 +270,9 @@ PAPERS = {
     "003": "Mo et al. (2015), doi 10.3969/J.ISSN.1672-7274.2015.06.003",
     "004": "Li et al., Infrared and Laser Engineering, doi 10.3788/IRLA20200143",
     "017": "Wang Renxiang, Acta Geodaetica et Cartographica Sinica 46(3) 332 (2017)",
+    REAL: "Measured data of other projects, and what they print of it",
 }
-"""Number of each source paper -> its citation."""
+"""Number of each source paper, or `REAL` -> its citation."""
 
 Comparison = Literal["two-sided", "at most", "at least"]
 Basis = Literal["printed", "chosen", "theory"]
@@ -366,10 +370,10 @@ class CheckResult:
             object.__setattr__(self, name, float(value))
         if (self.sigma is not None and self.sigma < 0) or self.seconds < 0:
             raise ValueError(f"{self.id}: sigma and seconds cannot be negative")
-        if (self.measured is None) != (self.verdict in (FAILED, NOT_CHECKABLE)):
+        if (self.measured is None) != (self.verdict in (FAILED, NOT_CHECKABLE, SKIPPED)):
             raise ValueError(
-                f"{self.id}: a measured value goes with every verdict but {FAILED!r} and {NOT_CHECKABLE!r}, and with "
-                "no other"
+                f"{self.id}: a measured value goes with every verdict but {FAILED!r}, {NOT_CHECKABLE!r} and "
+                f"{SKIPPED!r}, and with no other"
             )
 
     @property
@@ -597,6 +601,10 @@ class Check(Spec):
     def failed(self, why: str) -> CheckResult:
         """Return the result of a check that could not be computed."""
         return self._result(None, None, FAILED, f"Could not be computed: {why}")
+
+    def skipped(self, why: str) -> CheckResult:
+        """Return the result of a check whose measured data are absent."""
+        return self._result(None, None, SKIPPED, why)
 
     def without_comparison(self) -> CheckResult:
         """Return the result of a check for which the paper does not print what a comparison needs."""

@@ -26,7 +26,7 @@ from twin.framework.artefact import Artefact, Cell, Data, PngFigure, SvgFigure, 
 from twin.framework.svg import look, new_figure, plain_axes, to_svg
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.validation.check import Check, CheckResult, Chosen, Supposed, sentence
-from twin.validation.row_names import FILE, FOLDER, matches
+from twin.validation.row_names import FILE, FOLDER, REAL, matches
 
 
 class ArtefactText(Spec):
@@ -61,6 +61,8 @@ class Context:
         Function that takes the fraction of the group's work that is done, and the name of the present work.
     folder : Path or None
         Folder for files of the group, which the report lists; None if nothing is written.
+    real : Path
+        Folder of the measured data of others.
     experiments : dict of str to MonitorExperiment
         Monitoring experiments by instrument, shared by all groups.
     texts : mapping of str to ArtefactText
@@ -76,6 +78,7 @@ class Context:
     fast: bool = False
     report_progress: Callable[[float, str], None] = lambda fraction, text: None
     folder: Path | None = None
+    real: Path = Path()
     experiments: dict[str, MonitorExperiment] = field(default_factory=dict)
     texts: Mapping[str, ArtefactText] = FrozenMap()
     artefacts: list[Artefact] = field(default_factory=list)
@@ -361,14 +364,14 @@ def load_printed(paper: str) -> Printed:
     Parameters
     ----------
     paper : str
-        Number of the paper, for instance "001".
+        Number of the paper, for instance "001", or `REAL`.
 
     Raises
     ------
     InputError
         There is no file of that paper, or it cannot be read.
     """
-    return Printed(read_yaml(FOLDER / f"paper_{paper}" / FILE))
+    return Printed(read_yaml(FOLDER / (paper if paper == REAL else f"paper_{paper}") / FILE))
 
 
 def group_of(prefix: str, run: Run = lambda context: ()) -> CheckGroup:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 from optics.numerics.extension_table import ExtensionTable, entries
 from scenes.yaml.errors import nearest
 from scenes.yaml.named import Named
-from twin.validation.row_names import matches, names_in_files
+from twin.validation.row_names import REAL, matches, names_in_files
 
 if TYPE_CHECKING:  # all that the checks compute with
     from twin.validation.group import CheckGroup
@@ -34,6 +34,9 @@ _GROUPS = (
     Named("twin.validation.paper_004.distortion:GROUP"),
     Named("twin.validation.paper_004.distortion:FIGURES"),
     Named("twin.validation.paper_017.bundle:GROUP"),
+    Named("twin.validation.real.edges:GROUP"),
+    Named("twin.validation.real.scenes:GROUP"),
+    Named("twin.validation.real.spots:GROUP"),
 )
 """Module and name of each group of checks; a new group is added here."""
 
@@ -93,7 +96,7 @@ def select(groups: Sequence[CheckGroup], only: str | None) -> tuple[Selection, .
         All groups.
     only : str or None
         Prefixes separated by commas, each ending where a part of an id ends; further ids of a check count as well. None
-        selects everything.
+        selects the checks of all papers, without those of measured data.
 
     Raises
     ------
@@ -102,7 +105,8 @@ def select(groups: Sequence[CheckGroup], only: str | None) -> tuple[Selection, .
     """
     require_unique(groups)
     if only is None:
-        return tuple(Selection(group, frozenset(group.ids)) for group in groups)
+        papers = (group for group in groups if not matches(group.prefix, REAL))
+        return tuple(Selection(group, frozenset(group.ids)) for group in papers)
     prefixes = _known(only, [name for group in groups for check in group.checks for name in check.names])
     out = []
     for group in groups:

@@ -7,9 +7,11 @@ from pathlib import Path
 
 FILE = "printed.yaml"
 """Name of the file with the checks in each paper's folder."""
+REAL = "real"
+"""First part of the ids of checks against measured data; they run if the data's folder or their ids are given."""
 FOLDER = Path(__file__).parent
 """Folder that contains the papers' folders."""
-_ROW = re.compile(r"^      (\d{3}(?:\.\w+)+):$|^        also: \[(.*)\]$", re.M)
+_ROW = re.compile(r"^      ((?:\d{3}|real)(?:\.\w+)+):$|^        also: \[(.*)\]$", re.M)
 """Regular expression for a line with a check's key below ``groups``, or with its further ids."""
 
 
@@ -20,7 +22,7 @@ def names_in_files() -> list[str]:
     before the YAML is parsed, which takes a second.
     """
     ids: list[str] = []
-    for file in sorted(FOLDER.glob(f"paper_*/{FILE}")):
+    for file in sorted(FOLDER.glob(f"*/{FILE}")):
         for row_id, further in _ROW.findall(file.read_text("utf-8")):
             ids += [row_id] if row_id else [name.strip() for name in further.split(",")]
     return ids

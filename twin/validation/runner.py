@@ -14,7 +14,7 @@ from optics.numerics.backend import Backend
 from twin.framework.artefact import Artefact
 from twin.framework.provenance import versions
 from twin.monitor.monitor_experiment import MonitorExperiment
-from twin.validation.check import VERDICTS, CheckResult, Verdict
+from twin.validation.check import SKIPPED, VERDICTS, CheckResult, Verdict
 from twin.validation.group import CheckGroup, Context
 from twin.validation.registry import Selection
 
@@ -105,7 +105,8 @@ class Validation:
     def unexpected(self) -> tuple[tuple[CheckResult, Verdict], ...]:
         """Results whose verdict differs from the expected one, and the expected verdict, failed checks included."""
         expected = {check.id: check.expected for run in self.runs for check in run.group.checks}
-        return tuple((r, expected[r.id]) for r in self.results if r.verdict != expected[r.id])
+        found = (r for r in self.results if r.verdict != SKIPPED)
+        return tuple((r, expected[r.id]) for r in found if r.verdict != expected[r.id])
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain data for validation.json."""
@@ -155,6 +156,7 @@ def run_checks(
     fast: bool = False,
     progress: Progress = lambda done, text: None,
     folder: Path | None = None,
+    real: Path = Path(),
 ) -> Validation:
     """Run groups of checks one after the other.
 
@@ -174,6 +176,8 @@ def run_checks(
         Called whenever a group advances.
     folder : Path or None
         Open run folder; None if nothing is written.
+    real : Path
+        Folder of the measured data of others.
 
     Returns
     -------
@@ -187,7 +191,7 @@ def run_checks(
     for selection in selections:
         seconds = selection.group.rough_seconds(fast)
         advance = partial(_advance, progress, done, selection.group, seconds)
-        runs.append(_run_group(selection, backend, seed, fast, advance, folder, experiments))
+        runs.append(_run_group(selection, backend, seed, fast, advance, folder, experiments, real))
         done += seconds
     progress(done, "done")
     took = time.monotonic() - clock
@@ -207,6 +211,7 @@ def _run_group(
     advance: Callable[[float, str], None],
     folder: Path | None,
     experiments: dict[str, MonitorExperiment],
+    real: Path,
 ) -> GroupRun:
     group = selection.group
     group_folder = None if folder is None else folder / FILES / group.prefix
@@ -215,7 +220,7 @@ def _run_group(
     checks = {check.id: check for check in group.checks}
     results_by_id = {name: checks[name].without_comparison() for name in selection.ids if checks[name].not_checkable}
     wanted = selection.ids - set(results_by_id)
-    context = Context(backend, seed, wanted, checks, fast, advance, group_folder, experiments, group.artefacts)
+    context = Context(backend, seed, wanted, checks, fast, advance, group_folder, real, experiments, group.artefacts)
     begin = last = time.monotonic()
     why = "the group gave no result for it"
     advance(0.0, "start")

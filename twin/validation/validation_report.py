@@ -14,6 +14,7 @@ from twin.framework.page import links, report_page, reproduce
 from twin.framework.report import Report, Section, answer
 from twin.framework.run_folder import RunFolder, write_manifest
 from twin.validation.check import AGREED, PAPERS, SIGMAS, VERDICTS, CheckResult, Verdict
+from twin.validation.row_names import REAL
 from twin.validation.runner import GroupRun, Validation
 
 PROGRAM = "twin.validate"
@@ -32,6 +33,8 @@ def summary_files(validation: Validation) -> dict[str, bytes]:
         if isinstance(a, SvgFigure | PngFigure)
     }
     lines = [*_head(validation), *_tables(validation), *_chosen(validation), *_corrections(validation)]
+    if any(result.paper == REAL for result in validation.results):
+        lines += _measured_data(validation)
     if figures:
         lines += ["## Figures", ""]
     for name, artefact in figures.items():
@@ -41,7 +44,8 @@ def summary_files(validation: Validation) -> dict[str, bytes]:
 
 
 def _head(validation: Validation) -> Iterator[str]:
-    yield "# What the simulation says of the papers"
+    real = {r.paper for r in validation.results} == {REAL}
+    yield "# Measured data of others" if real else "# What the simulation says of the papers"
     yield ""
     took = duration_text(validation.seconds)
     yield f"Made by `{command(validation)}` in {took}; its validation.html has every row in full."
@@ -68,6 +72,9 @@ def _tables(validation: Validation) -> Iterator[str]:
         rows = [result for result in validation.results if result.paper == number]
         if not rows:
             continue
+        if number == REAL:
+            yield from _real_table(title, rows)
+            continue
         yield f"## Paper {number}: {title}"
         yield ""
         yield "| check | what is compared | claim | sides | measured | tolerance | finds | alternative | verdict |"
@@ -78,6 +85,36 @@ def _tables(validation: Validation) -> Iterator[str]:
             cells = (names, about, claim_text(r), comparison_text(r), _measured(r), *_limits(r), r.verdict)
             yield "| " + " | ".join(_cell(cell) for cell in cells) + " |"
         yield ""
+
+
+def _real_table(title: str, rows: Sequence[CheckResult]) -> Iterator[str]:
+    """Yield the lines of the table of rows on measured data."""
+    yield f"## {title}"
+    yield ""
+    yield "| row | statement | printed by others | measured here | sigma | verdict | what would have refuted it |"
+    yield "|---|---|---:|---:|---:|---|---|"
+    for r in rows:
+        unit = "" if r.unit == "1" or r.measured is None else f" {r.unit}"
+        refuted = ""
+        if r.power is not None and r.claim is not None:
+            side = {
+                "two-sided": "off by more than",
+                "at most": "above it by more than",
+                "at least": "below it by more than",
+            }
+            refuted = f"{side[r.comparison]} {plain(r.power, 2)}{unit} ({r.because}); the alternative, {r.against}, is "
+            refuted += f"{plain(r.tells or 0.0, 2)}{unit} away"
+        about = f"{r.equation}: {r.statement}"
+        cells = (f"`{r.id}`", about, claim_text(r), f"{measured_text(r)}{unit}", sigma_text(r), r.verdict, refuted)
+        yield "| " + " | ".join(_cell(cell) for cell in cells) + " |"
+    yield ""
+    yield "## Numbers of each row"
+    yield ""
+    for r in rows:
+        # the last line is the comparison, which the table has
+        lines = r.how.splitlines() if r.power is None else r.how.splitlines()[:-1]
+        yield from (f"- `{r.id}`: {_cell(' '.join(lines))}" for _ in lines[:1])
+    yield ""
 
 
 def _measured(result: CheckResult) -> str:
@@ -125,13 +162,42 @@ def _corrections(validation: Validation) -> Iterator[str]:
     yield ""
 
 
+def _measured_data(validation: Validation) -> Iterator[str]:
+    """Yield the lines with the tables of rows on measured data, the data's files, and the choices made on them."""
+    from twin.validation.group import load_printed
+    from twin.validation.real.data import published
+
+    tables = (a for run in validation.runs for a in run.artefacts if run.group.prefix.startswith(REAL))
+    for table in tables:
+        if not isinstance(table, Table):
+            continue
+        yield from (f"## {table.title}", "", table.caption, "")
+        yield "| " + " | ".join(table.heads) + " |"
+        yield "|" + "---|" * len(table.heads)
+        digits = table.decimals or (None,) * len(table.heads)
+        for row in table.rows:
+            cells = (
+                c if d is None or not isinstance(c, float) else fixed(c, d) for c, d in zip(row, digits, strict=True)
+            )
+            yield "| " + " | ".join(_cell(str(cell)) for cell in cells) + " |"
+        yield ""
+    yield from ("## Where the data are published", "")
+    yield "None of these files is part of the project; `--real DIR` names a folder that contains them."
+    yield from ("", "| file | published in | SHA-256 |", "|---|---|---|")
+    for name, (checksum, place) in published().items():
+        yield f"| `{name}` | {place} | `{checksum}` |"
+    yield from ("", "## Choices that were made on these files", "")
+    yield from (f"- {choice}" for choice in load_printed(REAL).content.data["choices"])
+    yield ""
+
+
 def _cell(text: str) -> str:
     """Escape text for a cell of a Markdown table."""
     return text.replace("|", "\\|").replace("\n", " ")
 
 
-_LOOKS = "confirmed", "reproduced", "consistent", "corrected", "refuted", "undecided", "silent", "failed"
-MARKS: dict[Verdict, tuple[str, str]] = dict(zip(VERDICTS, zip("=⊜∼≈≠±?✕", _LOOKS, strict=True), strict=True))
+_LOOKS = "confirmed", "reproduced", "consistent", "corrected", "refuted", "undecided", "silent", "failed", "silent"
+MARKS: dict[Verdict, tuple[str, str]] = dict(zip(VERDICTS, zip("=⊜∼≈≠±?✕–", _LOOKS, strict=True), strict=True))
 """Verdict -> its character and CSS class in the report; the character shows the meaning without colour."""
 
 
@@ -188,7 +254,12 @@ def _papers(validation: Validation) -> Iterator[Section]:
     for number, title in PAPERS.items():
         results = [result for result in validation.results if result.paper == number]
         if results:
-            yield Section(f"Paper {number}", (title,), (_paper_table(number, results),), name=f"paper-{number}")
+            yield Section(
+                "Measured data" if number == REAL else f"Paper {number}",
+                (title,),
+                (_paper_table(number, results),),
+                name=f"paper-{number}",
+            )
 
 
 def _paper_table(paper: str, results: Sequence[CheckResult]) -> Table:
