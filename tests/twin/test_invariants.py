@@ -96,7 +96,7 @@ def test_image_quality_that_cannot_be_is_none(backend, gf7_pair, monkeypatch) ->
     with pytest.raises(UnphysicalError, match="an MTF of the optics of camera forward: "):
         image_quality(gf7_pair, backend, [{}], (0.0,))
     monkeypatch.undo()
-    bench = quality._CameraBench(gf7_pair, "forward", backend, (0.0,), 650e-9, None)
+    bench = quality._CameraBench(gf7_pair, "forward", backend, (0.0,), None)
     good = np.array([[0.1], [0.05], [0.04], [1e-6], [0.3], [0.3]])
     bench._hold(good, np.zeros(1), None)
     for row, value, said in (

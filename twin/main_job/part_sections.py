@@ -26,7 +26,7 @@ from twin.main_job.render_files import DEFORMATION, HEATED_BODY
 from twin.main_job.render_results import JobRun, RenderRun
 from twin.main_job.result_sections import IN_PAGE, figure
 from twin.main_job.verdict import sharpness_lost
-from twin.monitor.image_quality import AT_FIELDS, POSITIONS, CameraQuality, ImageQuality
+from twin.monitor.image_quality import AT_FIELDS, POSITIONS, WAVELENGTH, CameraQuality, ImageQuality
 from twin.path_tracing.stray_light import FAMILY
 from twin.targets.target_images import DIRECTION_NAMES, DIRECTIONS
 from twin.targets.target_measurement import NYQUIST, BarReading, CameraTargets, EdgeReading, TargetRun
@@ -54,7 +54,7 @@ def quality_section(run: JobRun, drawn: Mapping[str, str]) -> Section | None:
     )
     caption = (
         "At fixed pixels of each line CCD, at its middle and at its left (+Y′) and right end. "
-        f"Wavefront errors are rms over the pupil at {plain(1e9 * quality.wavelength)} nm, without piston and tilt. "
+        f"Wavefront errors are rms over the pupil at {plain(1e9 * WAVELENGTH)} nm, without piston and tilt. "
         "Best focus is counted along the light: + is behind the CCD. The MTF with the pixel is that of the traced "
         "pupil over the named light, times the pixel's and, where the camera describes them, those of charge "
         "diffusion and TDI; `python -m twin.camera` has that of the optics alone. "

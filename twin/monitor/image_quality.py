@@ -236,8 +236,6 @@ class ImageQuality:
     ----------
     fields : (F,) tuple of float
         Field points, as fractions of half the line.
-    wavelength : float
-        Wavelength that is the unit of wavefront errors, in metres.
     cameras : mapping of str to CameraQuality
         Image quality by camera.
     obstruction : bool
@@ -245,7 +243,6 @@ class ImageQuality:
     """
 
     fields: tuple[float, ...]
-    wavelength: float
     cameras: Mapping[str, CameraQuality]
     obstruction: bool = True
 
@@ -347,7 +344,7 @@ QUALITY: Record[ImageQuality] = Record(
         "before", lambda quality: {"cameras": quality.state(0)}, "by camera, in the nominal state", record=_CAMERA
     ),
     Quantity("obstruction", lambda q: "traced" if q.obstruction else "ignore", "whether bodies in the beams count"),
-    Quantity("wavelength_nm", lambda quality: quality.wavelength, "unit of wavefront errors"),
+    Quantity("wavelength_nm", lambda quality: WAVELENGTH, "unit of wavefront errors"),
     Quantity(
         "fields", lambda quality: quality.fields, "field points as fractions of half the line, +1 at its left end"
     ),
@@ -363,7 +360,6 @@ def image_quality(
     backend: Backend,
     states: Sequence[State],
     fields: Sequence[float] = FIELDS,
-    wavelength: float = WAVELENGTH,
     obstruction: bool = True,
 ) -> ImageQuality:
     """Compute the image quality of every camera in every state.
@@ -378,8 +374,6 @@ def image_quality(
         S states, traced together.
     fields : sequence of float
         Field points from -1 to 1, as fractions of half the line, +1 at its left end (+Y').
-    wavelength : float
-        Wavelength that is the unit of wavefront errors, in metres.
     obstruction : bool
         True to include light blocked by bodies in the beams.
 
@@ -401,7 +395,7 @@ def image_quality(
     cameras = {}
     for name in instrument.cameras:
         shadows = shadow.imaging_shadows(instrument, name, backend) if obstruction else None
-        bench = _CameraBench(instrument, name, backend, tuple(fields), wavelength, shadows)
+        bench = _CameraBench(instrument, name, backend, tuple(fields), shadows)
         out = np.full((len(_COLUMNS), len(states), len(fields)), np.nan)
         reasons = [""] * len(states)
         for start in range(0, len(states), AT_ONCE):
@@ -414,7 +408,7 @@ def image_quality(
             pupils=tuple(bench.pupils.get(s, ()) for s in range(len(states))),
             **dict(zip(_COLUMNS, out, strict=True)),
         )
-    return ImageQuality(tuple(fields), wavelength, FrozenMap(cameras), obstruction)
+    return ImageQuality(tuple(fields), FrozenMap(cameras), obstruction)
 
 
 def quality_dicts(
@@ -474,13 +468,12 @@ class _CameraBench:
         name: str,
         backend: Backend,
         fields: tuple[float, ...],
-        wavelength: float,
         shadows: shadow.ImagingShadows | None,
     ) -> None:
         self.shadows = shadows
         self.pupils: dict[int, tuple[PupilOutline, ...]] = {}
         self._taken: list[tuple[np.ndarray, dict[str, np.ndarray]]] = []
-        self.instrument, self.name, self.backend, self.wavelength = instrument, name, backend, wavelength
+        self.instrument, self.name, self.backend = instrument, name, backend
         self.model = instrument.cameras[name]
         spec: CameraSpec = self.model.spec
         band = spec.bands[target_band(spec)] if spec.bands else None
@@ -627,7 +620,7 @@ class _CameraBench:
         focus = mean.flat(np.abs(rays.direction[..., 2]))
         defocus = mean(error * focus) / mean(focus**2)
         rest = error - defocus[:, None] * focus
-        wfe, refocused = (np.sqrt(np.maximum(mean(e**2), 0.0)) / self.wavelength for e in (error, rest))
+        wfe, refocused = (np.sqrt(np.maximum(mean(e**2), 0.0)) / WAVELENGTH for e in (error, rest))
         dark = np.mean((rays.amplitude == 0.0) & (True if free is None else free), axis=-1)
         mtf = np.full((2, len(dark)), np.nan)
         light_lost = np.zeros(len(dark))
@@ -637,7 +630,7 @@ class _CameraBench:
             light_lost[illuminated] = 1.0 - pupils.light
             if self.model.edges:
                 # the nodes for such a phase would take minutes, for almost no contrast
-                smooth &= wfe[illuminated] * self.wavelength <= MOST_BLUR * float(np.min(self.colours))
+                smooth &= wfe[illuminated] * WAVELENGTH <= MOST_BLUR * float(np.min(self.colours))
             good = np.flatnonzero(smooth & (pupils.bend <= WORST_BEND) & (pupils.light >= 1.0 - _DARKEST))
             if len(good):
                 if self.refracts:

@@ -285,7 +285,7 @@ def read(experiment: MonitorExperiment, light: Light, how: ObservationOptions) -
     return None
 
 
-def shared_detector(experiment: MonitorExperiment, frames: int, seed: int, stray: np.ndarray | float = 0.0) -> Record:
+def shared_detector(experiment: MonitorExperiment, frames: int, seed: int) -> Record:
     """Return a `Record` function that exposes all states with the same detectors.
 
     Changes are relative to one measurement of the nominal state.
@@ -298,10 +298,8 @@ def shared_detector(experiment: MonitorExperiment, frames: int, seed: int, stray
         Number of frames of each exposure.
     seed : int
         Seed of the detectors and all noise; each state has its own random stream.
-    stray : ndarray | float
-        Photons per pixel and frame added to those of the nominal spots.
     """
-    before = experiment.frames_before(frames, seed, stray)
+    before = experiment.frames_before(frames, seed)
     return lambda photons, numbers: (before, experiment.frames_after(photons, frames, seed, numbers))
 
 

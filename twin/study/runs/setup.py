@@ -112,11 +112,11 @@ class StudySetup:
                     return name, ("factors", name, *where)
         return None
 
-    def blamed(self, error: InputError, prefix: KeyPath = ()) -> InputError:
+    def blamed(self, error: InputError) -> InputError:
         """Return an error in the base job's data with its position at the factor that caused it, if there is one."""
         issues = []
         for issue in error.issues:
-            factor = self.factor_at((*prefix, *issue.key))
+            factor = self.factor_at(issue.key)
             if factor is not None:
                 text = f"{issue.problem} (at {key_text(issue.key)} of the base)"
                 issue = self._placed(replace(issue, problem=text), factor[1])
