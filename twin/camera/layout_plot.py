@@ -50,32 +50,16 @@ def layout_figure(model: CameraModel, backend: Backend) -> Figure:
 def _measure(axes: Axes, across: np.ndarray, along: np.ndarray) -> None:
     """Write the overall length and height of the parts in a view, with arrows from end to end, metres."""
     (left, right), (low, high) = axes.get_xlim(), axes.get_ylim()
-    place = low + 0.03 * (high - low), right - 0.012 * (right - left)
-    for start, end, text, where in (
-        ((along[0], place[0]), (along[1], place[0]), plain(float(np.ptp(along)), 4), (0.5 * np.sum(along), place[0])),
-        (
-            (place[1], across[0]),
-            (place[1], across[1]),
-            plain(float(np.ptp(across)), 4),
-            (place[1], 0.5 * np.sum(across)),
-        ),
-    ):
-        axes.annotate(
-            "", start, end, arrowprops={"arrowstyle": "<->", "color": GREY, "lw": 0.7, "shrinkA": 0, "shrinkB": 0}
+    below, beside = low + 0.03 * (high - low), right - 0.012 * (right - left)
+    for upright, ends in ((0, [(end, below) for end in along]), (90, [(beside, end) for end in across])):
+        x, y = np.mean(ends, axis=0)
+        text = f"{plain(float(np.linalg.norm(np.diff(ends, axis=0))), 4)} m"
+        style = {"arrowstyle": "<->", "color": GREY, "lw": 0.7, "shrinkA": 0, "shrinkB": 0}
+        axes.annotate("", ends[0], ends[1], arrowprops=style)
+        label = axes.text(
+            float(x), float(y), text, rotation=upright, ha="center", va="center", fontsize=7.5, color=GREY
         )
-        upright = 90 if start[0] == end[0] else 0
-        box = {"facecolor": "white", "edgecolor": "none", "pad": 0.6}
-        axes.text(
-            float(where[0]),
-            float(where[1]),
-            f"{text} m",
-            rotation=upright,
-            ha="center",
-            va="center",
-            fontsize=7.5,
-            color=GREY,
-            bbox=box,
-        )
+        label.set_bbox({"facecolor": "white", "edgecolor": "none", "pad": 0.6})
 
 
 def _fields(axis: int) -> list[tuple[float, float]]:
