@@ -31,11 +31,11 @@ from twin.monitor.image_quality import MOST_BLUR
 
 DESIGN, FIELD = "design", "field"
 """First parts of the names of knobs: of the camera's prescription, and of the field point."""
-RANGE_WAVES = 3.0
+RANGE_WAVES = 2.0
 """Change of the wavefront at the middle of the field at the end of a slider, waves rms, where the camera allows it."""
 MAP_POINTS, FREQUENCIES, PIXELS = 49, 33, 80
 """Points of a wavefront map on each side, frequencies of an MTF, pixels of a point image on each side."""
-PSF_HALF, MOST_PHASE, EVEN = 4.0, 150.0, 3000
+PSF_HALF, MOST_PHASE, EVEN = 4.0, 250.0, 3000
 """Half width of a sharp point image in wavelengths over the numerical aperture, largest phase in radians between chief
 ray and stop's edge in the picture of a wider one, and smallest number of rays of a vignetted stop.
 """
@@ -305,7 +305,7 @@ def point_image(optics: CameraOptics, field: Field, spot: Spot, places: np.ndarr
         raise ValueError(
             f"the light spreads over {width:.3g} \N{MICRO SIGN}m; the spot shows where, waves only a sharper image"
         )
-    nodes = quadrature.disk_for(1.5 * phase)
+    nodes = quadrature.disk_for(1.3 * phase)
     if optics.model.edges:
         nodes = quadrature.even_disk(max(EVEN, 2 * nodes.count))
     rays = optics.rays([field], INSIDE * np.concatenate([[[0.0, 0.0]], np.stack([nodes.x, nodes.y], axis=-1)]))
