@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 PROGRAMS = {
     "render": ("twin.render", "perturb an instrument, render its images, recover the changes"),
-    "new": ("twin.new", "write a commented file for your camera: camera, job, tolerance, study, asbuilt, operation"),
+    "new": ("twin.new", "commented files: camera, job, tolerance, study, asbuilt, instrument, operation"),
     "recover": ("twin.recover", "recover the changes from measured frames"),
     "live": ("twin.live", "the twin in a browser: move a slider, the spots follow"),
     "lab": ("twin.lab", "laboratory tests: focus, distortion, turntable"),

@@ -117,7 +117,7 @@ class CameraNumbers:
 
     @property
     def single(self) -> bool:
-        """Whether the camera has one element only."""
+        """True if the camera has one element only."""
         return len(self.elements) == 1
 
     @property
@@ -297,7 +297,7 @@ class CameraNumbers:
 
     @property
     def fits_monitor(self) -> bool:
-        """Whether a monitor can have the camera as it is: mirrors M1, M2, ... without planes and edges.
+        """True if a monitor can have the camera as it is: mirrors M1, M2, ... without planes and edges.
 
         Raises
         ------
