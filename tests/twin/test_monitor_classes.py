@@ -64,7 +64,9 @@ def test_both_classes_are_right_at_their_border(setup, number: int) -> None:
     # one and the same state in both classes: no step where they meet
     steps = [
         path.light_per_pixel[:, None, None]
-        * path.response.apply(image(one.fields([inner]), *(path.grid(axis, path.response.half_width) for axis in (1, 0))))
+        * path.response.apply(
+            image(one.fields([inner]), *(path.grid(axis, path.response.half_width) for axis in (1, 0)))
+        )
         for one in (path.class_beams(number), path.class_beams(number + 1))
     ]
     assert np.max(np.abs(steps[0] - steps[1])[:, None] / peak[0][:, None]) < ACCURACY

@@ -277,7 +277,7 @@ def test_what_contradicts_the_plan_is_in_the_numbers(filter_result: FilterResult
 
 def test_what_is_told_of_requirements(filter_result: FilterResult) -> None:
     one = RequirementStatus("forward d_f_um", "µm", 20.0, 0.95, 0.12, False, filter_result.time)
-    soon = replace(one, exceedance_now=0.01, holds_now=True, breaks_us=filter_result.time + 3 * DAY)
+    soon = replace(one, chance_now=0.01, holds_now=True, breaks_us=filter_result.time + 3 * DAY)
     never = replace(soon, breaks_us=None)
     assert list(told_of(replace(clean(filter_result), requirements=(one, soon, never)))) == [
         ("broken", "Δf of forward exceeds 20 µm with a probability of 12 %; 5.0 % is allowed"),

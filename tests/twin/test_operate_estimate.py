@@ -270,7 +270,7 @@ def test_a_requirement_that_is_going_to_break(known, tmp_path) -> None:
     now = estimate.filter_readings().now
     column = [one.name for one in estimate.forecast([]).quantities].index("intersection_angle change_arcsec")
     chance = beyond(now.values[0, column], now.sigmas[0, column], 30.0)
-    assert found.exceedance_now == pytest.approx(float(chance))
+    assert found.chance_now == pytest.approx(float(chance))
     tight = known[0].operation.requirements[0].model_copy(update={"limit": "1 mas"})
     plan = known[0].model_copy(update={"operation": known[0].operation.model_copy(update={"requirements": (tight,)})})
     (found,) = Operation(estimate.history, plan).filter_readings().requirements

@@ -308,7 +308,7 @@ def _required_cells(overview: Overview, quantity: Quantity) -> list[Cell]:
     style = "text" if requirement.holds_now else "text wrong"
     return [
         f"±{requirement.limit:g}",
-        percent(requirement.exceedance_now).removesuffix(" %"),
+        percent(requirement.chance_now).removesuffix(" %"),
         percent(1.0 - requirement.probability).removesuffix(" %"),
         Marked("yes" if requirement.holds_now else "no", look=style, key=quantity.name),
         when if requirement.holds_now else "violated",

@@ -392,7 +392,7 @@ def show_requirements(result: FilterResult, console: Console) -> None:
             [
                 name_of(requirement.quantity, result.now.quantities),
                 f"{plain(requirement.limit)} {requirement.unit}",
-                percent(requirement.exceedance_now),
+                percent(requirement.chance_now),
                 percent(1.0 - requirement.probability),
                 "yes" if requirement.holds_now else "no",
                 utc_text(requirement.breaks_us)

@@ -330,9 +330,9 @@ class Overview:
         if not requirements:
             return "The plan states no requirement"
         broken = [requirement for requirement in requirements if not requirement.holds_now]
-        worst = max(requirements, key=lambda status: status.exceedance_now / (1.0 - status.probability))
+        worst = max(requirements, key=lambda status: status.chance_now / (1.0 - status.probability))
         which = f"{self._now(worst)}, limit {_limit(worst)} (exceeded with a probability of "
-        which += f"{percent(worst.exceedance_now)}; {percent(1.0 - worst.probability)} is allowed)"
+        which += f"{percent(worst.chance_now)}; {percent(1.0 - worst.probability)} is allowed)"
         if len(requirements) == 1:
             return f"The requirement {'does not hold' if broken else 'holds'}: {which}"
         if broken:

@@ -190,7 +190,7 @@ class RequirementStatus(_Dated):
         Limit of the absolute change.
     probability : float
         Required probability that the change is within the limit.
-    exceedance_now : float
+    chance_now : float
         Probability that the limit is exceeded now.
     holds_now : bool
         True if the requirement is met now.
@@ -203,7 +203,7 @@ class RequirementStatus(_Dated):
     unit: str
     limit: float
     probability: float
-    exceedance_now: float
+    chance_now: float
     holds_now: bool
     breaks_us: int | None
 
@@ -496,9 +496,7 @@ def _of_requirement(requirement: RequirementStatus, time: int, quantities: Seque
     name, allowed = name_of(requirement.quantity, quantities), percent(1.0 - requirement.probability)
     limit = f"{plain(requirement.limit)} {requirement.unit}"
     if not requirement.holds_now:
-        text = (
-            f"{name} exceeds {limit} with a probability of {percent(requirement.exceedance_now)}; {allowed} is allowed"
-        )
+        text = f"{name} exceeds {limit} with a probability of {percent(requirement.chance_now)}; {allowed} is allowed"
         return Alarm(BROKEN, requirement.quantity, time, text, requirement.to_dict())
     assert requirement.breaks_us is not None
     since = utc_text(requirement.breaks_us)
