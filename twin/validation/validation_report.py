@@ -56,6 +56,8 @@ def _head(validation: Validation) -> Iterator[str]:
         if validation.counts[verdict]:
             yield f"| {verdict} | {validation.counts[verdict]} | {meaning} |"
     yield ""
+    if real:
+        return
     yield (
         "**Claim**: what the paper prints, or in brackets what its statement implies. **Tolerance**: how far claim and "
         "measurement may be apart without the noise, and why. **Finds**: the smallest error of the statement that the "
