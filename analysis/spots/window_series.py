@@ -13,9 +13,10 @@ specified, maximise the restricted likelihood of the pixels (Rasmussen and Willi
 Learning, 2006, sec. 5.4; Patterson and Thompson, Biometrika 58, 545 (1971)).
 
 Positions, fluxes and backgrounds of all frames follow by generalised least squares, linearised about the shape of the
-last iteration. This is the joint maximum of positions and shape, so the covariance contains what the unknown shape
-adds: little for the difference of two frames in which the spot has the same phase on the pixels. The mean position is by
-definition that of the Gaussian that fits all frames best, and the covariance is that of positions relative to it.
+last iteration. This is the joint maximum of positions and shape, so that the covariance contains what the unknown
+shape adds: little for the difference of two frames in which the spot has the same phase on the pixels. The mean
+position is by definition that of the Gaussian that fits all frames best; the covariance is that of positions relative
+to it.
 
 Pixel coordinates: (row, column), the centre of the first pixel is (0, 0).
 """

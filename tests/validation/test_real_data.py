@@ -10,7 +10,7 @@ import twin.validate as command
 from tests.twin.commands import invoke
 from twin.validation import registry
 from twin.validation.check import SKIPPED
-from twin.validation.real.data import notes, published
+from twin.validation.measured_data import notes, published
 from twin.validation.row_names import names_in_files
 from twin.validation.runner import run_checks
 

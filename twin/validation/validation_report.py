@@ -167,7 +167,7 @@ def _corrections(validation: Validation) -> Iterator[str]:
 def _measured_data(validation: Validation) -> Iterator[str]:
     """Yield the lines with the tables of rows on measured data, the data's files, and the choices made on them."""
     from twin.validation.group import load_printed
-    from twin.validation.real.data import published
+    from twin.validation.measured_data import published
 
     tables = (a for run in validation.runs for a in run.artefacts if run.group.prefix.startswith(REAL))
     for table in tables:
