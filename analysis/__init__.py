@@ -117,8 +117,8 @@ if TYPE_CHECKING:
     from analysis.spots.noise import NoiseModel
     from analysis.spots.photon_transfer import PhotonTransfer, photon_transfer
     from analysis.spots.spot_fit import SpotFit, fit_spot
-    from analysis.spots.window_series import SeriesPrior, WindowSeries, fit_window_series
     from analysis.spots.spot_template import SpotTemplate
+    from analysis.spots.window_series import SeriesPrior, WindowSeries, fit_window_series
     from analysis.statistics import proportion_interval, robust_sigma
     from analysis.turntable.dividing_error import AngleFit, chauvenet, fit_dividing_error
     from analysis.wavefront_maps.pupil_fit import MapFit, Pupil, find_pupil, fit_wavefront_map

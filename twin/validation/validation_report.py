@@ -56,6 +56,8 @@ def _head(validation: Validation) -> Iterator[str]:
         if validation.counts[verdict]:
             yield f"| {verdict} | {validation.counts[verdict]} | {meaning} |"
     yield ""
+    if real:
+        return
     yield (
         "**Claim**: what the paper prints, or in brackets what its statement implies. **Tolerance**: how far claim and "
         "measurement may be apart without the noise, and why. **Finds**: the smallest error of the statement that the "
@@ -165,7 +167,7 @@ def _corrections(validation: Validation) -> Iterator[str]:
 def _measured_data(validation: Validation) -> Iterator[str]:
     """Yield the lines with the tables of rows on measured data, the data's files, and the choices made on them."""
     from twin.validation.group import load_printed
-    from twin.validation.real.data import published
+    from twin.validation.measured_data import published
 
     tables = (a for run in validation.runs for a in run.artefacts if run.group.prefix.startswith(REAL))
     for table in tables:

@@ -15,7 +15,7 @@ from analysis.mtf.slanted_edge import EdgeMtf
 from twin.framework.svg import AFTER, BEFORE, INK
 from twin.validation.check import CheckResult
 from twin.validation.group import Context, drawing, group_of, load_printed
-from twin.validation.real.data import on_files
+from twin.validation.measured_data import on_files
 
 IMAGES = {"colour": "Test_edge1.tif", "mono": "Test_edge1_mono.tif"}
 ORDERS = (1, 5)

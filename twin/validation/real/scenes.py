@@ -24,7 +24,7 @@ from twin.orbit.measured.orbit_files import read_oem
 from twin.orbit.measured.platform_files import read_scene
 from twin.validation.check import CheckResult
 from twin.validation.group import Context, drawing, group_of, load_printed
-from twin.validation.real.data import on_files
+from twin.validation.measured_data import on_files
 
 EFFECTS: Mapping[str, LightEffects] = {
     "rpc": NO_EFFECTS,

@@ -21,7 +21,7 @@ from analysis.spots.window_series import CAUSES, WindowSeries, fit_window_series
 from twin.framework.svg import AFTER, BEFORE, INK
 from twin.validation.check import CheckResult, mean_of
 from twin.validation.group import Context, drawing, group_of, load_printed
-from twin.validation.real.data import on_files
+from twin.validation.measured_data import on_files
 
 PIXEL_ARCSEC = 5.0
 """Size of a pixel of the camera on the sky, arcseconds."""
