@@ -293,7 +293,7 @@ _PROCEDURES: dict[str, Procedure] = {
         setup="scenes.specs.orbit.setup:MatchSetup",
         measured=("scenes.specs.orbit.setup:RationalMatchSetup",),
         run="twin.orbit.matching.match_run:run_match",
-        numbers="twin.orbit.matching.match_run:MATCH",
+        numbers="twin.orbit.matching.match_run:match_numbers",
         report="twin.orbit.matching.match_report:match_report",
         export="twin.orbit.matching.match_run:exported",
         judged=False,
@@ -301,6 +301,8 @@ _PROCEDURES: dict[str, Procedure] = {
         about="""
     Measure points in a user's line images: distinct points of an orthophoto with heights of an elevation model, and
     tie points, are located in every image by least squares matching, as in a simulated patch.
+
+    A file with `images:` that have rational polynomials, without a camera, gives tie points between them.
 
     match.json holds for every line the number of matched points and how they were matched. With `--export DIR` they are
     written with orbit, attitude and line times to a folder that `twin.orbit calibrate` reads.
