@@ -170,8 +170,8 @@ def assembled(block: Block, datum: bool = False) -> Assembly:
     changes, units, size = _cameras(block, priors, size)
     for image in block.model_scenes:
         columns = size + np.arange(2 * len(image.sigma)).reshape(2, -1)
-        for k, term in enumerate(image.sigma):
-            priors.append(PriorGroup(term, columns[:, k], _unit(2), np.zeros(2)))
+        for k, name in enumerate(image.sigma):
+            priors.append(PriorGroup(name, columns[:, k], _unit(2), np.zeros(2)))
         changes[image.name], units[image.name] = columns.ravel(), np.array(list(image.sigma.values())).T.ravel()
         size += columns.size
     common = np.zeros(0, np.intp)

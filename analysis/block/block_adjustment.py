@@ -80,7 +80,9 @@ def intersected(block: Block) -> Array:
         The block cannot be adjusted.
     """
     reduction = assembled(pruned(block)).reduction
-    state = State(np.zeros(reduction.size), block.points.start, tuple(np.ones(len(s.point)) for s in reduction.sets), {})
+    state = State(
+        np.zeros(reduction.size), block.points.start, tuple(np.ones(len(s.point)) for s in reduction.sets), {}
+    )
     for _ in range(_STEPS):
         equations = reduction.eliminated(state)
         state = replace(state, ground=state.ground + equations.start)
@@ -256,8 +258,7 @@ def accepted_block(adjustment: BlockAdjustment) -> Block:
     block, sets = adjustment.assembly.block, adjustment.assembly.reduction.sets
     keep = {packets.name: weight > SETTLED for packets, weight in zip(sets, adjustment.weight, strict=True)}
     scenes = tuple(
-        s.taken(keep[s.name]) if s.name in keep and not s.name.endswith(" laser") else s
-        for s in block.scenes
+        s.taken(keep[s.name]) if s.name in keep and not s.name.endswith(" laser") else s for s in block.scenes
     )
     footprints = tuple(f.taken(keep[f"{f.of} laser"]) for f in block.footprints)
     points = block.points
@@ -452,7 +453,7 @@ class _Problem:
     def weighed(
         self, state: _AdjustmentState, weight: tuple[Array, ...], factor: Mapping[str, float]
     ) -> _AdjustmentState:
-        """Return the state with new weights, zero at points that fewer than three equations determine, now or before."""
+        """Return the state with new weights, zero at points that fewer than three equations determined."""
         # the residuals of a point that has lost its observations are zero and do not speak for these
         lost = (_rows_left(self.assembly, weight) < 3) | (_rows_left(self.assembly, state.weight) < 3)
         sets = self.assembly.reduction.sets

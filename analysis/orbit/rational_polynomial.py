@@ -27,6 +27,8 @@ _POWERS = np.array(
     ]
 )
 """Powers of longitude, latitude and height in the order of RPC00B."""
+_AXES = (1, 0, 2)
+"""Positions of longitude, latitude and height among scaled latitude, longitude and height."""
 _ROUNDS = 6
 """Number of reweighted least-squares solutions; the weights are the inverse denominators."""
 _RANK = 1e-11
@@ -279,20 +281,32 @@ def _checked_points(image: ArrayLike, ground: ArrayLike) -> Array:
 
 def _monomials(unit: Array) -> Array:
     """Return the 20 monomials (..., 20) of scaled latitude, longitude and height (..., 3)."""
-    powers = [np.stack([np.ones_like(one), one, one**2, one**3]) for one in (unit[..., 1], unit[..., 0], unit[..., 2])]
-    return np.stack([powers[0][a] * powers[1][b] * powers[2][c] for a, b, c in _POWERS], axis=-1)
+    return _products(*(_powers(unit[..., k]) for k in _AXES))
 
 
 def _monomial_slopes(unit: Array) -> Array:
     """Return the derivatives (..., 3, 20) of the monomials with respect to scaled latitude, longitude and height."""
-    order = (unit[..., 1], unit[..., 0], unit[..., 2])
-    powers = [np.stack([np.ones_like(one), one, one**2, one**3]) for one in order]
-    slopes = [np.stack([np.zeros_like(one), np.ones_like(one), 2.0 * one, 3.0 * one**2]) for one in order]
-    by_axis = []
-    for axis in (1, 0, 2):
-        factors = [slopes[k] if k == axis else powers[k] for k in range(3)]
-        by_axis.append(np.stack([factors[0][a] * factors[1][b] * factors[2][c] for a, b, c in _POWERS], axis=-1))
-    return np.stack(by_axis, axis=-2)
+    powers = [_powers(unit[..., k]) for k in _AXES]
+    slopes = [power[..., [0, 0, 1, 2]] * [0.0, 1.0, 2.0, 3.0] for power in powers]
+    return np.stack(
+        [
+            _products(powers[0], slopes[1], powers[2]),
+            _products(slopes[0], powers[1], powers[2]),
+            _products(powers[0], powers[1], slopes[2]),
+        ],
+        axis=-2,
+    )
+
+
+def _powers(value: Array) -> Array:
+    """Return the powers 0 to 3 of values (...), (..., 4)."""
+    square = value * value
+    return np.stack([np.ones_like(value), value, square, square * value], axis=-1)
+
+
+def _products(longitude: Array, latitude: Array, height: Array) -> Array:
+    """Return products (..., 20) of powers (..., 4) of the three coordinates, in the order of RPC00B."""
+    return longitude[..., _POWERS[:, 0]] * latitude[..., _POWERS[:, 1]] * height[..., _POWERS[:, 2]]
 
 
 def _best(

@@ -62,7 +62,9 @@ class Bench:
         rows = ["point,image,line,sample,line_sigma,sample_sigma"]
         for name, values in self.places.items():
             (folder / f"{name}_RPC.TXT").write_text(self.images[name].polynomial.text())
-            rows += [f"p{int(k)},{name},{line!r},{sample!r},{self.sigma},{self.sigma}" for k, line, sample in values.tolist()]
+            rows += [
+                f"p{int(k)},{name},{line!r},{sample!r},{self.sigma},{self.sigma}" for k, line, sample in values.tolist()
+            ]
         (folder / "points.csv").write_text("\n".join(rows) + "\n")
         text = {"name": "block", "images": {name: {"rpc": f"{name}_RPC.TXT"} for name in self.images}, **keys}
         text |= {"image_points": "points.csv", "errors": errors}

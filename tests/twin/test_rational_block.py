@@ -73,7 +73,9 @@ def test_it_is_the_least_squares_solution_of_all_unknowns_together(tmp_path: Pat
     assert np.abs((joint - covariance[:first, :first]) / limits).max() < 1e-6
     ground = one.ground + x[first:].reshape(-1, 3)
     assert np.abs(run.adjustment.ground - ground).max() < 1e-6 * sigma[first:].min() + 2e-9  # rounding of 6e6 m
-    blocks = np.array([covariance[first + 3 * k : first + 3 * k + 3, first + 3 * k : first + 3 * k + 3] for k in range(25)])
+    blocks = np.array(
+        [covariance[first + 3 * k : first + 3 * k + 3, first + 3 * k : first + 3 * k + 3] for k in range(25)]
+    )
     assert np.allclose(run.adjustment.point_covariance(np.arange(25)), blocks, rtol=1e-6, atol=1e-6 * blocks.max())
     assert run.adjustment.chi_square == pytest.approx(float(residual @ residual), rel=1e-6)
 
@@ -96,15 +98,38 @@ def test_corrections_and_points_scatter_as_their_sigmas_say(tmp_path: Path) -> N
     assert min(chances) > 1e-3
 
 
-def test_gross_errors_are_rejected_and_named(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("column", "size", "rejected"),
+    [
+        (2, 3.0, (("p7", "second"),)),
+        # along the common direction of the looks, three images do not say which one is wrong: the point is lost
+        (1, 100.0, (("p7", "first"), ("p7", "second"), ("p7", "third"))),
+    ],
+)
+def test_gross_errors_are_rejected_and_named(
+    tmp_path: Path, column: int, size: float, rejected: tuple[tuple[str, str], ...]
+) -> None:
     one = bench({"shift": 5.0})
-    one.places["second"][7, 2] += 30.0
+    one.places["second"][7, column] += size
     run = adjusted(one.write(tmp_path, {"shift": [5.0, 5.0]}))
-    assert run.rejected == (("p7", "second"),)
+    assert run.rejected == rejected
     assert run.adjustment.p_value > 1e-3
     assert max(image.rms_after.max() for image in run.images.values()) < 0.25
     assert min(image.rms_before.max() for image in run.images.values()) > 0.5
     assert any("p7 in second" in text for text in ADJUST.report(run).warnings)
+
+
+def test_another_program_projects_alike() -> None:
+    """Numbers of rpcm 1.4.10 (centreborelli, PyPI) for the polynomials of the bench: projection of longitude 5.503,
+    latitude 42.998, height 520 m to column and row, and localisation of column 400.25, row 1700.5, height 180 m."""
+    model = polynomial((0.25, 0.05))
+    line, sample = model.image(42.998, 5.503, 520.0)
+    assert abs(sample - 1499.9981015616133) < 1e-6
+    assert abs(line - 1383.976895379632) < 1e-6
+    latitude, longitude = model.ground(1700.5, 400.25, 180.0)
+    # 1e-6 px of 0.5 m are 5e-12 deg; rpcm's own localisation ends at 1e-2 px
+    assert abs(latitude - 42.99733907725773) < 1e-7
+    assert abs(longitude - 5.49645287415568) < 1e-7
 
 
 def test_what_is_exported_says_the_same_to_other_programs(tmp_path: Path) -> None:
@@ -121,7 +146,8 @@ def test_what_is_exported_says_the_same_to_other_programs(tmp_path: Path) -> Non
         (tmp_path / f"out_{name}").write_bytes(text if isinstance(text, bytes) else text.encode())
     told = json.loads(files["corrections.json"])
     joint = np.array(told["joint_covariance_px2"])
-    assert joint.shape == (18, 18) and told["joint_unknowns"][0] == "first shift of line"
+    assert joint.shape == (18, 18)
+    assert told["joint_unknowns"][0] == "first shift of line"
     assert np.abs(joint[:6, 6:12]).max() > 1e-5  # images have errors in common
     for k, (name, image) in enumerate(one.images.items()):
         said = told["images"][name]
@@ -135,7 +161,8 @@ def test_what_is_exported_says_the_same_to_other_programs(tmp_path: Path) -> Non
         assert np.allclose(said["covariance_px2"], joint[6 * k : 6 * k + 6, 6 * k : 6 * k + 6])
     tagged = read_rpc(tmp_path / "out_first.tif")
     assert np.array_equal(tagged.line_numerator, read_rpc(tmp_path / "out_first_RPC.TXT").line_numerator)
-    assert tagged.random_m == 0.4 and tagged.bias_m == pytest.approx(run.images["first"].polynomial.bias_m)
+    assert tagged.random_m == 0.4
+    assert tagged.bias_m == pytest.approx(run.images["first"].polynomial.bias_m)
     assert np.array_equal(tifffile.imread(tmp_path / "out_first.tif"), tifffile.imread(tmp_path / "crop.tif"))
 
 
@@ -227,5 +254,5 @@ def test_files_that_are_refused(tmp_path: Path, keys: dict[str, Any], words: str
 def test_points_of_another_image_are_named(tmp_path: Path) -> None:
     one = bench({"shift": 5.0})
     one.places["third"][:, 1:] += 40.0 * HALF
-    with pytest.raises(BenchError, match="or half an image, from the directions of their images|see no ground"):
+    with pytest.raises(BenchError, match="or half an image, from the directions of their images"):
         adjusted(one.write(tmp_path, {"shift": [5.0, 5.0]}, 3))

@@ -1,4 +1,4 @@
-"""Images that come with rational polynomials (RPC): their adjustment as a block, and tie points matched between them."""
+"""Images that come with rational polynomials (RPC): their adjustment as a block, and tie points between them."""
 
 from __future__ import annotations
 

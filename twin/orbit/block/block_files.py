@@ -15,6 +15,7 @@ import numpy as np
 
 from analysis.block.assembly import correction_names
 from analysis.orbit.forward_intersection import level_axes
+from scenes.specs.orbit.setup import RationalAdjustSetup
 from twin.orbit.block.block_run import BlockRun
 from twin.orbit.block.rational_block import AdjustedImage
 from twin.orbit.flight.earth import Earth
@@ -33,7 +34,7 @@ def exported(run: BlockRun) -> dict[str, str | bytes]:
     NAME_RPC.TXT of each image, NAME.tif where the image has RPCCoefficientTag, and corrections.json.
     """
     files: dict[str, str | bytes] = {"points.csv": csv_text(_points(run))}
-    if not run.images:
+    if not isinstance(run.setup, RationalAdjustSetup):
         return files
     files |= {f"{name}_RPC.TXT": image.polynomial.text() for name, image in run.images.items()}
     files["corrections.json"] = json.dumps(corrections(run), indent=1) + "\n"

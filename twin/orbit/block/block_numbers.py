@@ -115,20 +115,28 @@ def _coefficient(k: int, term: str, attribute: str) -> Callable[[AdjustedImage],
     return value
 
 
+def _rms(k: int, when: str) -> Callable[[AdjustedImage], Any]:
+    def value(image: AdjustedImage) -> Any:
+        return getattr(image, f"rms_{when}")[k]
+
+    return value
+
+
 IMAGE: Record[AdjustedImage] = Record(
     "Correction of an image with rational polynomials, added to line and sample by the polynomials.",
     Quantity("points", lambda image: image.points, "number of image points", "points"),
     *(
-        Quantity(f"{axis}_rms_{when}_px", lambda image, k=k, at=at: getattr(image, at)[k], words, head, 3)
-        for when, at, words in (
-            ("before", "rms_before", "rms residual of points intersected without corrections"),
-            ("after", "rms_after", "rms residual after the adjustment"),
+        Quantity(f"{axis}_rms_{when}_px", _rms(k, when), words, f"{axis} rms {when}", 3)
+        for when, words in (
+            ("before", "rms residual of points intersected without corrections"),
+            ("after", "rms residual after the adjustment"),
         )
         for k, axis in enumerate(("line", "sample"))
-        for head in (f"{axis} rms {when}",)
     ),
     *(
-        Quantity(f"{term}_{axis}_px{end}", _coefficient(k, term, attribute), f"{meaning}{words}", f"{term} {axis}{words}", 3)
+        Quantity(
+            f"{term}_{axis}_px{end}", _coefficient(k, term, attribute), f"{meaning}{words}", f"{term} {axis}{words}", 3
+        )
         for term, meaning in (
             ("shift", "constant correction"),
             ("drift", "correction at the last line, zero in the middle"),
@@ -141,7 +149,9 @@ IMAGE: Record[AdjustedImage] = Record(
             ("_sigma_before", ", prior sigma", "before"),
         )
     ),
-    Quantity("bias_m", lambda image: image.polynomial.bias_m, "ERR_BIAS: rms error of a horizontal axis", "ERR_BIAS", 3),
+    Quantity(
+        "bias_m", lambda image: image.polynomial.bias_m, "ERR_BIAS: rms error of a horizontal axis", "ERR_BIAS", 3
+    ),
     Quantity("random_m", lambda image: image.polynomial.random_m, "ERR_RAND of the polynomials before", "ERR_RAND", 3),
     Quantity(
         "fit_error_px",

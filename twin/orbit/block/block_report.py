@@ -12,6 +12,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from analysis.orbit.forward_intersection import level_axes
+from scenes.specs.orbit.setup import RationalAdjustSetup
 from twin.framework import svg
 from twin.framework.artefact import SvgFigure, Table
 from twin.framework.report import Report, Section, answer
@@ -66,9 +67,8 @@ def _facts(run: BlockRun) -> tuple[tuple[str, str], ...]:
     block, spec = run.adjustment.assembly.block, run.setup.test
     role = block.points.role
     counts = ", ".join(f"{int(np.sum(role == name))} {name}" for name in ("control", "tie", "check"))
-    if run.images:
-        scenes = (("Images", f"{len(block.scenes)} with rational polynomials"),)
-    else:
+    scenes: tuple[tuple[str, str], ...] = (("Images", f"{len(block.scenes)} with rational polynomials"),)
+    if not isinstance(run.setup, RationalAdjustSetup):
         scenes = (
             ("Camera", f"{run.setup.camera.name}: {', '.join(block.cameras)}"),
             ("Scenes", f"{len(block.scenes)} of {len(block.passes)} passes"),
@@ -142,10 +142,14 @@ def _images(run: BlockRun) -> Table:
     shown = {name: IMAGE(image) for name, image in run.images.items()}
     terms = dict.fromkeys(term for image in run.images.values() for term in image.terms)
     absent = tuple(term for term in ("shift", "drift", "affine") if term not in terms)
-    keys = [q.key for q in IMAGE if not q.key.endswith(("_before", "random_m", "fit_error_px")) and not q.key.startswith(absent or "-")]
+    keys = [
+        q.key
+        for q in IMAGE
+        if not q.key.endswith(("_before", "random_m", "fit_error_px")) and not q.key.startswith(absent or "-")
+    ]
     caption = (
-        "Corrections of line and sample, in pixels, with rms residuals before and after. ERR_BIAS: error of the corrected"
-        " polynomials on the ground, rms of an axis, in metres; errors of several images are correlated."
+        "Corrections of line and sample, in pixels, with rms residuals before and after. ERR_BIAS: error of the"
+        " corrected polynomials on the ground, rms of an axis, in metres; errors of several images are correlated."
     )
     return IMAGE.table("images", "Images", caption, shown, keys, "image")
 

@@ -156,7 +156,11 @@ def _points(
     for k, name in enumerate([] if ground is None else ground.points.ids.tolist()):
         if (at := ids.get(str(name))) is not None:
             assert ground is not None
-            role[at], given[at], covariance[at] = ground.points.role[k], ground.points.itrs[k], ground.points.covariance[k]
+            role[at], given[at], covariance[at] = (
+                ground.points.role[k],
+                ground.points.itrs[k],
+                ground.points.covariance[k],
+            )
             start[at] = given[at]
     lost = ~np.isfinite(start).all(axis=1)
     if np.any(lost):
@@ -225,7 +229,9 @@ def adjusted_images(adjustment: BlockAdjustment) -> FrozenMap[str, AdjustedImage
     return FrozenMap(images)
 
 
-def _residuals(adjustment: BlockAdjustment, scene: model.ModelScene, value: Array, without: Array) -> tuple[Array, Array]:
+def _residuals(
+    adjustment: BlockAdjustment, scene: model.ModelScene, value: Array, without: Array
+) -> tuple[Array, Array]:
     """Return rms residuals (2,) of an image's accepted points, without corrections and after the adjustment."""
     where = adjustment.assembly.images.get(scene.name)
     if where is None:

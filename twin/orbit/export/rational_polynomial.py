@@ -273,6 +273,8 @@ def _from_tiff(path: Path) -> RationalPolynomial:
 
 _CORRECTED_GRID = (21, 21, 7)
 """Number of lines, samples and heights of the grid to which corrected polynomials are fitted."""
+_RATIONAL_GRID = (11, 11, 5)
+"""The same for a correction that is an affine function, with which the polynomials keep their form."""
 _GROUND_GRID = 5
 """Number of lines and of samples at which errors on the ground are computed."""
 _UNLIKELY = 0.05
@@ -389,12 +391,14 @@ def corrected_polynomial(polynomial: RationalPolynomial, correction: ImageCorrec
     ValueError
         The polynomials cannot be inverted to the ground, or the ground lies at a pole or the 180th meridian.
     """
-    corrected = refitted(PolynomialImage.of(polynomial), correction.at)
+    corrected = refitted(PolynomialImage.of(polynomial), correction.at, _CORRECTED_GRID)
     bias, random = _on_the_ground(polynomial, correction)
     return replace(corrected, bias_m=bias, random_m=random)
 
 
-def refitted(image: PolynomialImage, correction: Callable[[Array, Array], Array]) -> RationalPolynomial:
+def refitted(
+    image: PolynomialImage, correction: Callable[[Array, Array], Array], grid: tuple[int, int, int] = _RATIONAL_GRID
+) -> RationalPolynomial:
     """Return polynomials that include a correction of line and sample, fitted over an image and its heights.
 
     Parameters
@@ -403,6 +407,8 @@ def refitted(image: PolynomialImage, correction: Callable[[Array, Array], Array]
         Polynomials without the correction, and the extent of the image.
     correction : callable
         Function from lines and samples (N,) by the polynomials to their correction (N, 2), in pixels.
+    grid : tuple of int
+        Number of lines, samples and heights of the grid.
 
     Raises
     ------
@@ -412,13 +418,13 @@ def refitted(image: PolynomialImage, correction: Callable[[Array, Array], Array]
     grids, polynomial = [], image.polynomial
     middle, half = np.append(image.middle, polynomial.offset[4]), np.append(image.size, polynomial.scale[4])
     for at_ends in (True, False):
-        counts = _CORRECTED_GRID if at_ends else tuple(count - 1 for count in _CORRECTED_GRID)
+        counts = grid if at_ends else tuple(count - 1 for count in grid)
         line, sample, height = _chebyshev_grid(middle, half, counts, at_ends)
         latitude, longitude = polynomial.ground(line, sample, height)
         moved = np.stack([line, sample], axis=-1) + correction(line, sample)
         ground = np.stack([latitude, longitude, height], axis=-1)
         grids.append((moved[np.isfinite(latitude)], ground[np.isfinite(latitude)]))
-    if min(len(moved) for moved, _ in grids) < np.prod(_CORRECTED_GRID) // 2:
+    if min(len(moved) for moved, _ in grids) < np.prod(grid) // 2:
         raise ValueError("the polynomials cannot be inverted to the ground over their image")
     return fit_rpc(*grids[0], check=grids[1])
 
@@ -450,10 +456,11 @@ def level_slopes(image: PolynomialImage) -> tuple[Array, Array]:
     ends = (middle + size * steps for middle, size in zip(image.middle, image.size, strict=True))
     position = np.stack([v.ravel() for v in np.meshgrid(*ends, indexing="ij")], axis=-1)
     height = np.full(len(position), image.polynomial.offset[4])
-    latitude, longitude = (np.radians(v) for v in image.polynomial.ground(*position.T, height))
+    line, sample = position.T
+    latitude, longitude = (np.radians(v) for v in image.polynomial.ground(line, sample, height))
     seen = np.isfinite(latitude)
     slope = image_slope(image.polynomial, latitude[seen], longitude[seen], height[seen])
-    return position[seen], np.linalg.inv(slope[:, :, :2])
+    return position[seen], np.asarray(np.linalg.inv(slope[:, :, :2]))
 
 
 def residual_sigma(correction: ImageCorrection) -> Array:

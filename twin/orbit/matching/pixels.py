@@ -12,7 +12,7 @@ from twin.framework.memory import Lowered, require_memory
 from twin.orbit.measured.maps import LARGEST_PART, opened
 
 if TYPE_CHECKING:
-    from scenes.specs.orbit.measurements import LineImageFileSpec, ImageWindowSpec
+    from scenes.specs.orbit.measurements import ImageWindowSpec, LineImageFileSpec
     from scenes.specs.orbit.rational import RationalImageSpec
 
 _PIXEL = 30.0

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from analysis.matching.correlation import MatchOptions, Reason, distinct_points, search
-from analysis.matching.matches import consensus, match_windows
+from analysis.matching.matches import DisplacementField, consensus, match_windows
 from analysis.matching.spline import resampled
 from optics.numerics.number_tree import FrozenMap
 from twin.framework.procedure import Advance, BenchError, silent
@@ -40,6 +40,8 @@ _APART = 3.0
 """Distance, in pixels along the epipolar line, from which two peaks of the search count as different."""
 _LEAST_RISE = 1e-6
 """Parallax, in pixels per metre of height, below which two images see the ground from one direction."""
+_NO_FIELD = DisplacementField(np.zeros((1, 2)), np.zeros(2), 1.0, 0, None)
+"""Displacement of images with too few matches."""
 _LEAST = 6
 """Smallest number of matches of two images: twice the terms of a linear displacement."""
 
@@ -185,7 +187,9 @@ def _searched(
     status = match.reason.astype(np.int64)
     status[~np.isfinite(start[:, 0])] = Reason.OUTSIDE
     status[(status == 0) & (rival > options.largest_ratio * value)] = Reason.AMBIGUOUS
-    return _agreed(frame, other, place, height, heights, match.position, match.covariance, match.correlation, status, spec)
+    return _agreed(
+        frame, other, place, height, heights, match.position, match.covariance, match.correlation, status, spec
+    )
 
 
 def _agreed(
@@ -208,7 +212,7 @@ def _agreed(
     miss = np.where(good[:, None], position - at, np.nan)
     sideways = np.sum(miss * across, axis=1)
     variance = np.einsum("ni,nij,nj->n", across, covariance, across) + spec.roughness**2
-    field, scatter, text = None, 0.0, f"{int(good.sum())} matches are too few for a consensus"
+    field, scatter, text = _NO_FIELD, 0.0, f"{int(good.sum())} matches are too few for a consensus"
     if good.sum() >= 2 * _LEAST:
         agreed = consensus(
             at,
@@ -225,14 +229,8 @@ def _agreed(
     level = np.where(status == 0, height + along, np.nan)
     outside = (level < heights[0]) | (level > heights[1])
     status[outside] = Reason.OUTSIDE
-    matched = MatchedLine(at, position, covariance, correlation, status, (0, 0), scatter, text, field or _no_field())
+    matched = MatchedLine(at, position, covariance, correlation, status, (0, 0), scatter, text, field)
     return matched, np.where(outside, np.nan, level)
-
-
-def _no_field() -> Any:
-    from analysis.matching.matches import DisplacementField
-
-    return DisplacementField(np.zeros((1, 2)), np.zeros(2), np.ones(2), 0, None)
 
 
 def _seen(frame: Frame, other: Frame, place: np.ndarray, height: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -249,7 +247,9 @@ def _templates(frame: Frame, other: Frame, place: np.ndarray, height: np.ndarray
     ground = frame.image.ground(place, height)
     longitude, latitude, _ = Earth().geodetic(ground)
     level = np.stack([-np.sin(longitude), np.cos(longitude), np.zeros_like(longitude)], axis=1)
-    up = np.stack([np.cos(latitude) * np.cos(longitude), np.cos(latitude) * np.sin(longitude), np.sin(latitude)], axis=1)
+    up = np.stack(
+        [np.cos(latitude) * np.cos(longitude), np.cos(latitude) * np.sin(longitude), np.sin(latitude)], axis=1
+    )
     axes = np.stack([level, np.cross(up, level)], axis=2)
     here, there = (one.image.seen(ground)[1] @ axes for one in (frame, other))
     defined = np.isfinite(here).all(axis=(1, 2)) & np.isfinite(there).all(axis=(1, 2))
@@ -299,7 +299,9 @@ def rational_report(run: RationalMatch) -> Report:
         f"{name}: " + ", ".join(f"{number} {reason}" for reason, number in line.rejections.items())
         for name, line in pairs.items()
     ]
-    return Report("Tie points", verdict, more, facts, table, (Section("Why points were not accepted", tuple(lost), ()),))
+    return Report(
+        "Tie points", verdict, more, facts, table, (Section("Why points were not accepted", tuple(lost), ()),)
+    )
 
 
 def rational_files(run: RationalMatch) -> dict[str, str]:
