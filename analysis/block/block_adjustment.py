@@ -453,9 +453,8 @@ class _Problem:
     def weighed(
         self, state: _AdjustmentState, weight: tuple[Array, ...], factor: Mapping[str, float]
     ) -> _AdjustmentState:
-        """Return the state with new weights, zero at points that fewer than three equations determined."""
-        # the residuals of a point that has lost its observations are zero and do not speak for these
-        lost = (_rows_left(self.assembly, weight) < 3) | (_rows_left(self.assembly, state.weight) < 3)
+        """Return the state with new weights, zero at points that fewer than three equations would determine."""
+        lost = _rows_left(self.assembly, weight) < 3
         sets = self.assembly.reduction.sets
         weights = tuple(np.where(lost[packets.point], 0.0, w) for packets, w in zip(sets, weight, strict=True))
         return replace(state, weight=weights, factor=factor)
