@@ -10,9 +10,18 @@ from scipy import sparse
 from scipy.spatial.transform import Rotation
 
 from analysis.arrays import Array, Indices
-from analysis.block.block import Block, CameraPrior, JointCameraPrior, Term
+from analysis.block.block import Block, CameraPrior, JointCameraPrior, ModelScene, Term
 from analysis.block.error_processes import BlockError, Corrections, Part, Support
-from analysis.block.point_reduction import FixedPoints, Heights, LineImage, Packets, Pointings, PriorGroup, Reduction
+from analysis.block.point_reduction import (
+    FixedPoints,
+    Heights,
+    LineImage,
+    ModelImage,
+    Packets,
+    Pointings,
+    PriorGroup,
+    Reduction,
+)
 from analysis.orbit.three_line_model import BIAS, DRIFT
 
 OFFSET = ("along", "across", "down")
@@ -66,11 +75,12 @@ class Assembly:
         Processes of each kind ("attitude", "station") and pass.
     all_processes : tuple of Process
         All processes, each once.
-    changes : mapping of str to (4,) ndarray of int
-        For the camera of each scene, indices of the unknowns d_alpha, d_beta, d_gamma (rotations about its Y, X and Z
-        axes) and d_f (change of the principal distance).
-    units : mapping of str to (4,) ndarray
-        Scale of each of these unknowns: the change, in radians or metres, for a value of 1.
+    changes : mapping of str to ndarray of int
+        For the camera of each scene, indices (4,) of the unknowns d_alpha, d_beta, d_gamma (rotations about its Y, X
+        and Z axes) and d_f (change of the principal distance); for a scene that is a function of the ground, indices
+        (2 K,) of the K coefficients of its correction of the line, then of the sample.
+    units : mapping of str to ndarray
+        Scale of each of these unknowns: the change, in radians, metres or pixels, for a value of 1.
     datum : (0,) or (3,) ndarray of int
         Indices of the unknown common shift of the control points; empty if none is estimated.
     axes : mapping of str to (3, 3) ndarray
@@ -99,9 +109,12 @@ class Assembly:
             axes = BIAS if process.kind == "attitude" else tuple(f"offset {n}" for n in OFFSET)
             for k, axis in enumerate(axes):
                 names[process.column + k] = f"{process.name} {axis}"
-        for scene in self.block.scenes:
+        for scene in self.block.line_scenes:
             for column, name in zip(self.changes[scene.name].tolist(), DRIFT, strict=True):
                 names[column] = f"{scene.of} {scene.camera} {name}"
+        for image in self.block.model_scenes:
+            for column, name in zip(self.changes[image.name].tolist(), correction_names(image), strict=True):
+                names[column] = f"{image.name} {name}"
         return tuple(name or "terrain height" for name in names)
 
     def corrections(self, of: str, times: Array) -> Corrections:
@@ -155,6 +168,12 @@ def assembled(block: Block, datum: bool = False) -> Assembly:
                     scopes[kind, k, _scope_of(block, term, block_pass.name)] for k, term in enumerate(terms)
                 )
     changes, units, size = _cameras(block, priors, size)
+    for image in block.model_scenes:
+        columns = size + np.arange(2 * len(image.sigma)).reshape(2, -1)
+        for k, name in enumerate(image.sigma):
+            priors.append(PriorGroup(name, columns[:, k], _unit(2), np.zeros(2)))
+        changes[image.name], units[image.name] = columns.ravel(), np.array(list(image.sigma.values())).T.ravel()
+        size += columns.size
     common = np.zeros(0, np.intp)
     if block.terrain is not None:
         common = np.array([size])
@@ -187,13 +206,13 @@ def assembled(block: Block, datum: bool = False) -> Assembly:
 def _times(block: Block) -> dict[str, Array]:
     """Return the times of all observations of each pass; passes without observations are omitted."""
     times: dict[str, list[Array]] = {}
-    for scene in block.scenes:
+    for scene in block.line_scenes:
         if scene.rays.time is not None and len(scene.rays.time):
             times.setdefault(scene.of, []).append(scene.rays.time)
     for footprints in block.footprints:
         if len(footprints.time):
             times.setdefault(footprints.of, []).append(footprints.time)
-    if not times:
+    if not times and not any(len(image.rays.point) for image in block.model_scenes):
         raise BlockError("block: no observations")
     return {name: np.concatenate(times[name]) for name in (p.name for p in block.passes) if name in times}
 
@@ -215,7 +234,7 @@ def _scopes(block: Block, term: Term, times: Mapping[str, Array]) -> dict[str, l
 
 def _axes(block: Block, name: str) -> Array:
     """Return the mean body axes of a pass as columns, ITRS: the (3, 3) rotation nearest to its mean attitude."""
-    attitudes = [s.rays.attitude for s in block.scenes if s.of == name and len(s.rays.point)]
+    attitudes = [s.rays.attitude for s in block.line_scenes if s.of == name and len(s.rays.point)]
     attitudes += [f.attitude for f in block.footprints if f.of == name]
     return np.asarray(Rotation.from_matrix(np.concatenate(attitudes)).mean().as_matrix())
 
@@ -235,8 +254,8 @@ def _cameras(block: Block, priors: list[PriorGroup], size: int) -> tuple[dict[st
     units: dict[str, Array] = {}
     joint_prior = block.monitored if isinstance(block.monitored, JointCameraPrior) else None
     joint_parts: list[tuple[Indices, Indices, Array]] = []
-    for camera in dict.fromkeys(s.camera for s in block.scenes):
-        camera_scenes = [s for s in block.scenes if s.camera == camera]
+    for camera in dict.fromkeys(s.camera for s in block.line_scenes):
+        camera_scenes = [s for s in block.line_scenes if s.camera == camera]
         pass_numbers = sorted({order.index(s.of) for s in camera_scenes})
         rows = (4 * np.array(pass_numbers)[:, None] + np.arange(4)).ravel()
         deviation = np.sqrt(np.maximum(np.diag(block.known[camera].covariance), 0.0)).reshape(-1, 4).max(axis=0)
@@ -303,7 +322,12 @@ def _sets(assembly: Assembly, common: Indices) -> tuple[list[Packets], dict[str,
     block = assembly.block
     sets: list[Packets] = []
     images: dict[str, int] = {}
-    for scene in block.scenes:
+    for image in block.model_scenes:
+        if len(image.rays.point):
+            white = np.linalg.inv(np.linalg.cholesky(block.image**2 * image.rays.spread))
+            images[image.name] = len(sets)
+            sets.append(ModelImage(image, white, assembly.changes[image.name], assembly.units[image.name]))
+    for scene in block.line_scenes:
         rays = scene.rays
         if not len(rays.point):
             continue
@@ -348,6 +372,11 @@ def _sets(assembly: Assembly, common: Indices) -> tuple[list[Packets], dict[str,
             )
         )
     return sets, images
+
+
+def correction_names(image: ModelScene) -> tuple[str, ...]:
+    """Return the names of the 2 K coefficients of an image's correction, in the order of the unknowns."""
+    return tuple(f"{term} of {axis}" for axis in ("line", "sample") for term in image.sigma)
 
 
 def group_ranks(priors: Sequence[PriorGroup]) -> dict[str, int]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import Literal
+from typing import Literal, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -68,6 +68,92 @@ class Scene:
     of: str
     camera: str
     rays: Rays
+
+    def taken(self, keep: NDArray[np.bool_]) -> Scene:
+        """Return the scene with the image points that a boolean mask selects."""
+        return replace(self, rays=self.rays.taken(keep))
+
+
+class GroundToImage(Protocol):
+    """Interface of an image whose positions are a function of the ground, such as rational polynomials."""
+
+    @property
+    def middle(self) -> Array:
+        """Line and sample (2,) at which corrections that grow with the position are zero, in pixels."""
+
+    @property
+    def size(self) -> Array:
+        """Distances (2,) from the middle, in lines and samples, at which these corrections have their full value."""
+
+    def seen(self, ground: Array) -> tuple[Array, Array]:
+        """Return line and sample (n, 2) of n ground points (n, 3), and the derivatives (n, 2, 3).
+
+        Ground points are in the ITRS, in metres; line and sample are in pixels.
+        """
+
+
+CORRECTIONS = ("shift", "drift", "affine")
+"""Terms of the correction of line and sample of an image: constant, growing with the line, growing with the sample."""
+
+
+@dataclass(frozen=True, eq=False)
+class ImagePlaces:
+    """Image points of an image that is a function of the ground, n of them.
+
+    Attributes
+    ----------
+    point : (n,) ndarray of int
+        Index of the ground point that each image point shows.
+    image : (n, 2) ndarray
+        Line and sample, in pixels.
+    spread : (n, 2, 2) ndarray
+        Covariance of line and sample, in pixels^2.
+    """
+
+    point: Indices
+    image: Array
+    spread: Array
+
+    def taken(self, which: NDArray[np.bool_] | Indices) -> ImagePlaces:
+        """Return the image points that a boolean mask or an array of indices selects."""
+        return ImagePlaces(self.point[which], self.image[which], self.spread[which])
+
+
+@dataclass(frozen=True, eq=False)
+class ModelScene:
+    """Image that is a function of the ground, with an unknown correction of line and sample.
+
+    The corrected position of a ground point is p + c(p), with p the position by the model. For each of line and sample,
+    c is a constant (`shift`), plus a term in proportion to line - middle (`drift`), plus a term in proportion to
+    sample - middle (`affine`); the coefficients are the values at the distance `size` from the middle.
+
+    Attributes
+    ----------
+    name : str
+        Name of the scene.
+    model : GroundToImage
+        Position in the image as a function of the ground.
+    sigma : mapping of str to (float, float)
+        Term of the correction, from `CORRECTIONS` -> prior standard deviations of its coefficients for line and sample,
+        in pixels.
+    rays : ImagePlaces
+        Image points; `point` is an index into the block's points.
+    """
+
+    name: str
+    model: GroundToImage
+    sigma: Mapping[str, tuple[float, float]]
+    rays: ImagePlaces
+
+    def taken(self, keep: NDArray[np.bool_]) -> ModelScene:
+        """Return the scene with the image points that a boolean mask selects."""
+        return replace(self, rays=self.rays.taken(keep))
+
+    def basis(self, position: Array) -> Array:
+        """Return the K terms of the correction, in the order of `sigma`, at n model positions (n, 2), as (n, K)."""
+        scaled = (position - self.model.middle) / self.model.size
+        columns = {"shift": np.ones(len(position)), "drift": scaled[:, 0], "affine": scaled[:, 1]}
+        return np.stack([columns[term] for term in self.sigma], axis=1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -234,8 +320,8 @@ class Block:
     ----------
     passes : tuple of Pass
         Passes, in the order of the cameras' priors.
-    scenes : tuple of Scene
-        Scenes of these passes.
+    scenes : tuple of Scene or ModelScene
+        Images of line cameras in these passes, and images that are functions of the ground.
     cameras : mapping of str to LineModel
         Calibrated cameras without changes, by name.
     known : mapping of str to CameraPrior
@@ -259,7 +345,7 @@ class Block:
     """
 
     passes: tuple[Pass, ...]
-    scenes: tuple[Scene, ...]
+    scenes: tuple[Scene | ModelScene, ...]
     cameras: Mapping[str, LineModel]
     known: Mapping[str, CameraPrior]
     attitude: tuple[Term, ...]
@@ -270,6 +356,16 @@ class Block:
     footprints: tuple[Footprints, ...] = ()
     terrain: Terrain | None = None
     angles: tuple[TrackerAngle, ...] = field(default=())
+
+    @property
+    def line_scenes(self) -> tuple[Scene, ...]:
+        """Images of line cameras."""
+        return tuple(scene for scene in self.scenes if isinstance(scene, Scene))
+
+    @property
+    def model_scenes(self) -> tuple[ModelScene, ...]:
+        """Images that are functions of the ground."""
+        return tuple(scene for scene in self.scenes if isinstance(scene, ModelScene))
 
     @property
     def sensors(self) -> tuple[str, ...]:
@@ -304,7 +400,7 @@ class Block:
             mask = points.role != "tie"
             for footprints in self.footprints:  # footprints stay in the images as laser observations
                 mask[footprints.point] = True
-            scenes = tuple(replace(s, rays=s.rays.taken(mask[s.rays.point])) for s in self.scenes)
+            scenes = tuple(s.taken(mask[s.rays.point]) for s in self.scenes)
             terrain = self.terrain
             if terrain is not None:
                 use = mask[terrain.point]
@@ -323,7 +419,10 @@ class Block:
         names = [prior.name for prior in self.passes]
         if len(set(names)) != len(names) or len({s.name for s in self.scenes}) != len(self.scenes):
             raise BlockError("block: two passes or two scenes have the same name")
-        for scene in self.scenes:
+        for image in self.model_scenes:
+            if not image.sigma or not all(sigma > 0.0 for pair in image.sigma.values() for sigma in pair):
+                raise BlockError(f"block: scene {image.name!r}: its correction needs sigmas above zero")
+        for scene in self.line_scenes:
             if scene.of not in names:
                 raise BlockError(f"block: scene {scene.name!r}: no pass is called {scene.of!r}")
             if scene.camera not in self.cameras or scene.camera not in self.known:

@@ -62,11 +62,33 @@ def pruned(block: Block) -> Block:
     determined = rows >= 3
     if not np.any(determined):
         raise BlockError("block: no point is seen by two scenes, and none is control")
-    scenes = tuple(replace(s, rays=s.rays.taken(determined[s.rays.point])) for s in block.scenes)
+    scenes = tuple(s.taken(determined[s.rays.point]) for s in block.scenes)
     terrain = block.terrain
     if terrain is not None:
         terrain = terrain.taken(determined[terrain.point])
     return replace(block, scenes=scenes, terrain=terrain)
+
+
+def intersected(block: Block) -> Array:
+    """Return the coordinates (m, 3), ITRS, in metres, of a block's m points for scenes and readings without errors.
+
+    Each point has the least sum of its squared standardised residuals; points without observations keep their start.
+
+    Raises
+    ------
+    BlockError
+        The block cannot be adjusted.
+    """
+    reduction = assembled(pruned(block)).reduction
+    state = State(
+        np.zeros(reduction.size), block.points.start, tuple(np.ones(len(s.point)) for s in reduction.sets), {}
+    )
+    for _ in range(_STEPS):
+        equations = reduction.eliminated(state)
+        state = replace(state, ground=state.ground + equations.start)
+        if not _largest(equations.start, equations.spread) > _CONVERGED:
+            break
+    return state.ground
 
 
 def check_places(block: Block) -> None:
@@ -75,11 +97,12 @@ def check_places(block: Block) -> None:
     Raises
     ------
     BlockError
-        The direction of an image and that to its point differ by more than `FAR`.
+        The direction of an image and that to its point differ by more than `FAR`, or the position of a point in an
+        image that is a function of the ground by more than half the image.
     """
     wrong: list[str] = []
     control: list[bool] = []
-    for scene in block.scenes:
+    for scene in block.line_scenes:
         rays = scene.rays
         if not len(rays.point):
             continue
@@ -91,6 +114,11 @@ def check_places(block: Block) -> None:
         names = block.points.ids[rays.point[bad]].tolist()
         wrong += [f"{name} in {scene.name}" for name in names]
         control += (block.points.role[rays.point[bad]] == "control").tolist()
+    for image in block.model_scenes:
+        position, _ = image.model.seen(block.points.start[image.rays.point])
+        bad = ~np.all(np.abs(position - image.rays.image) < image.model.size, axis=1)
+        wrong += [f"{name} in {image.name}" for name in block.points.ids[image.rays.point[bad]].tolist()]
+        control += (block.points.role[image.rays.point[bad]] == "control").tolist()
     if not wrong:
         return
     listed = ", ".join(wrong[:_NAMED]) + (f" and {len(wrong) - _NAMED} more" if len(wrong) > _NAMED else "")
@@ -98,7 +126,8 @@ def check_places(block: Block) -> None:
         "do their images belong to these scenes?"
     )  # fmt: skip
     raise BlockError(
-        f"block: these points lie more than {FAR:g} rad from the directions of their images: {listed}; {hint}"
+        f"block: these points lie more than {FAR:g} rad, or half an image, from the directions of their images:"
+        f" {listed}; {hint}"
     )
 
 
@@ -200,7 +229,8 @@ class BlockAdjustment:
         """Return the change of a scene's camera and its covariance (4, 4), in radians and metres.
 
         The change is d_alpha, d_beta, d_gamma (rotations about the camera's Y, X and Z axes) and d_f (principal
-        distance).
+        distance). For a scene that is a function of the ground it is the correction of the image: its coefficients for
+        the line, then for the sample, in pixels.
         """
         columns, unit = self.assembly.changes[scene], self.assembly.units[scene]
         return unit * self.x[columns], unit[:, None] * self.covariance[np.ix_(columns, columns)] * unit
@@ -228,8 +258,7 @@ def accepted_block(adjustment: BlockAdjustment) -> Block:
     block, sets = adjustment.assembly.block, adjustment.assembly.reduction.sets
     keep = {packets.name: weight > SETTLED for packets, weight in zip(sets, adjustment.weight, strict=True)}
     scenes = tuple(
-        replace(s, rays=s.rays.taken(keep[s.name])) if s.name in keep and not s.name.endswith(" laser") else s
-        for s in block.scenes
+        s.taken(keep[s.name]) if s.name in keep and not s.name.endswith(" laser") else s for s in block.scenes
     )
     footprints = tuple(f.taken(keep[f"{f.of} laser"]) for f in block.footprints)
     points = block.points

@@ -16,7 +16,7 @@ from scipy.sparse.csgraph import connected_components
 
 from analysis.arrays import Array
 from analysis.block.assembly import assembled
-from analysis.block.block import Block, Term
+from analysis.block.block import Block, ModelScene, Term
 from analysis.block.block_adjustment import BlockAdjustment
 from analysis.block.error_processes import Law
 from analysis.block.point_reduction import State
@@ -80,10 +80,11 @@ def network_of(block: Block) -> Network:
 def simplified(block: Block) -> Block:
     """Return the block with its error models replaced by one constant rotation and one constant shift of each pass.
 
-    Their variances are the sums of those of all error models at the ends of the longest pass.
+    Their variances are the sums of those of all error models at the ends of the longest pass. The correction of an
+    image that is a function of the ground becomes a shift, with the sum of the variances of its terms.
     """
     spans: dict[str, list[float]] = {}
-    for scene in block.scenes:
+    for scene in block.line_scenes:
         if scene.rays.time is not None and len(scene.rays.time):
             ends = [float(scene.rays.time.min()), float(scene.rays.time.max())]
             spans[scene.of] = [min(spans.get(scene.of, ends)[0], ends[0]), max(spans.get(scene.of, ends)[1], ends[1])]
@@ -94,7 +95,14 @@ def simplified(block: Block) -> Block:
         a, b, c = np.maximum(sigma, 1e-12).tolist()
         return (Term(Law("", "constant", (a, b, c))),)
 
-    return replace(block, attitude=whole(block.attitude), station=whole(block.station), angles=())
+    scenes = tuple(
+        replace(scene, sigma={"shift": tuple(np.sqrt(np.sum(np.square(list(scene.sigma.values())), axis=0)).tolist())})
+        if isinstance(scene, ModelScene)
+        else scene
+        for scene in block.scenes
+    )
+    attitude, station = whole(block.attitude), whole(block.station)
+    return replace(block, scenes=scenes, attitude=attitude, station=station, angles=())
 
 
 @dataclass(frozen=True)
@@ -163,6 +171,9 @@ def _sizes(block: Block, names: tuple[str, ...]) -> Array:
             camera_sigma = np.sqrt(np.diag(prior.covariance)).reshape(-1, 4).max(axis=0)
             for axis, size in zip(("d_alpha", "d_beta", "d_gamma", "d_f"), camera_sigma.tolist(), strict=True):
                 sizes[f"{block_pass.name} {camera} {axis}"] = size
+    for image in block.model_scenes:
+        for axis, size in zip(("line", "sample"), image.sigma["shift"], strict=True):
+            sizes[f"{image.name} shift of {axis}"] = size
     common = 1.0 if block.terrain is None else max(block.terrain.common, 1e-6)
     return np.array([sizes.get(name, common) for name in names])
 

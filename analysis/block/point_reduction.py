@@ -29,6 +29,7 @@ from numpy.typing import NDArray
 from scipy import sparse
 
 from analysis.arrays import Array, Indices
+from analysis.block.block import ModelScene
 from analysis.block.error_processes import Corrections, cross, rotated, rotated_back, rotation_vector_derivatives
 from analysis.block.reweighting import standardised_packets
 from analysis.orbit.three_line_model import LineModel, Rays
@@ -160,6 +161,70 @@ class LineImage:
         """Return selected image points as a new set, with the given indices of their ground points."""
         rays = replace(self.rays.taken(which), point=point)
         return replace(self, rays=rays, white=self.white[which], corrections=self.corrections.taken(which))
+
+
+@dataclass(frozen=True, eq=False)
+class ModelImage:
+    """Image points of an image that is a function of the ground, n in number.
+
+    Attributes
+    ----------
+    scene : ModelScene
+        Image with its points and the terms of its correction.
+    white : (n, 2, 2) ndarray
+        Matrices that whiten the misclosures.
+    change : (2 K,) ndarray of int
+        Indices, among all unknowns, of the K coefficients of the correction of the line, then of the sample.
+    unit : (2 K,) ndarray
+        Scale of each of these unknowns: the coefficient, in pixels, for a value of 1.
+    group : str
+        Variance group.
+    """
+
+    scene: ModelScene
+    white: Array
+    change: Indices
+    unit: Array
+    group: str = "image"
+    rows: int = 2
+
+    @property
+    def name(self) -> str:
+        """Name of the scene."""
+        return self.scene.name
+
+    @property
+    def point(self) -> Indices:
+        """Index of the ground point that each of the n image points shows, (n,)."""
+        return self.scene.rays.point
+
+    @property
+    def columns(self) -> Indices:
+        """Indices (n, 2 K) of the unknowns, the coefficients of the correction, on which each image point depends."""
+        return np.broadcast_to(self.change, (len(self.point), len(self.change)))
+
+    def linearised(self, which: Indices, x: Array, ground: Array) -> tuple[Array, Array, Array]:
+        """Return whitened misclosures of image points, with derivatives for unknowns and ground points."""
+        position, slope = self.scene.model.seen(ground)
+        basis, white = self.scene.basis(position), self.white[which]
+        coefficients = (self.unit * x[self.change]).reshape(2, -1)
+        growth = np.zeros((2, 2))
+        for k, term in enumerate(self.scene.sigma):
+            if term != "shift":
+                axis = ("drift", "affine").index(term)
+                growth[:, axis] = coefficients[:, k] / self.scene.model.size[axis]
+        miss = position + basis @ coefficients.T - self.scene.rays.image[which]
+        by_x = np.zeros((len(which), 2, len(self.change)))
+        count = basis.shape[1]
+        by_x[:, 0, :count] = basis * self.unit[:count]
+        by_x[:, 1, count:] = basis * self.unit[count:]
+        by_ground = (np.eye(2) + growth) @ slope
+        return np.einsum("nij,nj->ni", white, miss), white @ by_x, white @ by_ground
+
+    def taken(self, which: Indices, point: Indices) -> ModelImage:
+        """Return selected image points as a new set, with the given indices of their ground points."""
+        rays = replace(self.scene.rays.taken(which), point=point)
+        return replace(self, scene=replace(self.scene, rays=rays), white=self.white[which])
 
 
 @dataclass(frozen=True, eq=False)

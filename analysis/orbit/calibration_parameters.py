@@ -865,7 +865,9 @@ def echelon(vectors: Array) -> Array:
 
 
 def shown(name: str, change: float) -> str:
-    """Return a change of an unknown, given in metres or radians, as text with its unit."""
+    """Return a change of an unknown, given in metres, radians or pixels, as text with its unit."""
+    if " shift of " in name:
+        return f"{name} {change:+.4g} px"
     if "offset" in name or "height" in name:
         return f"{name} {change:+.4g} m"
     if name.split()[-1] in _ANGLES:

@@ -27,6 +27,8 @@ _POWERS = np.array(
     ]
 )
 """Powers of longitude, latitude and height in the order of RPC00B."""
+_AXES = (1, 0, 2)
+"""Positions of longitude, latitude and height among scaled latitude, longitude and height."""
 _ROUNDS = 6
 """Number of reweighted least-squares solutions; the weights are the inverse denominators."""
 _RANK = 1e-11
@@ -36,8 +38,6 @@ _DAMPING = (0.0, 1e-8, 1e-6, 1e-4, 1e-2, 1.0)
 """Strengths of the regularisation of the denominators that are tried; with the largest, denominators are almost 1 and
 the ratios almost polynomials.
 """
-_STEP = 1e-6
-"""Step of a numerical derivative with respect to ground coordinates, relative to the half extent of the fitted area."""
 _ARRIVED = 1e-9
 """Newton step of ground coordinates, relative to the half extent of the fitted area, below which the iteration has
 converged.
@@ -96,14 +96,9 @@ class RationalPolynomial:
         wanted = np.stack(np.broadcast_arrays(line, sample), axis=-1).astype(np.float64)
         at = np.broadcast_to(np.asarray(height, np.float64), wanted.shape[:-1])
         position = np.broadcast_to(self.offset[2:4], wanted.shape)
-        step = _STEP * self.scale[2:4]
         for _ in range(_MOST_STEPS):
-            here, north, east = (
-                np.stack(self.image(position[..., 0] + up, position[..., 1] + aside, at), axis=-1)
-                for up, aside in ((0.0, 0.0), (step[0], 0.0), (0.0, step[1]))
-            )
-            slope = np.stack([(north - here) / step[0], (east - here) / step[1]], axis=-1)
-            move = np.linalg.solve(slope, (wanted - here)[..., None])[..., 0]
+            here, slope = self.linearised(position[..., 0], position[..., 1], at)
+            move = np.linalg.solve(slope[..., :2], (wanted - here)[..., None])[..., 0]
             # a larger step would leave the ground on which the polynomials are valid
             position = position + np.clip(move, -self.scale[2:4], self.scale[2:4])
             if np.all(np.abs(move) < _ARRIVED * self.scale[2:4]):
@@ -117,11 +112,41 @@ class RationalPolynomial:
 
         The arguments are broadcast.
         """
-        unit = (np.stack(np.broadcast_arrays(latitude, longitude, height), axis=-1) - self.offset[2:]) / self.scale[2:]
-        basis = _monomials(unit)
+        basis = _monomials(self._scaled(latitude, longitude, height))
         line = basis @ self.line_numerator / (basis @ self.line_denominator)
         sample = basis @ self.sample_numerator / (basis @ self.sample_denominator)
         return self.offset[0] + self.scale[0] * line, self.offset[1] + self.scale[1] * sample
+
+    def linearised(self, latitude: ArrayLike, longitude: ArrayLike, height: ArrayLike) -> tuple[Array, Array]:
+        """Return line and sample of ground points and their derivatives with respect to the ground coordinates.
+
+        Parameters
+        ----------
+        latitude, longitude, height : array_like
+            Ground coordinates (...) in degrees and metres; they are broadcast.
+
+        Returns
+        -------
+        tuple of ndarray
+            Line and sample (..., 2), in pixels, and their derivatives (..., 2, 3) with respect to latitude, longitude
+            (pixels per degree) and height (pixels per metre).
+        """
+        unit = self._scaled(latitude, longitude, height)
+        basis, slopes = _monomials(unit), _monomial_slopes(unit)
+        parts = (self.line_numerator, self.line_denominator), (self.sample_numerator, self.sample_denominator)
+        values, derivatives = [], []
+        for above, below in parts:
+            ratio = basis @ above / (basis @ below)
+            values.append(ratio)
+            derivatives.append((slopes @ above - ratio[..., None] * (slopes @ below)) / (basis @ below)[..., None])
+        by_ground = np.stack(derivatives, axis=-2) * self.scale[:2, None] / self.scale[2:]
+        return self.offset[:2] + self.scale[:2] * np.stack(values, axis=-1), by_ground
+
+    def _scaled(self, latitude: ArrayLike, longitude: ArrayLike, height: ArrayLike) -> Array:
+        """Return scaled latitude, longitude and height (..., 3); longitudes may differ by a whole circle."""
+        place = np.stack(np.broadcast_arrays(latitude, longitude, height), axis=-1) - self.offset[2:]
+        place[..., 1] = np.remainder(place[..., 1] + 180.0, 360.0) - 180.0
+        return np.asarray(place / self.scale[2:])
 
     def text(self) -> str:
         """Return the polynomials as the text of a file NAME_RPC.TXT, which GDAL reads beside NAME.tif."""
@@ -256,11 +281,32 @@ def _checked_points(image: ArrayLike, ground: ArrayLike) -> Array:
 
 def _monomials(unit: Array) -> Array:
     """Return the 20 monomials (..., 20) of scaled latitude, longitude and height (..., 3)."""
-    powers = [
-        np.stack([np.ones_like(coordinate), coordinate, coordinate**2, coordinate**3])
-        for coordinate in (unit[..., 1], unit[..., 0], unit[..., 2])
-    ]
-    return np.stack([powers[0][a] * powers[1][b] * powers[2][c] for a, b, c in _POWERS], axis=-1)
+    return _products(*(_powers(unit[..., k]) for k in _AXES))
+
+
+def _monomial_slopes(unit: Array) -> Array:
+    """Return the derivatives (..., 3, 20) of the monomials with respect to scaled latitude, longitude and height."""
+    powers = [_powers(unit[..., k]) for k in _AXES]
+    slopes = [power[..., [0, 0, 1, 2]] * [0.0, 1.0, 2.0, 3.0] for power in powers]
+    return np.stack(
+        [
+            _products(powers[0], slopes[1], powers[2]),
+            _products(slopes[0], powers[1], powers[2]),
+            _products(powers[0], powers[1], slopes[2]),
+        ],
+        axis=-2,
+    )
+
+
+def _powers(value: Array) -> Array:
+    """Return the powers 0 to 3 of values (...), (..., 4)."""
+    square = value * value
+    return np.stack([np.ones_like(value), value, square, square * value], axis=-1)
+
+
+def _products(longitude: Array, latitude: Array, height: Array) -> Array:
+    """Return products (..., 20) of powers (..., 4) of the three coordinates, in the order of RPC00B."""
+    return longitude[..., _POWERS[:, 0]] * latitude[..., _POWERS[:, 1]] * height[..., _POWERS[:, 2]]
 
 
 def _best(

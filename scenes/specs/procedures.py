@@ -37,8 +37,8 @@ class Procedure:
         Function from the result to the plain data of KIND.json, whose keys end in their unit.
     report : callable
         Function from the result to a `twin.framework.report.Report`.
-    measured : type or None
-        Class of the test on measurements, chosen by the keys of the file; None if there is none.
+    measured : type, tuple of types, or None
+        Classes of the tests on measurements, chosen by the keys of the file; None if there is none.
     export : callable or None
         Function from the result to paths and contents of files with the measured data, for the option ``--export``;
         None if there is none.
@@ -96,8 +96,8 @@ class Procedure:
         InputError
             A file cannot be read or is not valid, or the files do not fit together.
         """
-        if self.measured is not None:
-            measured = Named(self.measured).get()
+        for source in (self.measured,) if isinstance(self.measured, str) else self.measured or ():
+            measured = Named(source).get()
             if measured.measured_by(Named("scenes.specs.resolved:test_keys")(path)):
                 return measured.read(path)
         return getattr(self.model, "read", self.model)(path, *named)
@@ -177,16 +177,19 @@ _PROCEDURES: dict[str, Procedure] = {
     "orbit adjust": Procedure(
         "block",
         setup="scenes.specs.orbit.setup:AdjustSetup",
-        measured="scenes.specs.orbit.setup:MeasuredAdjustSetup",
+        measured=("scenes.specs.orbit.setup:MeasuredAdjustSetup", "scenes.specs.orbit.setup:RationalAdjustSetup"),
         run="twin.operate.operated_block:run_operated_block",
         numbers="twin.orbit.block.block_numbers:BLOCK",
         report="twin.orbit.block.block_report:block_report",
+        export="twin.orbit.block.block_files:exported",
         varied=True,
         about="""
     Adjust all scenes of a block together: image points, control, the cameras' monitor, star trackers and their
     angles, a laser altimeter and a terrain model, with time laws for the errors of the readings.
 
-    A file with `data: DIR` runs on the measurements of that folder, as `calibrate` does.
+    A file with `data: DIR` runs on the measurements of that folder, as `calibrate` does; a file with `images:` adjusts
+    images that come with rational polynomials. `--export DIR` writes the adjusted points with their covariances, and
+    the corrected polynomials of such images with the joint covariance of their corrections.
 
     block.json holds the errors in plan and height at check points, with all sensors and without each, the tests of
     observations and laws, the parameters that the prior determines more than the observations, and the cameras'
@@ -288,8 +291,9 @@ _PROCEDURES: dict[str, Procedure] = {
     "orbit match": Procedure(
         "match",
         setup="scenes.specs.orbit.setup:MatchSetup",
+        measured=("scenes.specs.orbit.setup:RationalMatchSetup",),
         run="twin.orbit.matching.match_run:run_match",
-        numbers="twin.orbit.matching.match_run:MATCH",
+        numbers="twin.orbit.matching.match_run:match_numbers",
         report="twin.orbit.matching.match_report:match_report",
         export="twin.orbit.matching.match_run:exported",
         judged=False,
@@ -297,6 +301,8 @@ _PROCEDURES: dict[str, Procedure] = {
         about="""
     Measure points in a user's line images: distinct points of an orthophoto with heights of an elevation model, and
     tie points, are located in every image by least squares matching, as in a simulated patch.
+
+    A file with `images:` that have rational polynomials, without a camera, gives tie points between them.
 
     match.json holds for every line the number of matched points and how they were matched. With `--export DIR` they are
     written with orbit, attitude and line times to a folder that `twin.orbit calibrate` reads.

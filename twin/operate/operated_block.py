@@ -20,7 +20,7 @@ from analysis.arrays import ARCSEC, Array
 from analysis.block.block import JointCameraPrior
 from analysis.monitor.limits import Quantity
 from scenes.specs.orbit.adjust import MonitorRecordSpec
-from scenes.specs.orbit.setup import AnyAdjust
+from scenes.specs.orbit.setup import AdjustSetup, AnyAdjust, MeasuredAdjustSetup, RationalAdjustSetup
 from scenes.yaml.errors import InputError, Problem, unknown
 from twin.framework.procedure import Advance, silent
 from twin.operate.estimate.operation_filter import Operation
@@ -151,8 +151,8 @@ def run_operated_block(
     BenchError
         The orbit does not exist, or the block cannot be adjusted.
     """
-    spec = setup.test.monitor_record
-    if spec is None:
+    spec = None if isinstance(setup, RationalAdjustSetup) else setup.test.monitor_record
+    if spec is None or isinstance(setup, RationalAdjustSetup):
         return run_adjustment(setup, backend, seed, advance, pool)
     named = spec
 
@@ -169,7 +169,11 @@ def run_operated_block(
 
 
 def _prior_of_record(
-    setup: AnyAdjust, spec: MonitorRecordSpec, epochs: Mapping[str, str], lines: Sequence[str], advance: Advance
+    setup: AdjustSetup | MeasuredAdjustSetup,
+    spec: MonitorRecordSpec,
+    epochs: Mapping[str, str],
+    lines: Sequence[str],
+    advance: Advance,
 ) -> JointCameraPrior:
     """Return the prior of the cameras in every pass from the record's estimate."""
     with History(spec.record) as history:

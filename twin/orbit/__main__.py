@@ -63,7 +63,7 @@ add_tests(app, "orbit", apart=("adjust",))
 
 
 @app.command("adjust", help=PROCEDURES["orbit adjust"].about)
-@cli.with_options("export")
+@cli.with_options()
 def adjust(
     file: cli.File,
     options: cli.Options,

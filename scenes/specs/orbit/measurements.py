@@ -235,7 +235,7 @@ class RasterFileSpec(_HeightsFileSpec):
     band: Annotated[Whole, Field(ge=1, le=1000)] = 1
 
 
-_FILE_NAMES = ("file", "geoid", "earth_orientation")
+_FILE_NAMES = ("file", "geoid", "earth_orientation", "rpc")
 """Keys of specifications whose values are paths of files in other formats."""
 FILE_KEYS = ("platform", "orbit", "attitude", "lines", "ground", "image_points", "tie_points")
 """Keys of a pass whose values are paths of its tables."""

@@ -21,6 +21,7 @@ from scenes.specs.orbit.angle import LINES, OrbitAngleSpec, usual_angles
 from scenes.specs.orbit.calibration import OrbitCalibrationSpec, checked_schemes
 from scenes.specs.orbit.jitter_search import OrbitJitterSpec
 from scenes.specs.orbit.monitor import MechanismsSpec, OrbitMonitorSpec
+from scenes.specs.orbit.rational import RationalAdjustSpec, RationalMatchSpec
 from scenes.specs.orbit.scene import LineImageSpec, OrbitSimulateSpec
 from scenes.specs.orbit.three_line_camera import ThreeLineCameraSpec
 from scenes.specs.resolved import ExperimentSetup, ResolvedJob, TestType, line_detector, resolve_job
@@ -425,7 +426,31 @@ class MeasuredAdjustSetup(MeasuredPassesSetup[MeasuredAdjustSpec]):
         return self
 
 
-AnyAdjust = AdjustSetup | MeasuredAdjustSetup
+class RationalSetup(ExperimentSetup[TestType], Generic[TestType]):
+    """Base of tests of images with rational polynomials."""
+
+    FOLDER = load.ORBIT
+
+    @classmethod
+    def parts(cls, test: Any) -> dict[str, Any]:
+        """Make the paths of the test absolute; return field -> content."""
+        return {"test": measurements.with_absolute_files(test, None, test)}
+
+    @classmethod
+    def measured_by(cls, keys: Mapping[str, Any]) -> bool:
+        """Return whether a file with these keys is a test of images with rational polynomials, without a camera."""
+        return "images" in keys and "camera" not in keys
+
+
+class RationalAdjustSetup(RationalSetup[RationalAdjustSpec]):
+    """Block adjustment of images with rational polynomials."""
+
+
+class RationalMatchSetup(RationalSetup[RationalMatchSpec]):
+    """Matching of tie points between images with rational polynomials."""
+
+
+AnyAdjust = AdjustSetup | MeasuredAdjustSetup | RationalAdjustSetup
 AnyAngle = AngleSetup | MeasuredAngleSetup
 AnyCalibration = CalibrationSetup | MeasuredCalibrationSetup
 AnyJitter = JitterSetup | MeasuredJitterSetup
@@ -482,7 +507,7 @@ def without_sensors(setup: AnyAdjust, names: Sequence[str]) -> AnyAdjust:
 
     Parameters
     ----------
-    setup : AdjustSetup | MeasuredAdjustSetup
+    setup : AnyAdjust
         The block.
     names : Sequence[str]
         Names of the sensors.
@@ -507,7 +532,7 @@ def _require_known(what: str, test: Spec, key: KeyPath, names: Iterable[str], kn
             raise test.error(unknown(f"no such {what}", name, known), (*key, name))
 
 
-def _require_sensors(test: OrbitAdjustSpec | MeasuredAdjustSpec) -> None:
+def _require_sensors(test: OrbitAdjustSpec | MeasuredAdjustSpec | RationalAdjustSpec) -> None:
     """Raise `InputError` for an excluded sensor that the block does not have."""
     for name in test.without:
         if name not in test.sensors:

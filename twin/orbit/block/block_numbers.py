@@ -13,6 +13,7 @@ from analysis.block.reweighting import GroupTest
 from analysis.orbit.forward_intersection import Accuracy
 from twin.framework.record import Quantity, Record
 from twin.orbit.block.block_run import BlockRun, CameraChange, SensorContribution
+from twin.orbit.block.rational_block import AdjustedImage
 
 ACCURACY: Record[Accuracy] = Record(
     "90% errors on the ground.",
@@ -105,6 +106,59 @@ CHANGE: Record[CameraChange] = Record(
         )
     ),
 )
+
+
+def _coefficient(k: int, term: str, attribute: str) -> Callable[[AdjustedImage], Any]:
+    def value(image: AdjustedImage) -> Any:
+        return getattr(image, attribute)[k, image.terms.index(term)] if term in image.terms else None
+
+    return value
+
+
+def _rms(k: int, when: str) -> Callable[[AdjustedImage], Any]:
+    def value(image: AdjustedImage) -> Any:
+        return getattr(image, f"rms_{when}")[k]
+
+    return value
+
+
+IMAGE: Record[AdjustedImage] = Record(
+    "Correction of an image with rational polynomials, added to line and sample by the polynomials.",
+    Quantity("points", lambda image: image.points, "number of image points", "points"),
+    *(
+        Quantity(f"{axis}_rms_{when}_px", _rms(k, when), words, f"{axis} rms {when}", 3)
+        for when, words in (
+            ("before", "rms residual of points intersected without corrections"),
+            ("after", "rms residual after the adjustment"),
+        )
+        for k, axis in enumerate(("line", "sample"))
+    ),
+    *(
+        Quantity(
+            f"{term}_{axis}_px{end}", _coefficient(k, term, attribute), f"{meaning}{words}", f"{term} {axis}{words}", 3
+        )
+        for term, meaning in (
+            ("shift", "constant correction"),
+            ("drift", "correction at the last line, zero in the middle"),
+            ("affine", "correction at the last sample, zero in the middle"),
+        )
+        for k, axis in enumerate(("line", "sample"))
+        for end, words, attribute in (
+            ("", "", "value"),
+            ("_sigma", ", sigma", "sigma"),
+            ("_sigma_before", ", prior sigma", "before"),
+        )
+    ),
+    Quantity(
+        "bias_m", lambda image: image.polynomial.bias_m, "ERR_BIAS: rms error of a horizontal axis", "ERR_BIAS", 3
+    ),
+    Quantity("random_m", lambda image: image.polynomial.random_m, "ERR_RAND of the polynomials before", "ERR_RAND", 3),
+    Quantity(
+        "fit_error_px",
+        lambda image: max(image.polynomial.error_px),
+        "largest error of the corrected polynomials against polynomials plus correction",
+    ),
+)
 BLOCK: Record[BlockRun] = Record(
     "Content of block.json: the adjustment of a block of scenes.",
     Quantity(
@@ -131,5 +185,6 @@ BLOCK: Record[BlockRun] = Record(
     Quantity("network", lambda run: run.network, "connections between the scenes", record=NETWORK),
     Quantity("open", lambda run: list(run.open), "combinations that the priors determine", record=OPEN),
     Quantity("cameras", lambda run: run.cameras, "scene -> change of its camera", record=CHANGE),
+    Quantity("images", lambda run: run.images, "image with rational polynomials -> its correction", record=IMAGE),
     Quantity("rejected", lambda run: [list(point) for point in run.rejected], "point and scene of each gross error"),
 )

@@ -12,10 +12,11 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from analysis.orbit.forward_intersection import level_axes
+from scenes.specs.orbit.setup import RationalAdjustSetup
 from twin.framework import svg
 from twin.framework.artefact import SvgFigure, Table
 from twin.framework.report import Report, Section, answer
-from twin.orbit.block.block_numbers import ALARM, CHANGE, CONTRIBUTION, GROUP
+from twin.orbit.block.block_numbers import ALARM, CHANGE, CONTRIBUTION, GROUP, IMAGE
 from twin.orbit.block.block_run import ALL, DATUM_ALARM, BlockRun
 from twin.orbit.measured.pass_measurements import duplicates, listed
 
@@ -66,9 +67,14 @@ def _facts(run: BlockRun) -> tuple[tuple[str, str], ...]:
     block, spec = run.adjustment.assembly.block, run.setup.test
     role = block.points.role
     counts = ", ".join(f"{int(np.sum(role == name))} {name}" for name in ("control", "tie", "check"))
+    scenes: tuple[tuple[str, str], ...] = (("Images", f"{len(block.scenes)} with rational polynomials"),)
+    if not isinstance(run.setup, RationalAdjustSetup):
+        scenes = (
+            ("Camera", f"{run.setup.camera.name}: {', '.join(block.cameras)}"),
+            ("Scenes", f"{len(block.scenes)} of {len(block.passes)} passes"),
+        )
     return (
-        ("Camera", f"{run.setup.camera.name}: {', '.join(block.cameras)}"),
-        ("Scenes", f"{len(block.scenes)} of {len(block.passes)} passes"),
+        *scenes,
         ("Points", counts),
         ("Sensors", ", ".join(sensor.replace("_", " ") for sensor in run.used)),
         ("Unknowns", f"{len(run.adjustment.x)} beside the points, {run.adjustment.iterations} iterations"),
@@ -125,10 +131,27 @@ def _sections(run: BlockRun) -> tuple[Section, ...]:
     return (
         *_ground_section(run),
         Section("Tests of the stated errors", (), (groups,)),
-        Section("Cameras", (), (cameras,)),
+        Section("Images", (), (_images(run),)) if run.images else Section("Cameras", (), (cameras,)),
         Section("Weakly observable combinations", (), (weak,)),
         Section("Check points", (), (points,), folded=1),
     )
+
+
+def _images(run: BlockRun) -> Table:
+    """Return the table of the corrections of images with rational polynomials."""
+    shown = {name: IMAGE(image) for name, image in run.images.items()}
+    terms = dict.fromkeys(term for image in run.images.values() for term in image.terms)
+    absent = tuple(term for term in ("shift", "drift", "affine") if term not in terms)
+    keys = [
+        q.key
+        for q in IMAGE
+        if not q.key.endswith(("_before", "random_m", "fit_error_px")) and not q.key.startswith(absent or "-")
+    ]
+    caption = (
+        "Corrections of line and sample, in pixels, with rms residuals before and after. ERR_BIAS: error of the"
+        " corrected polynomials on the ground, rms of an axis, in metres; errors of several images are correlated."
+    )
+    return IMAGE.table("images", "Images", caption, shown, keys, "image")
 
 
 def _ground_section(run: BlockRun) -> tuple[Section, ...]:

@@ -22,12 +22,13 @@ from analysis.block.point_reduction import Pool
 from analysis.orbit.forward_intersection import Accuracy, level_axes, predicted, realised
 from optics.numerics.backend import one_blas_thread
 from optics.numerics.number_tree import FrozenMap
-from scenes.specs.orbit.setup import AnyAdjust, MeasuredAdjustSetup
+from scenes.specs.orbit.setup import AnyAdjust, MeasuredAdjustSetup, RationalAdjustSetup
 from twin.framework.cluster import ClusterError, Workers, chosen_workers
 from twin.framework.memory import Lowered, require_memory
 from twin.framework.procedure import Advance, BenchError, silent
 from twin.orbit.block.drawn_block import DrawnBlock, draw_block
 from twin.orbit.block.measured_block import MonitorSource, measured_block
+from twin.orbit.block.rational_block import AdjustedImage, adjusted_images, rational_block
 
 if TYPE_CHECKING:
     from optics.numerics.backend import Backend
@@ -147,6 +148,8 @@ class BlockRun:
         Test of a common shift of the control points; None without control points.
     cameras : Mapping[str, CameraChange]
         Scene -> change of its camera.
+    images : Mapping[str, AdjustedImage]
+        Scene with rational polynomials -> its correction.
     check : tuple of ndarray
         Indices (k,) of the k check points, their errors (k, 3) east, north and up, in metres, and the sigmas (k, 3).
     rejected : Rejected
@@ -163,6 +166,7 @@ class BlockRun:
     laws: tuple[LawTest, ...]
     datum: DatumTest | None
     cameras: Mapping[str, CameraChange]
+    images: Mapping[str, AdjustedImage]
     check: tuple[np.ndarray, np.ndarray, np.ndarray]
     rejected: Rejected
 
@@ -213,8 +217,11 @@ def run_adjustment(
     spec = setup.test
     advance("block", 0, 2)
     drawn = None
-    if isinstance(setup, MeasuredAdjustSetup):
-        block, places = measured_block(setup, advance, monitor)
+    if isinstance(setup, MeasuredAdjustSetup | RationalAdjustSetup):
+        if isinstance(setup, RationalAdjustSetup):
+            block, places = rational_block(setup, advance)
+        else:
+            block, places = measured_block(setup, advance, monitor)
         reference = _Reference(places, block.points.covariance, {})
     else:
         _require_memory(setup.test)
@@ -233,8 +240,9 @@ def run_adjustment(
         )
         advance("block", 2, 2)
         contributions = _contributions(accepted_block(adjustment), adjustment, reference, advance, pool)
+        images = adjusted_images(adjustment)
     except (MeasurementError, np.linalg.LinAlgError) as error:
-        key = "data" if drawn is None else "points"
+        key = "points" if drawn else "image_points" if isinstance(setup, RationalAdjustSetup) else "data"
         raise BenchError(str(error), (key,), "more points, or scenes that see the same ground") from error
     where, wrong, spread = _check(adjustment, reference)
     level = level_axes(adjustment.ground[where])
@@ -251,6 +259,7 @@ def run_adjustment(
         law_tests(adjustment),
         datum,
         _cameras(adjustment, reference),
+        images,
         (where, errors, sigma),
         rejected or adjustment.rejected(),
     )
@@ -340,7 +349,7 @@ def _cameras(adjustment: BlockAdjustment, reference: _Reference) -> FrozenMap[st
     block = adjustment.assembly.block
     order = [block_pass.name for block_pass in block.passes]
     rows = {}
-    for scene in block.scenes:
+    for scene in block.line_scenes:
         if scene.name not in adjustment.assembly.changes:
             continue
         value, spread = adjustment.change(scene.name)

@@ -4,7 +4,8 @@ Line and sample are ratios of cubics in latitude, longitude and height, the one 
 reads. Coordinates are scaled to -1 .. 1 over the ground that the fit covers; beyond it the polynomials are not valid.
 Image coordinates count from the centre of the first pixel, heights are above the ellipsoid (WGS84).
 
-Files that are read: RPC00B as text beside an image or inside a GeoTIFF, and the RPC files of DIMAP 2 and 3, of which
+Files that are read: RPC00B as text beside an image (NAME_RPC.TXT, NAME.RPB) or inside a GeoTIFF, and the RPC files of
+DIMAP 2 and 3, of which
 the model from the ground to the image is used. DIMAP 2 counts lines and samples from 1, which becomes 0 here; DIMAP 3
 counts them from 0, as a scene of Pléiades Neo shows, whose RPC file has the first pixel at 0.0005, -0.0006.
 
@@ -16,7 +17,8 @@ from __future__ import annotations
 
 import re
 import warnings
-from dataclasses import replace
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -114,11 +116,13 @@ def _chebyshev_grid(middle: Array, half: Array, counts: tuple[int, ...], at_ends
 
 _AXES = ("LINE", "SAMP", "LAT", "LONG", "HEIGHT")
 _PARTS = ("LINE_NUM", "LINE_DEN", "SAMP_NUM", "SAMP_DEN")
-_WHAT = "rational polynomials: NAME_RPC.TXT, a GeoTIFF with them, or RPC_NAME.XML of DIMAP"
+_WHAT = "rational polynomials: NAME_RPC.TXT, NAME.RPB, a GeoTIFF with them, or RPC_NAME.XML of DIMAP"
 _GROUND_MODELS = {"2": "Inverse_Model", "3": "GroundtoImage_Values"}
 _FIRST_PIXEL = {"2": 1.0, "3": 0.0}
 _TIFF = (".tif", ".tiff")
 _ROW = re.compile(r"\s*([A-Z_0-9]+)\s*[:=]\s*(\S+)\s*(?:[A-Za-z]+\s*)?$")
+_RPB_ROW = re.compile(r"\b(\w+)\s*=\s*(\([^)]*\)|[^;\n]*);", re.S)
+_RPB_AXES = ("line", "samp", "lat", "long", "height")
 _LEAST_SCALE = 1e-9
 
 
@@ -137,6 +141,8 @@ def read_rpc(path: str | Path) -> RationalPolynomial:
     """
     if Path(path).suffix.lower() in _TIFF:
         return _from_tiff(Path(path))
+    if Path(path).suffix.lower() == ".rpb":
+        return _from_rpb(Path(path))
     if any(line.lstrip("\ufeff \t").startswith("<") for line in first_lines(path, _WHAT, 1)):
         return _from_dimap(read_xml(path, _WHAT))
     return _from_text(Path(path))
@@ -201,6 +207,31 @@ def _from_text(path: Path) -> RationalPolynomial:
     )
 
 
+def _from_rpb(path: Path) -> RationalPolynomial:
+    """Read a file NAME.RPB of DigitalGlobe: `key = value;`, with lists of coefficients in parentheses."""
+    file, content = str(path), "\n".join(text_lines(path, _WHAT))
+    found = {name: (text, content.count("\n", 0, at) + 1) for name, text, at in _rpb_rows(content)}
+
+    def values(name: str, count: int) -> list[float]:
+        if name not in found:
+            raise InputError(Issue(f"no {name}", file, None, (name,), None, _WHAT, nearest(name, found)))
+        text, line = found[name]
+        words = text.strip("() \n\t").replace(",", " ").split()
+        if len(words) != count:
+            raise InputError(Issue("another number of values", file, line, (name,), f"{len(words)}", f"{count}"))
+        return numbers(file, [words], [line], [name] * count)[0].tolist()
+
+    offset, scale = ([values(f"{axis}{what}", 1)[0] for axis in _RPB_AXES] for what in ("Offset", "Scale"))
+    names = ("lineNumCoef", "lineDenCoef", "sampNumCoef", "sampDenCoef")
+    errors = [values(name, 1)[0] if name in found else None for name in ("errBias", "errRand")]
+    return _polynomial_of(file, offset, scale, [np.array(values(name, TERMS)) for name in names], errors)
+
+
+def _rpb_rows(content: str) -> list[tuple[str, str, int]]:
+    """Return key, value and position of each assignment of a file NAME.RPB."""
+    return [(row.group(1), row.group(2), row.start()) for row in _RPB_ROW.finditer(content)]
+
+
 def _from_dimap(root: Element) -> RationalPolynomial:
     if root.tag != "Dimap_Document":
         root.wrong("not a DIMAP file", f"<{root.tag}>", "<Dimap_Document>")
@@ -240,10 +271,10 @@ def _from_tiff(path: Path) -> RationalPolynomial:
     )
 
 
-_SLOPE_STEP = 10.0
-"""Step of numerical derivatives on the ground, in metres; the polynomials are linear to 1e-9 over it."""
 _CORRECTED_GRID = (21, 21, 7)
 """Number of lines, samples and heights of the grid to which corrected polynomials are fitted."""
+_RATIONAL_GRID = (11, 11, 5)
+"""The same for a correction that is an affine function, with which the polynomials keep their form."""
 _GROUND_GRID = 5
 """Number of lines and of samples at which errors on the ground are computed."""
 _UNLIKELY = 0.05
@@ -295,29 +326,58 @@ def image_slope(polynomial: RationalPolynomial, latitude: Array, longitude: Arra
 
     They are computed at N positions; latitudes and longitudes are in radians, heights in metres.
     """
+    by_geodetic = polynomial.linearised(np.degrees(latitude), np.degrees(longitude), height)[1]
+    return by_geodetic[..., [1, 0, 2]] * _degrees_per_metre(latitude, height)[..., None, :]
+
+
+def _degrees_per_metre(latitude: Array, height: Array) -> Array:
+    """Return the changes of longitude and latitude (degrees) and of height for a metre east, north and up, (..., 3)."""
     meridian, normal = curvature_radii(latitude)
-    moves = (
-        (0.0, _SLOPE_STEP / ((normal + height) * np.cos(latitude)), 0.0),
-        (_SLOPE_STEP / (meridian + height), 0.0, 0.0),
-        (0.0, 0.0, _SLOPE_STEP),
-    )
-    columns = []
-    for north, east, up in moves:
-        ends = [
-            np.stack(
-                polynomial.image(
-                    np.degrees(latitude + sign * north), np.degrees(longitude + sign * east), height + sign * up
-                ),
-                axis=-1,
-            )
-            for sign in (0.5, -0.5)
-        ]
-        columns.append((ends[0] - ends[1]) / _SLOPE_STEP)
-    return np.stack(columns, axis=-1)
+    east, north = np.degrees(1.0 / ((normal + height) * np.cos(latitude))), np.degrees(1.0 / (meridian + height))
+    return np.stack([east, north, np.ones_like(east)], axis=-1)
+
+
+@dataclass(frozen=True, eq=False)
+class PolynomialImage:
+    """Image with rational polynomials, as a function of ground points in the ITRS.
+
+    Attributes
+    ----------
+    polynomial : RationalPolynomial
+        Rational polynomials.
+    middle, size : (2,) ndarray
+        Middle and half extent of the image in lines and samples, in pixels.
+    """
+
+    polynomial: RationalPolynomial
+    middle: Array
+    size: Array
+
+    def seen(self, ground: Array) -> tuple[Array, Array]:
+        """Return line and sample (n, 2) of n ground points (n, 3), ITRS, in metres, and derivatives (n, 2, 3)."""
+        longitude, latitude, height = Earth().geodetic(ground)
+        position, slope = self.polynomial.linearised(np.degrees(latitude), np.degrees(longitude), height)
+        level = slope[..., [1, 0, 2]] * _degrees_per_metre(latitude, height)[..., None, :]
+        return position, level @ east_north_up(longitude, latitude)
+
+    @classmethod
+    def of(cls, polynomial: RationalPolynomial, shape: tuple[int, int] | None = None) -> PolynomialImage:
+        """Return an image of known numbers of lines and samples, or of the extent that the polynomials state."""
+        if shape is None:
+            return cls(polynomial, polynomial.offset[:2], polynomial.scale[:2])
+        half = 0.5 * (np.array(shape) - 1.0)
+        return cls(polynomial, half, np.maximum(half, 1.0))
+
+    def ground(self, position: Array, height: Array | float) -> Array:
+        """Return the ground points (n, 3), ITRS, in metres, that positions (n, 2) see at heights; NaN for none."""
+        latitude, longitude = self.polynomial.ground(position[:, 0], position[:, 1], height)
+        return np.asarray(Earth().ecef(np.radians(longitude), np.radians(latitude), height))
 
 
 def corrected_polynomial(polynomial: RationalPolynomial, correction: ImageCorrection) -> RationalPolynomial:
     """Return polynomials that include a correction, with its remaining ground errors as ERR_BIAS and ERR_RAND.
+
+    They are fitted over the image and the heights that the scales of the polynomials state.
 
     Parameters
     ----------
@@ -331,18 +391,42 @@ def corrected_polynomial(polynomial: RationalPolynomial, correction: ImageCorrec
     ValueError
         The polynomials cannot be inverted to the ground, or the ground lies at a pole or the 180th meridian.
     """
-    grids, axes = [], [0, 1, 4]
+    corrected = refitted(PolynomialImage.of(polynomial), correction.at, _CORRECTED_GRID)
+    bias, random = _on_the_ground(polynomial, correction)
+    return replace(corrected, bias_m=bias, random_m=random)
+
+
+def refitted(
+    image: PolynomialImage, correction: Callable[[Array, Array], Array], grid: tuple[int, int, int] = _RATIONAL_GRID
+) -> RationalPolynomial:
+    """Return polynomials that include a correction of line and sample, fitted over an image and its heights.
+
+    Parameters
+    ----------
+    image : PolynomialImage
+        Polynomials without the correction, and the extent of the image.
+    correction : callable
+        Function from lines and samples (N,) by the polynomials to their correction (N, 2), in pixels.
+    grid : tuple of int
+        Number of lines, samples and heights of the grid.
+
+    Raises
+    ------
+    ValueError
+        The polynomials cannot be inverted to the ground, or the ground lies at a pole or the 180th meridian.
+    """
+    grids, polynomial = [], image.polynomial
+    middle, half = np.append(image.middle, polynomial.offset[4]), np.append(image.size, polynomial.scale[4])
     for at_ends in (True, False):
-        counts = _CORRECTED_GRID if at_ends else tuple(count - 1 for count in _CORRECTED_GRID)
-        line, sample, height = _chebyshev_grid(polynomial.offset[axes], polynomial.scale[axes], counts, at_ends)
+        counts = grid if at_ends else tuple(count - 1 for count in grid)
+        line, sample, height = _chebyshev_grid(middle, half, counts, at_ends)
         latitude, longitude = polynomial.ground(line, sample, height)
-        moved = np.stack([line, sample], axis=-1) + correction.at(line, sample)
+        moved = np.stack([line, sample], axis=-1) + correction(line, sample)
         ground = np.stack([latitude, longitude, height], axis=-1)
         grids.append((moved[np.isfinite(latitude)], ground[np.isfinite(latitude)]))
-    if min(len(moved) for moved, _ in grids) < np.prod(_CORRECTED_GRID) // 2:
+    if min(len(moved) for moved, _ in grids) < np.prod(grid) // 2:
         raise ValueError("the polynomials cannot be inverted to the ground over their image")
-    bias, random = _on_the_ground(polynomial, correction)
-    return replace(fit_rpc(*grids[0], check=grids[1]), bias_m=bias, random_m=random)
+    return fit_rpc(*grids[0], check=grids[1])
 
 
 def _on_the_ground(polynomial: RationalPolynomial, correction: ImageCorrection) -> tuple[float, float]:
@@ -350,26 +434,33 @@ def _on_the_ground(polynomial: RationalPolynomial, correction: ImageCorrection) 
 
     They are the error of the correction, and the scatter of the control points beyond their own covariances.
     """
-    steps = np.linspace(-1.0, 1.0, _GROUND_GRID)
-    line, sample = (
-        v.ravel()
-        for v in np.meshgrid(*(polynomial.offset[k] + polynomial.scale[k] * steps for k in (0, 1)), indexing="ij")
-    )
-    height = np.full_like(line, polynomial.offset[4])
-    latitude, longitude = (np.radians(v) for v in polynomial.ground(line, sample, height))
-    seen = np.isfinite(latitude)
-    slope = image_slope(polynomial, latitude[seen], longitude[seen], height[seen])[:, :, :2]
-    to_ground = np.linalg.inv(slope)
+    position, to_ground = level_slopes(PolynomialImage.of(polynomial))
     used = correction.used
     predicted = np.einsum("nii->ni", correction.variance)[used]
     beyond = np.zeros(2)
     if correction.probability < _UNLIKELY:
         beyond = np.maximum(np.mean(correction.residual[used] ** 2 - predicted, axis=0), 0.0)
-    covariance = correction.covariance_at(line[seen], sample[seen])
+    covariance = correction.covariance_at(*position.T)
     sigmas = []
     for variance in (covariance, np.broadcast_to(np.diag(beyond), covariance.shape)):
         sigmas.append(axis_sigma(to_ground @ variance @ np.swapaxes(to_ground, 1, 2)))
     return sigmas[0], sigmas[1]
+
+
+def level_slopes(image: PolynomialImage) -> tuple[Array, Array]:
+    """Return line and sample (N, 2) of a grid over an image, and metres east and north per pixel there, (N, 2, 2).
+
+    The ground has the middle height of the polynomials.
+    """
+    steps = np.linspace(-1.0, 1.0, _GROUND_GRID)
+    ends = (middle + size * steps for middle, size in zip(image.middle, image.size, strict=True))
+    position = np.stack([v.ravel() for v in np.meshgrid(*ends, indexing="ij")], axis=-1)
+    height = np.full(len(position), image.polynomial.offset[4])
+    line, sample = position.T
+    latitude, longitude = (np.radians(v) for v in image.polynomial.ground(line, sample, height))
+    seen = np.isfinite(latitude)
+    slope = image_slope(image.polynomial, latitude[seen], longitude[seen], height[seen])
+    return position[seen], np.asarray(np.linalg.inv(slope[:, :, :2]))
 
 
 def residual_sigma(correction: ImageCorrection) -> Array:

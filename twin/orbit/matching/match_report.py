@@ -7,13 +7,16 @@ import numpy as np
 from twin.framework.report import Report, Section, answer
 from twin.orbit.images.point_report import found_table, how_measured, point_artefacts
 from twin.orbit.matching.match_run import IMAGE, Match
+from twin.orbit.matching.rational_match import RationalMatch, rational_report
 
 _FAR = 0.5
 """Share of the search range above which a median displacement is reported as too near the limit of the search."""
 
 
-def match_report(run: Match) -> Report:
+def match_report(run: Match | RationalMatch) -> Report:
     """Return the report of points measured in a user's images: verdict, counts, accuracy and warnings."""
+    if isinstance(run, RationalMatch):
+        return rational_report(run)
     return Report(
         "Points measured in images",
         *_verdict(run),

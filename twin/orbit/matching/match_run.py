@@ -10,14 +10,14 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from analysis.orbit.calibration_parameters import level_covariance
 from optics.numerics.number_tree import FrozenMap
-from scenes.yaml.errors import InputError, Issue, names_text, nearest
-from twin.framework.memory import Lowered, require_memory
+from scenes.specs.orbit.setup import RationalMatchSetup
+from scenes.yaml.errors import names_text, nearest
 from twin.framework.procedure import Advance, BenchError, silent
 from twin.framework.record import Quantity, Record
 from twin.orbit.conventions.pass_readings import (
@@ -45,7 +45,9 @@ from twin.orbit.images.image_points import (
 )
 from twin.orbit.images.pushbroom import Window
 from twin.orbit.images.simulate_run import POINTS
-from twin.orbit.measured.maps import LARGEST_PART, MapPart, UserMap
+from twin.orbit.matching.pixels import read_pixels
+from twin.orbit.matching.rational_match import RATIONAL, RationalMatch, rational_files, run_rational_match
+from twin.orbit.measured.maps import MapPart, UserMap
 from twin.orbit.measured.measurement_tables import campaign_files
 from twin.orbit.measured.pass_measurements import GroundPoints, ImagePoints, PassMeasurements
 from twin.orbit.measured.platform_files import platform_table, read_platform
@@ -61,8 +63,6 @@ _SPARE = 300.0
 """Margin of the map about the images' ground, in metres, in addition to the search range, for errors of camera and
 platform.
 """
-_PIXEL = 30.0
-"""Memory per pixel of an image, including the part of the maps that shows the same ground, in bytes."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,8 +98,12 @@ class Match:
     accuracy: float | None
 
 
-def run_match(setup: MatchSetup, backend: Backend | None, seed: int, advance: Advance = silent) -> Match:
+def run_match(
+    setup: MatchSetup | RationalMatchSetup, backend: Backend | None, seed: int, advance: Advance = silent
+) -> Match | RationalMatch:
     """Measure control, check and tie points in a user's images; nothing is traced or drawn at random.
+
+    Images with rational polynomials have tie points only.
 
     Raises
     ------
@@ -108,6 +112,8 @@ def run_match(setup: MatchSetup, backend: Backend | None, seed: int, advance: Ad
     BenchError
         Points cannot be measured.
     """
+    if isinstance(setup, RationalMatchSetup):
+        return run_rational_match(setup, advance)
     advance("points", 0, 3)
     spec, folder = setup.test, Path()
     readings, conventions = read_platform(spec.platform, folder)
@@ -178,7 +184,7 @@ def _image(spec: LineImageFileSpec, name: str, sensor: Sensor, folder: Path, cou
     """Return the image of a line, one of `count`, with columns along the line's pixels."""
     path = folder / spec.file
     part = spec.window
-    frame = _read_image(path, spec, count)
+    frame = read_pixels(spec.model_copy(update={"file": str(path)}), part, count)
     row, column = (0, 0) if part is None else (part.row, part.column)
     rows, columns = frame.shape
     first_line = spec.first_line + row
@@ -198,37 +204,6 @@ def _image(spec: LineImageFileSpec, name: str, sensor: Sensor, folder: Path, cou
         allowed = f"lines to {sensor.lines - 1}, of which the table has times; or a `window`"
         raise spec.error("an image longer than its line times", ("first_line",), found=found, allowed=allowed)
     return LineFrame(frame, Window(first_line, first_pixel, rows, columns), sensor, (1.0, 1.0))
-
-
-def _read_image(path: Path, spec: LineImageFileSpec, count: int) -> np.ndarray:
-    """Return grey values (rows, columns) of an image or its window; `count` such images must fit into the memory."""
-    from twin.orbit.measured.maps import opened
-
-    file, part = str(path), spec.window
-    with opened(file) as source:
-        from rasterio.windows import Window as Part
-
-        if not 1 <= spec.band <= source.count:
-            raise spec.error("no such band", ("band",), found=spec.band, allowed=f"1 to {source.count}")
-        shape = (source.height, source.width)
-        row, column, rows, columns = (
-            (0, 0, *shape) if part is None else (part.row, part.column, part.rows, part.columns)
-        )
-        if row + rows > shape[0] or column + columns > shape[1]:
-            allowed = f"within {shape[0]} rows and {shape[1]} columns"
-            raise spec.error("a window outside of the image", ("window",), allowed=allowed)
-        if rows * columns > LARGEST_PART:
-            found, allowed = f"{rows} x {columns} pixels", f"a `window:` of at most {LARGEST_PART:.0e} pixels"
-            raise spec.error("too large an image to be matched at once", ("window",), found=found, allowed=allowed)
-        key = ("file",) if part is None else ("window", "rows")
-        unit = "rows in a `window`" if part is None else "rows"
-        require_memory(Lowered(spec, key, rows, unit, lambda n: n * columns * count * _PIXEL, 32))
-        values = np.asarray(source.read(spec.band, window=Part(column, row, columns, rows)))
-    if values.dtype.kind not in "uif":
-        raise InputError(Issue("not grey values", file, found=str(values.dtype), allowed="real numbers"))
-    if not np.all(np.isfinite(values)):
-        raise InputError(Issue("grey values that are not finite", file, allowed="images without gaps, or a `window:`"))
-    return values if values.dtype == np.uint16 else values.astype(np.float32)
 
 
 def _extent(
@@ -332,6 +307,13 @@ MATCH: Record[Match] = Record(
 )
 
 
-def exported(run: Match) -> dict[str, str]:
-    """Return the files of a folder with the measurements of the pass, path -> text."""
+def match_numbers(run: Match | RationalMatch) -> dict[str, Any]:
+    """Return the content of match.json."""
+    return RATIONAL(run) if isinstance(run, RationalMatch) else MATCH(run)
+
+
+def exported(run: Match | RationalMatch) -> dict[str, str]:
+    """Return the files of a folder with the measurements of the pass, or of the tie points, path -> text."""
+    if isinstance(run, RationalMatch):
+        return rational_files(run)
     return campaign_files([run.measurements], run.setup.camera.plain())

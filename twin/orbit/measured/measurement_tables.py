@@ -439,14 +439,14 @@ def _pass_tables(measured: PassMeasurements) -> dict[str, str]:
         lines["time [s]"] += times.time.tolist()
     known = measured.ground.role != "tie"
     tables = {
-        "orbit": _csv(orbit),
-        "attitude": _csv(attitude),
-        "lines": _csv(lines),
-        "ground": _csv(_ground(measured.ground.taken(known))),
-        "image_points": _csv(_images(measured.images, measured.ground, known)),
+        "orbit": csv_text(orbit),
+        "attitude": csv_text(attitude),
+        "lines": csv_text(lines),
+        "ground": csv_text(_ground(measured.ground.taken(known))),
+        "image_points": csv_text(_images(measured.images, measured.ground, known)),
     }
     if np.any(~known):
-        tables["tie_points"] = _csv(_images(measured.images, measured.ground, ~known))
+        tables["tie_points"] = csv_text(_images(measured.images, measured.ground, ~known))
     return tables
 
 
@@ -496,7 +496,7 @@ def _columns(names: Sequence[str], values: np.ndarray) -> dict[str, np.ndarray]:
     return dict(zip(names, values.T, strict=True))
 
 
-def _csv(columns: Mapping[str, Any]) -> str:
+def csv_text(columns: Mapping[str, Any]) -> str:
     """Return a table as CSV text, each number with the fewest digits that reproduce it exactly."""
     cells = [[str(v) for v in np.asarray(c, dtype=object).tolist()] for c in columns.values()]
     rows = [", ".join(columns), *map(",".join, zip(*cells, strict=True))]

@@ -77,8 +77,8 @@ def height_error(drawn: DrawnBlock, bundle: bool) -> float:
     if bundle:
         ground = adjust_block(block).ground
     else:
-        rays = {scene.name: scene.rays for scene in block.scenes}
-        cameras = {scene.name: block.cameras[scene.camera] for scene in block.scenes}
+        rays = {scene.name: scene.rays for scene in block.line_scenes}
+        cameras = {scene.name: block.cameras[scene.camera] for scene in block.line_scenes}
         ground = intersect(rays, cameras, Noise(1e-6), count=len(drawn.ground)).ground
     where = np.flatnonzero(block.points.role == "check")
     error = np.sum((ground - drawn.ground)[where] * vertical(drawn.ground[where]), axis=1)

@@ -1,0 +1,162 @@
+"""Tie points between images with rational polynomials: simulated images of a terrain whose every position is known."""
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.ndimage import gaussian_filter, map_coordinates
+
+from scenes.specs.procedures import PROCEDURES
+from scenes.yaml.csv_table import read_table
+from scenes.yaml.errors import InputError
+from scenes.yaml.yaml_file import dump_yaml
+from tests.twin.rational_bench import HALF, LOOKS, PLACE, polynomial
+from twin.framework.data_files import FrameFacts, tiff
+from twin.framework.procedure import BenchError
+from twin.orbit.block.rational_block import IMAGE_POINTS
+from twin.orbit.export.rational_polynomial import PolynomialImage
+from twin.orbit.flight.earth import Earth
+
+MATCH, ADJUST = PROCEDURES["orbit match"], PROCEDURES["orbit adjust"]
+SIDE = 360
+FIRST = HALF - 0.5 * (SIDE - 1.0)
+"""First line and sample of the crop in the image of the polynomials."""
+SHIFTS = {"first": (1.3, -2.2), "second": (-0.7, 0.4), "third": (2.1, 1.6)}
+"""Errors of the polynomials, measured less predicted, px."""
+TEXTURE = 2048
+
+
+def terrain(north: np.ndarray, east: np.ndarray) -> np.ndarray:
+    """Heights above the mean, metres: hills of 30 m."""
+    return 15.0 * np.sin(north / 60.0) * np.cos(east / 45.0) + 0.1 * north
+
+
+def metres(latitude: np.ndarray, longitude: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    return (latitude - PLACE[0]) * 111_100.0, (longitude - PLACE[1]) * 111_300.0 * np.cos(np.radians(PLACE[0]))
+
+
+class Landscape:
+    """Images of the terrain, and where each sees what."""
+
+    def __init__(self) -> None:
+        rng = np.random.default_rng(12)
+        rough = gaussian_filter(rng.standard_normal((TEXTURE, TEXTURE)), 1.6)
+        self.texture = rough / rough.std() + gaussian_filter(rng.standard_normal(rough.shape), 8.0) * 20.0
+        self.images = {}
+        for name, look in LOOKS.items():
+            whole = polynomial(look)
+            offset = whole.offset - np.array([FIRST, FIRST, 0.0, 0.0, 0.0])
+            self.images[name] = PolynomialImage.of(replace(whole, offset=offset), (SIDE, SIDE))
+
+    def ground(self, name: str, position: np.ndarray) -> np.ndarray:
+        """Latitude, longitude, height (n, 3) of the terrain at true positions (n, 2) of an image."""
+        height = np.full(len(position), 400.0)
+        for _ in range(25):
+            at = (position - SHIFTS[name]).T
+            latitude, longitude = self.images[name].polynomial.ground(*at, height)
+            height = 400.0 + terrain(*metres(latitude, longitude))
+        return np.column_stack([latitude, longitude, height])
+
+    def seen(self, name: str, ground: np.ndarray) -> np.ndarray:
+        """True positions (n, 2) of ground points in an image."""
+        return np.column_stack(self.images[name].polynomial.image(*ground.T)) + SHIFTS[name]
+
+    def picture(self, name: str) -> np.ndarray:
+        grid = np.stack(np.meshgrid(np.arange(SIDE), np.arange(SIDE), indexing="ij"), axis=-1).reshape(-1, 2)
+        north, east = metres(*self.ground(name, grid.astype(float)).T[:2])
+        places = np.stack([north, east]) / 0.4 + 0.5 * TEXTURE
+        grey = map_coordinates(self.texture, places, order=3, mode="wrap").reshape(SIDE, SIDE)
+        noise = np.random.default_rng(len(name)).standard_normal(grey.shape)
+        return np.clip(2000.0 + 300.0 * grey + 10.0 * noise, 0.0, 65535.0).astype(np.uint16)
+
+
+@pytest.fixture(scope="module")
+def landscape() -> Landscape:
+    return Landscape()
+
+
+@pytest.fixture(scope="module")
+def folder(landscape: Landscape, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("images")
+    for name, image in landscape.images.items():
+        facts = FrameFacts(georeference=image.polynomial)
+        (folder / f"{name}.tif").write_bytes(tiff(landscape.picture(name)[None], facts))
+    return folder
+
+
+def run(procedure: Any, folder: Path, **keys: Any) -> Any:
+    file = folder / "file.yaml"
+    images = {name: {"file": f"{name}.tif"} for name in LOOKS}
+    file.write_text(dump_yaml({"name": "hills", "images": images, **keys}))
+    return procedure.run(procedure.resolve(file), None, 0, lambda *_: None)
+
+
+@pytest.fixture(scope="module")
+def found(folder: Path) -> Any:
+    made = run(MATCH, folder, heights=["300 m", "500 m"], points={"tie": 60, "reach": 8})
+    (folder / "ties.csv").write_text(MATCH.export(made)["image_points.csv"])
+    return made
+
+
+@pytest.mark.second
+def test_matches_lie_where_the_terrain_is_seen(landscape: Landscape, found: Any) -> None:
+    wrong, squares = [], []
+    for source, points in found.points.items():
+        ground = landscape.ground(source, points.lines[source].place)
+        for name, line in points.searched_lines.items():
+            assert line.accepted.mean() > 0.4, (source, name)
+            miss = (line.place - landscape.seen(name, ground))[line.accepted]
+            wrong.append(np.abs(miss).max())
+            spread = line.covariance[line.accepted]
+            squares.append(np.einsum("ni,nij,nj->n", miss, np.linalg.inv(spread), miss))
+    assert max(wrong) < 0.3
+    assert np.median(np.concatenate(squares)) < 2.0 * 1.386  # the median of chi-square of two is 1.386
+
+
+@pytest.mark.second
+def test_the_block_of_the_matches_has_the_heights_of_the_terrain(
+    landscape: Landscape, folder: Path, found: Any
+) -> None:
+    block_run = run(ADJUST, folder, image_points="ties.csv", errors={"shift": [3.0, 3.0]})
+    assert block_run.adjustment.p_value > 1e-3
+    for image in block_run.images.values():
+        assert image.rms_after.max() < 0.1 < 0.3 < image.rms_before.max()
+    longitude, latitude, height = Earth().geodetic(block_run.adjustment.ground)
+    # the three shifts in common move the block: plan by 1 m, heights as the priors let them
+    truth = 400.0 + terrain(*metres(np.degrees(latitude), np.degrees(longitude)))
+    off = (height - truth)[np.isfinite(height)]
+    assert 1.4826 * np.median(np.abs(off - np.median(off))) < 0.3
+    assert abs(np.median(off)) < 3.0 * 3.0 * 0.5 / 0.25  # three sigma of the shifts of a base of 0.25 at least
+
+
+@pytest.mark.second
+def test_heights_without_ground_are_refused(folder: Path) -> None:
+    with pytest.raises(BenchError, match="no two images have common points"):
+        run(MATCH, folder, heights=["8000 m", "8100 m"], points={"tie": 20})
+
+
+@pytest.mark.parametrize(
+    ("keys", "words"),
+    [
+        ({"heights": ["500 m", "300 m"]}, "not a range of heights"),
+        ({"heights": ["300 m", "500 m"], "points": {"template": 24}}, "odd"),
+        ({"heights": ["300 m", "500 m"], "images": {"first": {"file": "first.tif"}}}, "a single image"),
+        ({"heights": ["300 m", "500 m"], "images": {"a": {"rpc": "first.tif"}, "b": {"rpc": "first.tif"}}}, "no image"),
+    ],
+)
+def test_files_that_are_refused(tmp_path: Path, keys: dict[str, Any], words: str) -> None:
+    (tmp_path / "first.tif").write_bytes(b"")
+    images = {"first": {"file": "first.tif"}, "second": {"file": "first.tif"}}
+    (tmp_path / "file.yaml").write_text(dump_yaml({"name": "hills", "images": images, **keys}))
+    with pytest.raises(InputError, match=words):
+        MATCH.resolve(tmp_path / "file.yaml")
+
+
+@pytest.mark.second
+def test_the_table_is_what_adjust_reads(folder: Path, found: Any) -> None:
+    table = read_table(folder / "ties.csv", IMAGE_POINTS)
+    assert set(table["image"]) == set(LOOKS)
+    assert len(table) == MATCH.numbers(found)["image_points"]
+    assert f"{MATCH.numbers(found)['tie_points']} tie points" in MATCH.report(found).verdict

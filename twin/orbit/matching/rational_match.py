@@ -1,0 +1,309 @@
+"""Tie points between images that come with rational polynomials (RPC), guided by these and a range of heights.
+
+Distinct points of each image are searched in every other one along their epipolar line: at heights in steps of the
+search radius (vertical line locus), by correlation with the template in the other image's geometry. The best height
+starts the least squares match (`analysis.matching`). Positions across the epipolar line differ from the prediction by
+the errors of the polynomials alone, which are smooth: matches that contradict their neighbours there are rejected.
+Along the line the ground is free within the range of heights.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from analysis.matching.correlation import MatchOptions, Reason, distinct_points, search
+from analysis.matching.matches import DisplacementField, consensus, match_windows
+from analysis.matching.spline import resampled
+from optics.numerics.number_tree import FrozenMap
+from twin.framework.procedure import Advance, BenchError, silent
+from twin.framework.record import Quantity, Record
+from twin.framework.report import Report, Section, answer
+from twin.orbit.block.rational_block import read_image
+from twin.orbit.export.rational_polynomial import PolynomialImage
+from twin.orbit.flight.earth import Earth
+from twin.orbit.images.image_points import CONSENSUS, SOURCE, MatchedLine, MatchedPoints
+from twin.orbit.images.simulate_run import MATCHED, POINTS
+from twin.orbit.matching.pixels import read_pixels
+from twin.orbit.measured.measurement_tables import csv_text
+
+if TYPE_CHECKING:
+    from scenes.specs.orbit.rational import RationalPointsSpec
+    from scenes.specs.orbit.setup import RationalMatchSetup
+
+_TURNS = 3
+"""Number of rounds in which the height of a match is brought to the middle of its epipolar line; one suffices for lines
+that are straight over the search radius."""
+_APART = 3.0
+"""Distance, in pixels along the epipolar line, from which two peaks of the search count as different."""
+_LEAST_RISE = 1e-6
+"""Parallax, in pixels per metre of height, below which two images see the ground from one direction."""
+_NO_FIELD = DisplacementField(np.zeros((1, 2)), np.zeros(2), 1.0, 0, None)
+"""Displacement of images with too few matches."""
+_LEAST = 6
+"""Smallest number of matches of two images: twice the terms of a linear displacement."""
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """Image with its rational polynomials.
+
+    Attributes
+    ----------
+    values : (lines, samples) ndarray
+        Grey values.
+    image : PolynomialImage
+        Rational polynomials.
+    """
+
+    values: np.ndarray
+    image: PolynomialImage
+
+
+@dataclass(frozen=True, eq=False)
+class RationalMatch:
+    """Tie points between images with rational polynomials.
+
+    Attributes
+    ----------
+    setup : RationalMatchSetup
+        Test file.
+    points : Mapping[str, MatchedPoints]
+        Image in which points were chosen -> the points with their matches in every other image that shows them.
+    """
+
+    setup: RationalMatchSetup
+    points: FrozenMap[str, MatchedPoints]
+
+    @property
+    def table(self) -> dict[str, list[Any]]:
+        """Columns of the table of image points: all points that two images or more see."""
+        heads = ("point", "image", "line", "sample", "line_sigma", "sample_sigma", "correlation")
+        columns: dict[str, list[Any]] = {head: [] for head in heads}
+        for source, points in self.points.items():
+            seen = np.sum([line.accepted for line in points.lines.values()], axis=0) >= 2
+            for name, line in points.lines.items():
+                which = np.flatnonzero(line.accepted & seen)
+                measured = line.measured(which, which)
+                sigma = np.sqrt(np.diagonal(measured.covariance, axis1=1, axis2=2))
+                columns["point"] += [f"{source}-{k}" for k in which.tolist()]
+                columns["image"] += [name] * len(which)
+                like = measured.covariance[:, 0, 1] / sigma[:, 0] / sigma[:, 1]
+                values = (measured.line, measured.pixel, sigma[:, 0], sigma[:, 1], like)
+                for head, column in zip(heads[2:], values, strict=True):
+                    columns[head] += column.tolist()
+        return columns
+
+
+def run_rational_match(setup: RationalMatchSetup, advance: Advance = silent) -> RationalMatch:
+    """Match tie points between images with rational polynomials; nothing is drawn at random.
+
+    Raises
+    ------
+    InputError
+        A file cannot be read.
+    BenchError
+        No two images have common points.
+    """
+    spec = setup.test
+    frames = {}
+    for name, image in spec.images.items():
+        frames[name] = Frame(read_pixels(image, None, len(spec.images)), read_image(image))
+    points: dict[str, MatchedPoints] = {}
+    for k, source in enumerate(frames):
+        advance("points", k, len(frames))
+        points[source] = _points_of(source, frames, spec.heights, spec.points)
+    advance("points", len(frames), len(frames))
+    if not any(line.accepted.any() for group in points.values() for line in group.searched_lines.values()):
+        texts = [line.text for group in points.values() for line in group.searched_lines.values()]
+        problem = f"no two images have common points: {texts[0] if texts else 'they show different ground'}"
+        raise BenchError(problem, ("heights",), "the heights of the ground that they show, or a larger points.reach")
+    return RationalMatch(setup, FrozenMap(points))
+
+
+def _points_of(
+    source: str, frames: dict[str, Frame], heights: tuple[float, float], spec: RationalPointsSpec
+) -> MatchedPoints:
+    """Return distinct points of an image, matched in every other image that shows enough of them."""
+    frame = frames[source]
+    border = spec.template // 2 + spec.reach
+    if min(frame.values.shape) <= 2 * border + 1:
+        shape = " x ".join(str(n) for n in frame.values.shape)
+        problem = f"{source}: {shape} pixels have no room for a template of {spec.template} pixels and its search"
+        raise BenchError(problem, ("points",), "a larger image, or a smaller reach or template")
+    place = distinct_points(frame.values, spec.tie, spacing=max(0.5 * spec.template, 1.0), border=border)
+    count = len(place)
+    none = np.zeros(count)
+    chosen = MatchedLine(
+        place, place, np.zeros((count, 2, 2)), none + 1.0, np.full(count, SOURCE), (0, 0), 0.0, f"{count} points chosen"
+    )
+    lines, levels = {source: chosen}, np.full((len(frames), count), np.nan)
+    for k, (name, other) in enumerate(frames.items()):
+        if name != source and count:
+            lines[name], levels[k] = _searched(frame, other, place, heights, spec)
+    known = np.isfinite(levels).any(axis=0)
+    height = np.full(count, 0.5 * sum(heights))
+    height[known] = np.nanmean(levels[:, known], axis=0)
+    ground = frame.image.ground(place, height)
+    return MatchedPoints("tie", none, none, height, ground, none.astype(bool), FrozenMap(lines))
+
+
+def _searched(
+    frame: Frame, other: Frame, place: np.ndarray, heights: tuple[float, float], spec: RationalPointsSpec
+) -> tuple[MatchedLine, np.ndarray]:
+    """Return n points of one image matched in another one, and their heights (n,), NaN where they were not accepted."""
+    options = MatchOptions(least_correlation=spec.least_correlation, largest_sigma=spec.largest_sigma)
+    middle = np.full(len(place), 0.5 * sum(heights))
+    _, rise = _seen(frame, other, place, middle)
+    length = np.nanmax(np.linalg.norm(rise, axis=1), initial=0.0)
+    steps = int(np.ceil((heights[1] - heights[0]) * length / spec.reach)) + 1
+    templates = _templates(frame, other, place, middle, spec.template)
+    levels = np.linspace(*heights, steps) if steps > 1 else middle[:1]
+    positions, values = np.full((len(levels), len(place), 2), np.nan), np.full((len(levels), len(place)), -1.0)
+    for k, level in enumerate(levels.tolist()):
+        expected, _ = _seen(frame, other, place, np.full(len(place), level))
+        peaks = search(other.values, templates, expected, spec.reach)
+        found = peaks.reason == Reason.ACCEPTED
+        positions[k], values[k] = peaks.position, np.where(found, peaks.value, -1.0)
+    best = np.argmax(values, axis=0)
+    which = np.arange(len(place))
+    peak, value = positions[best, which], values[best, which]
+    # another peak along the epipolar line, as in regular patterns
+    apart = np.linalg.norm(positions - peak, axis=2) > _APART
+    rival = np.max(np.where(apart, values, -1.0), axis=0)
+    height = levels[best]
+    for _ in range(_TURNS):
+        at, rise = _seen(frame, other, place, height)
+        square = np.sum(rise**2, axis=1)
+        along = np.sum((peak - at) * rise, axis=1) / np.maximum(square, _LEAST_RISE**2)
+        height = np.clip(height + np.where(square > _LEAST_RISE**2, along, 0.0), heights[0], heights[1])
+    height = np.where(value > 0.0, height, middle)
+    templates = _templates(frame, other, place, height, spec.template)
+    start = np.where(value[:, None] > 0.0, peak, np.nan)
+    templates[~np.isfinite(start[:, 0])] = np.nan
+    match = match_windows(other.values, templates, np.nan_to_num(start), search_radius=2, options=options)
+    status = match.reason.astype(np.int64)
+    status[~np.isfinite(start[:, 0])] = Reason.OUTSIDE
+    status[(status == 0) & (rival > options.largest_ratio * value)] = Reason.AMBIGUOUS
+    return _agreed(
+        frame, other, place, height, heights, match.position, match.covariance, match.correlation, status, spec
+    )
+
+
+def _agreed(
+    frame: Frame,
+    other: Frame,
+    place: np.ndarray,
+    height: np.ndarray,
+    heights: tuple[float, float],
+    position: np.ndarray,
+    covariance: np.ndarray,
+    correlation: np.ndarray,
+    status: np.ndarray,
+    spec: RationalPointsSpec,
+) -> tuple[MatchedLine, np.ndarray]:
+    """Return the matches without those that contradict their neighbours across the epipolar line, and their heights."""
+    good = status == 0
+    at, rise = _seen(frame, other, place, height)
+    unit = rise / np.maximum(np.linalg.norm(rise, axis=1, keepdims=True), _LEAST_RISE)
+    across = np.stack([-unit[:, 1], unit[:, 0]], axis=1)
+    miss = np.where(good[:, None], position - at, np.nan)
+    sideways = np.sum(miss * across, axis=1)
+    variance = np.einsum("ni,nij,nj->n", across, covariance, across) + spec.roughness**2
+    field, scatter, text = _NO_FIELD, 0.0, f"{int(good.sum())} matches are too few for a consensus"
+    if good.sum() >= 2 * _LEAST:
+        agreed = consensus(
+            at,
+            at + sideways[:, None] * across,
+            covariance=variance[:, None, None] * np.eye(2),
+            degree=1,
+            false_alarm=spec.false_alarm,
+        )
+        status[good & ~agreed.accepted] = CONSENSUS
+        field, scatter, text = agreed.field, agreed.scatter, agreed.text
+    else:
+        status[good] = CONSENSUS
+    along = np.sum(miss * unit, axis=1) / np.maximum(np.linalg.norm(rise, axis=1), _LEAST_RISE)
+    level = np.where(status == 0, height + along, np.nan)
+    outside = (level < heights[0]) | (level > heights[1])
+    status[outside] = Reason.OUTSIDE
+    matched = MatchedLine(at, position, covariance, correlation, status, (0, 0), scatter, text, field)
+    return matched, np.where(outside, np.nan, level)
+
+
+def _seen(frame: Frame, other: Frame, place: np.ndarray, height: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return positions (n, 2) in another image of points of one image at heights, and pixels per metre of height."""
+    ground = frame.image.ground(place, height)
+    position, slope = other.image.seen(ground)
+    # the point moves along the line of sight of the first image
+    step = frame.image.ground(place, height + 1.0) - ground
+    return position, np.einsum("nij,nj->ni", slope, step)
+
+
+def _templates(frame: Frame, other: Frame, place: np.ndarray, height: np.ndarray, side: int) -> np.ndarray:
+    """Return n templates of one image, (n, side, side), in the geometry of the other image at heights of the ground."""
+    ground = frame.image.ground(place, height)
+    longitude, latitude, _ = Earth().geodetic(ground)
+    level = np.stack([-np.sin(longitude), np.cos(longitude), np.zeros_like(longitude)], axis=1)
+    up = np.stack(
+        [np.cos(latitude) * np.cos(longitude), np.cos(latitude) * np.sin(longitude), np.sin(latitude)], axis=1
+    )
+    axes = np.stack([level, np.cross(up, level)], axis=2)
+    here, there = (one.image.seen(ground)[1] @ axes for one in (frame, other))
+    defined = np.isfinite(here).all(axis=(1, 2)) & np.isfinite(there).all(axis=(1, 2))
+    affine = np.full_like(here, np.nan)
+    affine[defined] = here[defined] @ np.linalg.inv(there[defined])
+    grid = np.arange(side) - side // 2
+    down, right = np.meshgrid(grid, grid, indexing="ij")
+    offset = np.einsum("nij,jkl->nikl", affine, np.stack([down, right]))
+    at = place[:, :, None, None] + offset
+    return resampled(frame.values, at[:, 0], at[:, 1])
+
+
+def _both(run: RationalMatch) -> int:
+    return len(set(run.table["point"]))
+
+
+RATIONAL: Record[RationalMatch] = Record(
+    "match.json of images with rational polynomials.",
+    Quantity("tie_points", _both, "points that two images or more see"),
+    Quantity("image_points", lambda run: len(run.table["point"]), "image points of these"),
+    Quantity("points", lambda run: run.points, "image in which points were chosen -> matches", record=POINTS),
+)
+
+
+def rational_report(run: RationalMatch) -> Report:
+    """Return the report of tie points between images: verdict, counts and displacements across the epipolar lines."""
+    pairs = {
+        f"{source} in {name}": line
+        for source, points in run.points.items()
+        for name, line in points.searched_lines.items()
+    }
+    rows = {name: MATCHED(line) for name, line in pairs.items() if line.accepted.any()}
+    keys = ("found", "matched", "accepted", "displacement_lines_px", "displacement_pixels_px", "consensus_scatter_px")
+    caption = (
+        "Displacement: median of the accepted from the prediction at the height of each point, in lines and samples;"
+        " it is that of the polynomials across the epipolar lines. Scatter: beyond the covariances."
+    )
+    table = MATCHED.table("points-found", "Matching", caption, rows, keys, "points", digits=4)
+    heads = sorted(pairs, key=lambda name: float(pairs[name].accepted.mean()))
+    verdict, more = answer(
+        f"{_both(run)} tie points were measured in {len(run.points)} images",
+        f"the share of accepted points is lowest for {heads[0]}, {pairs[heads[0]].accepted.mean():.0%}",
+    )
+    low, high = run.setup.test.heights
+    facts = (("Heights", f"{low:g} to {high:g} m"), ("Description", run.setup.test.description))
+    lost = [
+        f"{name}: " + ", ".join(f"{number} {reason}" for reason, number in line.rejections.items())
+        for name, line in pairs.items()
+    ]
+    return Report(
+        "Tie points", verdict, more, facts, table, (Section("Why points were not accepted", tuple(lost), ()),)
+    )
+
+
+def rational_files(run: RationalMatch) -> dict[str, str]:
+    """Return the table of image points for ``python -m twin.orbit adjust``, path -> text."""
+    return {"image_points.csv": csv_text(run.table)}
