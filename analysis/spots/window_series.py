@@ -233,6 +233,11 @@ def _terms(state: _State, pixels: _Pixels, prior: SeriesPrior) -> dict[str, Arra
     )
 
 
+def _total(terms: dict[str, Array]) -> Array:
+    """Return the covariance of the pixels (P, P) by all causes together."""
+    return np.sum(list(terms.values()), axis=0)
+
+
 def fit_window_series(
     images: ArrayLike,
     noise: NoiseModel | None = None,
@@ -302,7 +307,7 @@ def fit_window_series(
             learnt = _learn(part, some, *_linearised(part, some, g[use], slopes[:, use]), starts, noise is None)
             starts = (learnt,)
         terms = _terms(state, pixels, learnt)
-        solver = _Solver(sum(terms.values()), design)
+        solver = _Solver(_total(terms), design)
         step = solver.estimator @ rest
         left = solver.projector @ rest
         g, slopes = _shape_of(state, pixels, learnt, left)
@@ -474,7 +479,8 @@ def _some_frames(state: _State, pixels: _Pixels) -> tuple[_State, _Pixels, NDArr
     part = replace(
         pixels, value=pixels.value[use], level=pixels.level[use], frame=frame, place=pixels.place[use], same=same
     )
-    return _State(*(v[chosen] for v in (state.position, state.flux, state.background)), state.width), part, use
+    some = _State(state.position[chosen], state.flux[chosen], state.background[chosen], state.width)
+    return some, part, use
 
 
 def _learn(
@@ -488,7 +494,7 @@ def _learn(
     def target(logs: Array) -> tuple[float, Array]:
         now = priors(logs)
         terms = _terms(state, pixels, now)
-        solver = _Solver(sum(terms.values()), design)
+        solver = _Solver(_total(terms), design)
         left = solver.projector @ rest
         value = solver.log_determinant + float(np.linalg.slogdet(solver.information)[1]) + float(rest @ left)
         changes = [2.0 * terms["shape"]]

@@ -21,7 +21,7 @@ from scenes.yaml.csv_table import Column, Table, read_table
 from scenes.yaml.errors import InputError, Issue, Problem
 from scenes.yaml.units import ANGLE, DISTANCE, SPEED, TIME
 from twin.orbit.flight.earth import Earth
-from twin.orbit.flight.light_effects import NO_EFFECTS
+from twin.orbit.flight.light_effects import NO_EFFECTS, LightEffects
 from twin.orbit.flight.line_camera import polynomial_line
 from twin.orbit.flight.platform_table import PlatformTable, TabulatedTrajectory
 from twin.orbit.flight.sensor import Sensor
@@ -440,8 +440,8 @@ class DimapScene:
     epoch: str
 
 
-def read_scene(path: str | Path, band: str | None = None) -> DimapScene:
-    """Read the scene of a DIMAP file, whose light is refracted where the file specifies it.
+def read_scene(path: str | Path, band: str | None = None, effects: LightEffects | None = None) -> DimapScene:
+    """Read the scene of a DIMAP file.
 
     Parameters
     ----------
@@ -449,6 +449,8 @@ def read_scene(path: str | Path, band: str | None = None) -> DimapScene:
         File DIM_*.XML of the product.
     band : str or None
         Band whose lines of sight are read; may be omitted where all bands have the same.
+    effects : LightEffects or None
+        Effects on the light; None for refraction alone, where the file specifies it.
 
     Raises
     ------
@@ -460,7 +462,8 @@ def read_scene(path: str | Path, band: str | None = None) -> DimapScene:
     table = platform_table(readings, _ITRS)
     trajectory = TabulatedTrajectory(table)
     first = float(read.first_line.instants("UTC").since(table.epoch)[0])
-    effects = replace(NO_EFFECTS, refraction=read.refracted)
+    if effects is None:
+        effects = replace(NO_EFFECTS, refraction=read.refracted)
     camera = polynomial_line(read.name, read.pixels, read.forward, read.right)
     try:
         sensor = Sensor(camera, trajectory, Earth(), read.line_time, first, read.lines, effects)
