@@ -302,7 +302,7 @@ def fit_window_series(
             learnt = _learn(part, some, *_linearised(part, some, g[use], slopes[:, use]), starts, noise is None)
             starts = (learnt,)
         terms = _terms(state, pixels, learnt)
-        solver = _Solver(sum(terms.values()), design)
+        solver = _Solver(np.sum(list(terms.values()), axis=0), design)
         step = solver.estimator @ rest
         left = solver.projector @ rest
         g, slopes = _shape_of(state, pixels, learnt, left)
@@ -474,7 +474,8 @@ def _some_frames(state: _State, pixels: _Pixels) -> tuple[_State, _Pixels, NDArr
     part = replace(
         pixels, value=pixels.value[use], level=pixels.level[use], frame=frame, place=pixels.place[use], same=same
     )
-    return _State(*(v[chosen] for v in (state.position, state.flux, state.background)), state.width), part, use
+    few = _State(state.position[chosen], state.flux[chosen], state.background[chosen], state.width)
+    return few, part, use
 
 
 def _learn(
@@ -488,7 +489,7 @@ def _learn(
     def target(logs: Array) -> tuple[float, Array]:
         now = priors(logs)
         terms = _terms(state, pixels, now)
-        solver = _Solver(sum(terms.values()), design)
+        solver = _Solver(np.sum(list(terms.values()), axis=0), design)
         left = solver.projector @ rest
         value = solver.log_determinant + float(np.linalg.slogdet(solver.information)[1]) + float(rest @ left)
         changes = [2.0 * terms["shape"]]

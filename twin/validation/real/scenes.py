@@ -103,7 +103,7 @@ def _pleiades(context: Context, paths: list[Path]) -> Iterator[CheckResult]:
             found = compare_product(scene.sensor, polynomials, str(path))
             alone = found.largest if name == "rpc" else alone
             implied = {"rpc": 0.0, "refraction": alone}.get(name)
-            facts = {"rms": found.rms, "mean": found.mean, "heights": found.heights}
+            facts: dict[str, Any] = {"rms": found.rms, "mean": found.mean, "heights": found.heights}
             yield context.row(f"real.pleiades.{name}", found.largest, None, implied, **facts)
 
 
