@@ -233,11 +233,6 @@ def _terms(state: _State, pixels: _Pixels, prior: SeriesPrior) -> dict[str, Arra
     )
 
 
-def _total(terms: dict[str, Array]) -> Array:
-    """Return the covariance of the pixels (P, P) by all causes together."""
-    return np.sum(list(terms.values()), axis=0)
-
-
 def fit_window_series(
     images: ArrayLike,
     noise: NoiseModel | None = None,
@@ -307,7 +302,7 @@ def fit_window_series(
             learnt = _learn(part, some, *_linearised(part, some, g[use], slopes[:, use]), starts, noise is None)
             starts = (learnt,)
         terms = _terms(state, pixels, learnt)
-        solver = _Solver(_total(terms), design)
+        solver = _Solver(np.sum(list(terms.values()), axis=0), design)
         step = solver.estimator @ rest
         left = solver.projector @ rest
         g, slopes = _shape_of(state, pixels, learnt, left)
@@ -479,8 +474,8 @@ def _some_frames(state: _State, pixels: _Pixels) -> tuple[_State, _Pixels, NDArr
     part = replace(
         pixels, value=pixels.value[use], level=pixels.level[use], frame=frame, place=pixels.place[use], same=same
     )
-    some = _State(state.position[chosen], state.flux[chosen], state.background[chosen], state.width)
-    return some, part, use
+    few = _State(state.position[chosen], state.flux[chosen], state.background[chosen], state.width)
+    return few, part, use
 
 
 def _learn(
@@ -494,7 +489,7 @@ def _learn(
     def target(logs: Array) -> tuple[float, Array]:
         now = priors(logs)
         terms = _terms(state, pixels, now)
-        solver = _Solver(_total(terms), design)
+        solver = _Solver(np.sum(list(terms.values()), axis=0), design)
         left = solver.projector @ rest
         value = solver.log_determinant + float(np.linalg.slogdet(solver.information)[1]) + float(rest @ left)
         changes = [2.0 * terms["shape"]]
