@@ -117,8 +117,8 @@ def ghosts(
     >>> mirror = OpticalSurface(-4.0, -1.8, -1.0, "mirror", diameter=0.1)
     >>> window = [OpticalSurface(thickness=-0.006, material=1.5), OpticalSurface(thickness=-0.2)]
     >>> (ghost,) = ghosts(Camera([mirror, *window], wavelength=550e-9).refocused(), detector=0.0)
-    >>> f"{1e3 * ghost.focus:.4f} mm, {ghost.energy:.4%}"
-    '-8.0000 mm, 0.1601%'
+    >>> f"{1e3 * ghost.focus:.4f} mm, {ghost.energy:.2%}"
+    '-8.0000 mm, 0.16%'
     """
     given = {f"s{k}": share for k, share in (coatings or {}).items()}
     names = camera._assembly.sequences["image"]

@@ -146,7 +146,7 @@ class Polygon:
 
 @dataclass(frozen=True, eq=False)
 class Disk:
-    """Disk or ellipse: the points centre + radius * stretch @ p, with p all points of the unit disk.
+    """Disk or ellipse: the points centre + radius * linear_map @ p, with p all points of the unit disk.
 
     Attributes
     ----------
@@ -160,7 +160,7 @@ class Disk:
     Raises
     ------
     ValueError
-        The radius is not positive, or the stretch has no inverse.
+        The radius is not positive, or the linear map has no inverse.
     """
 
     centre: np.ndarray
@@ -168,13 +168,13 @@ class Disk:
     linear_map: np.ndarray = field(default_factory=lambda: np.eye(2))
 
     def __post_init__(self) -> None:
-        """Freeze the arrays, and check that the radius is positive and the stretch has an inverse."""
+        """Freeze the arrays, and check that the radius is positive and the linear map has an inverse."""
         object.__setattr__(self, "centre", _vector(self.centre, "the centre of a disk"))
         object.__setattr__(self, "linear_map", _frozen(self.linear_map))
         if not (np.isfinite(self.radius) and self.radius > 0.0):
             raise ValueError(f"a disk needs a positive radius, found {self.radius}")
         if self.linear_map.shape != (2, 2) or not self.area > 0.0:
-            raise ValueError("a disk needs a stretch of shape (2, 2) that has an inverse")
+            raise ValueError("a disk needs a linear map of shape (2, 2) that has an inverse")
 
     @property
     def area(self) -> float:
@@ -190,7 +190,7 @@ class Disk:
     def spectrum(self, fx: np.ndarray, fy: np.ndarray) -> np.ndarray:
         """Return the Fourier transform of the disk or ellipse, in m^2.
 
-        It is area * 2 J1(q)/q with q = |radius stretch^T k|, where k is 2 pi times the frequency and J1 a Bessel
+        It is area * 2 J1(q)/q with q = |radius linear_map^T k|, where k is 2 pi times the frequency and J1 a Bessel
         function.
 
         Parameters

@@ -119,11 +119,11 @@ def test_principal_point_over_a_narrow_field():
     point = found.point
     assert not point.observable
     for part in ("not observable over +-1.25 deg", "take p = 0", "eq. 3", "0.44 um, compared with 1 um", "decentring"):
-        assert part in point.comparison
+        assert part in point.sentence
     # not fitted: the same, said of the p that could have been
     without = fit_interior_orientation(position, GF7, UM, ("constant", "principal_distance")).point
-    assert f"p is fixed at zero; if fitted, its sigma would be {1e3 * expected:.2g} mm" in without.comparison
-    assert "not observable" in without.comparison
+    assert f"p is fixed at zero; if fitted, its sigma would be {1e3 * expected:.2g} mm" in without.sentence
+    assert "not observable" in without.sentence
 
 
 def test_principal_point_over_a_wide_field():
@@ -136,16 +136,16 @@ def test_principal_point_over_a_wide_field():
     assert abs(found.value("principal_point") - 50e-6) < stats.norm.isf(FALSE_ALARM / 2) * found.sigma(
         "principal_point"
     )
-    assert ": observable over +-20 deg" in found.point.comparison
-    assert "take p = 0" not in found.point.comparison
+    assert ": observable over +-20 deg" in found.point.sentence
+    assert "take p = 0" not in found.point.sentence
 
 
 def test_a_large_tan_squared_term_over_a_narrow_field_is_not_called_zero():
     position = line_image(GF7, point=20e-3)
     point = fit_interior_orientation(position, GF7, UM, ("constant", "principal_distance", "principal_point")).point
     assert not point.observable
-    assert "take p = 0" not in point.comparison
-    assert "decentring" in point.comparison
+    assert "take p = 0" not in point.sentence
+    assert "decentring" in point.sentence
 
 
 # ---- bad input

@@ -248,7 +248,7 @@ def test_a_journal_keeps_every_bit_and_is_of_one_search(facts: tuple[BeamFacts, 
     assert again.beam == FIRST
     for name in ("taken", "facets", "light"):
         assert np.array_equal(getattr(again, name), getattr(facts[0], name))
-    for name in ("shared", "own", "parameters"):
+    for name in ("shared", "individual", "parameters"):
         assert np.array_equal(getattr(again.seen["mirrors.yaml"], name), getattr(facts[0].seen["mirrors.yaml"], name))
 
 
