@@ -80,6 +80,11 @@ def inline(text: str) -> Markup:
 _CODE = re.compile("`([^`]+)`")
 
 
+def style_sheet() -> str:
+    """Return the style sheet of reports."""
+    return (files(__package__) / "sheet.css").read_text("utf-8")
+
+
 @cache
 def _template() -> Template:
     """Return the Jinja template of a report's HTML page."""

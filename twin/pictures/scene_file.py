@@ -34,7 +34,7 @@ from scenes.models.instrument_model import Instrument
 from scenes.models.meshes import BOARD, CHIP, behind, board_size, body_outline, lens_mesh, mirror_mesh
 from scenes.specs.baffle import Plate
 from scenes.specs.instrument import BASE, Channel
-from twin.framework.page import page_policy
+from twin.framework.page import page_policy, style_sheet
 from twin.pictures.light_paths import RIM, Beam, LightPaths
 
 LINE_WIDTH = 0.002
@@ -354,7 +354,7 @@ def viewer_page(title: str, scene: bytes, moved: str, still: Markup) -> str:
     still : Markup
         Figure for browsers without WebGL.
     """
-    style = files("twin.framework").joinpath("sheet.css").read_text("utf-8")
+    style = style_sheet()
     page = Markup(_HERE.joinpath("view.html").read_text("utf-8"))
     allowed, programs = page_policy(style, viewer_programs()), viewer_scripts(scene)
     return page.format(
