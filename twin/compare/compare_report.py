@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -26,7 +26,7 @@ MOST_BARS = 30
 _MOST_IMAGES = 8
 """Largest number of differing images that the report shows."""
 
-_HEADLINES = (
+_HEADLINES: tuple[tuple[str, str, Callable[[list[float]], float], str], ...] = (
     ("optics.json", r"wfe_worst_waves", max, "worst wavefront error [waves]"),
     ("optics.json", r"mtf_at_nyquist\[.*\]\.along_\w+", min, "lowest MTF of the optics at Nyquist"),
     ("optics.json", r"first_order\.focal_length_m", max, "focal length [m]"),

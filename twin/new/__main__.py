@@ -10,6 +10,7 @@ if __name__ == "__main__":
 import sys
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 from inspect import Parameter
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -175,20 +176,21 @@ def _answers(kind: str, given: Mapping[str, str | None], numbers: CameraNumbers)
     questions = NEW[kind].questions
     out = {name: str(getattr(numbers, QUESTIONS[name].default, QUESTIONS[name].default)) for name in questions}
 
-    def check(changed: Mapping[str, str]) -> None:
+    def check(name: str = "", value: str = "") -> None:
+        changed = {name: value} if name else {}
         checked_text(kind, numbers, {**out, **changed, "file": f"{kind}.yaml", "base": "job.yaml"})
 
     for name, value in given.items():
         if value is not None:
             try:
-                check({name: value})
+                check(name, value)
             except InputError as error:
                 raise InputError(Issue(f"--{name}: {_reason(error)}")) from None
             out[name] = value
-    check({})
+    check()
     for name in questions:
         if given[name] is None and _is_terminal():
-            out[name] = _ask(QUESTIONS[name].text, out[name], lambda value, name=name: check({name: value}))
+            out[name] = _ask(QUESTIONS[name].text, out[name], partial(check, name))
     return out
 
 

@@ -377,7 +377,8 @@ def _merit_result(
         levels(by_model[1]),
         Yield.count(passing),
         (float(np.mean(merit.passes(by_model[0]))), float(np.mean(merit.passes(by_model[1])))),
-        *(FrozenMap(zip(bench.entries, s[:, m].tolist(), strict=True)) for s in (shares.values, shares.errors)),
+        FrozenMap(zip(bench.entries, shares.values[:, m].tolist(), strict=True)),
+        FrozenMap(zip(bench.entries, shares.errors[:, m].tolist(), strict=True)),
     )
 
 
