@@ -11,7 +11,7 @@ from typing import Any
 
 from scenes.specs.course import noll
 from scenes.yaml.errors import Problem, names_text, nearest, shown, unknown
-from scenes.yaml.units import split_quantity
+from scenes.yaml.units import SCALE, parse_quantity, split_quantity
 
 AXES = {"x": 0, "y": 1, "z": 2}
 KINDS = {
@@ -173,8 +173,22 @@ def _pure(kind: str, quantity: str, text: str) -> float:
     except ValueError:
         amount = math.nan
     if not math.isfinite(amount):
-        raise Problem(f"a change of the {kind} is a pure number", shown(quantity or text), f"M2 {kind} 1e-4")
+        raise Problem(
+            f"a change of the {kind} is a pure number", shown(quantity or text), _instead(kind, quantity, text)
+        )
     return amount
+
+
+def _instead(kind: str, quantity: str, text: str) -> str:
+    """Return what is allowed in place of an amount that is no pure number; for a share, the same change as a number."""
+    node = text.split()[0]
+    try:
+        share = parse_quantity(quantity, SCALE)
+    except Problem:
+        return f"M2 {kind} 1e-4"
+    value, name = (-1.0, "conic constant") if kind == "conic" else (1.5, "refractive index")
+    example = f"{node} {kind} {share * value:.6g} if that is {value:g}"
+    return f"a number; {quantity} is {share:.6g} times the {name} of {node} in its camera file, such as {example}"
 
 
 def perturbation_in_words(texts: Iterable[str]) -> dict[str, dict[str, Any]]:

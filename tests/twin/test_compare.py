@@ -108,6 +108,28 @@ def test_noise_alone_is_within_some_sigma(runs: Path, tmp_path: Path) -> None:
     assert "no input" not in " ".join(verdict(strict))  # the seed stands in config.yaml
 
 
+def test_the_verdict_begins_with_what_a_reader_of_cameras_looks_for(tmp_path: Path) -> None:
+    """Worst error, lowest MTF and focal length, with the digits in which they differ; nothing where one is unknown."""
+
+    def camera(name: str, wfe: float | None, mtf: float, focal: float) -> Path:
+        fields = [{"field": [x, 0.0], "along_line": 0.4, "along_track": mtf + x} for x in (0.0, 0.1)]
+        found = {"wfe_worst_waves": wfe, "mtf_at_nyquist": fields, "first_order": {"focal_length_m": focal}}
+        with RunFolder(tmp_path / name) as target:
+            target.write_bytes("optics.json", json.dumps(found).encode())
+            write_manifest(target, "twin.camera", 0.0, 1.0, seed=1, warnings=[])
+        return tmp_path / name
+
+    a, b = camera("a", 0.009364, 0.375, 3.2), camera("b", 0.0241, 0.3, 3.20006)
+    said = verdict(compare([a, b, camera("c", None, 0.375, 3.2)], 1e-9, None))
+    assert said[0] == (
+        "from a to b: worst wavefront error [waves] 0.00936, then 0.0241; lowest MTF of the optics at Nyquist 0.375, "
+        "then 0.3; focal length [m] 3.2, then 3.2001"
+    )
+    assert said[1].startswith("run b differs from a in 4 numbers of")
+    assert said[2].startswith("run c differs from a in 1 numbers of")
+    assert verdict(compare([a, a], 1e-9, None))[0].startswith("run ")
+
+
 def test_a_sigma_says_what_it_is_of() -> None:
     """Where a file has both, it is that of the noise."""
     both = {"x": 1.0, "x_sigma": 0.6, "x_sigma_noise": 0.1, "y": 1.0, "y_sigma": 0.3}

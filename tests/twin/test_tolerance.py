@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from scenes.lens.first_design import first_camera
 from scenes.specs.job import checked_nodes
 from scenes.specs.load import LIBRARY
 from scenes.specs.resolved import resolve
@@ -21,7 +22,7 @@ from twin.camera.camera_optics import CameraOptics
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.tolerance import allocation, instrument_warnings, merit_models, samples, tolerance_report, tolerance_run
 from twin.tolerance.allocation import CostCurve
-from twin.tolerance.merit_models import MeritModel, inverse_limits, sensitivities
+from twin.tolerance.merit_models import MeritModel, VarianceShares, inverse_limits, sensitivities
 from twin.tolerance.monitor_merit import Merit
 from twin.tolerance.samples import Workforce, draw_samples
 from twin.tolerance.tolerance_bench import Adjustments, ToleranceBench
@@ -384,7 +385,9 @@ def test_the_verdict_names_a_design_that_misses_its_requirement_and_the_cause_of
     few = Yield.count(np.arange(100) < 50)
     shares = {"M1_figure": 0.99, "M2_tilt": 0.004}, {"M1_figure": 0.3, "M2_tilt": 0.6}
     results = [
-        MeritResult(merit=merit, nominal=value, passing=few, shares=share, **rest)
+        MeritResult(
+            merit=merit, nominal=value, passing=few, shares=share, share_errors=dict.fromkeys(share, 0.01), **rest
+        )
         for merit, value, share in zip((mtf, error), (0.293, 0.04), shares, strict=True)
     ]
     run = SimpleNamespace(merits=results, bench=SimpleNamespace(entries=shares[0]))
@@ -396,6 +399,73 @@ def test_the_verdict_names_a_design_that_misses_its_requirement_and_the_cause_of
         "M2_tilt 60 % and M1_figure 30 % are the largest causes of the spread (variance) of wavefront",
     )
     assert tolerance_report._designed(SimpleNamespace(merits=results[1:])) == ""
+
+
+def test_causes_whose_order_is_noise_are_named_together() -> None:
+    share = {"tilt_x": 0.25, "tilt_y": 0.24, "shift_x": 0.2, "shift_y": 0.19, "radius": 0.12}
+    for error, named in ((0.001, 3), (0.01, 4)):
+        result = SimpleNamespace(shares=share, share_errors=dict.fromkeys(share, error))
+        assert tolerance_report._few(list(share), result) == named
+
+
+def shares_of(model: MeritModel, entries: dict[str, tuple[int, ...]], x: np.ndarray, values) -> VarianceShares:
+    """Shares of variance of merits that are functions of the parts of a model."""
+    bench: Any = SimpleNamespace(entries=entries, values=values)
+    return VarianceShares.of(bench, model, x)
+
+
+def test_shares_of_variance_are_those_of_the_model() -> None:
+    """A sum of independent terms: slope^2 var(x), and bent^2 / 2 of bent x^2 / 2 with normal x; a mixed pair."""
+    rng = np.random.default_rng(8)
+    slope, bent = np.array([[1.0, 2.0, 0.5, 0.0]]), np.zeros((1, 4, 4))
+    bent[0, 3, 3], bent[0, 0, 2], bent[0, 2, 0] = 3.0, 0.7, 0.7
+    x = np.column_stack([rng.uniform(-1.0, 1.0, (40_000, 3)), rng.standard_normal(40_000)])
+    found = shares_of(MeritModel(np.ones(1), slope, bent), {"pair": (0, 2), "b": (1,), "c": (3,)}, x, np.asarray)
+    parts = np.array([(1.0 + 0.25) / 3.0 + 0.49 / 9.0, 4.0 / 3.0, 4.5])
+    away = (found.values[:, 0] - parts / np.sum(parts)) / found.errors[:, 0]
+    assert np.all(np.abs(away) < 4.0)  # 1 of 5000 seeds
+    assert np.all((found.errors > 1e-4) & (found.errors < 0.02))
+    none = shares_of(MeritModel(np.ones(1), 0.0 * slope, 0.0 * bent), {"all": (0, 1, 2, 3)}, x, np.asarray)
+    assert (none.values[0, 0], none.errors[0, 0]) == (0.0, 0.0)
+
+
+def test_the_errors_of_shares_of_variance_are_their_scatter() -> None:
+    """The length of a vector of symmetric components, from 2000 draws each: equal shares within the stated errors."""
+    model = MeritModel(np.zeros(2), np.eye(2), np.zeros((2, 2, 2)))
+    rng = np.random.default_rng(2)
+    tries = [
+        shares_of(model, {"x": (0,), "y": (1,)}, rng.standard_normal((2000, 2)), lambda p: np.hypot(*p.T)[:, None])
+        for _ in range(300)
+    ]
+    values, errors = (np.array([getattr(one, key)[:, 0] for one in tries]) for key in ("values", "errors"))
+    assert np.std(values, axis=0) == pytest.approx(errors.mean(axis=0), rel=0.2)  # of 300: 4 %, and skewed
+    assert np.mean(values[:, 0]) == pytest.approx(np.mean(values[:, 1]), abs=4.0 * np.mean(errors) / np.sqrt(150.0))
+
+
+@pytest.mark.second
+def test_a_camera_that_is_symmetric_has_equal_shares_in_x_and_y(backend, tmp_path) -> None:
+    (tmp_path / "rc.yaml").write_text(first_camera("ritchey-chretien", "rc", 0.4, 8.0, 650e-9), "utf-8")
+    tolerances = {
+        f"{kind}_{axis}": {"motion": f"M2 {kind} {axis}", "limit": limit}
+        for kind, limit in (("shift", "10 um"), ("rotate", "5 arcsec"))
+        for axis in "xy"
+    }
+    merits = {"boresight": {"kind": "boresight", "at_most": "5 arcmin"}}
+    setup = budget(
+        tmp_path,
+        instrument="rc.yaml",
+        tolerances=tolerances,
+        merits=merits,
+        compensators={},
+        samples=50,
+        allocation=None,
+    )
+    (result,) = run_tolerance(setup, backend).merits
+    for kind in ("shift", "rotate"):
+        one, other = f"{kind}_x", f"{kind}_y"
+        error = np.hypot(result.share_errors[one], result.share_errors[other])
+        assert error < 0.008
+        assert abs(result.shares[one] - result.shares[other]) < 4.0 * error
 
 
 def test_models_of_scaled_tolerances_are_the_model_of_scaled_draws() -> None:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+import re
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,7 +16,7 @@ from scenes.yaml.units import split_quantity, unit_ratio
 from scenes.yaml.yaml_file import read_yaml
 from twin.compare import folder_difference as difference
 from twin.compare.folder_difference import NOISE, ArrayDifference, Leaf, NumberDifference, is_sigma
-from twin.framework.artefact import Artefact, Cell, PngFigure, SvgFigure, Table, significant
+from twin.framework.artefact import Artefact, Cell, PngFigure, SvgFigure, Table, plain, significant
 from twin.framework.report import Report, Section, answer
 from twin.framework.run_folder import Manifest, finished_manifest
 from twin.framework.svg import BLUE, GREY, look, new_figure, plain_axes, signed_map, to_png, to_svg
@@ -24,6 +25,15 @@ MOST_BARS = 30
 """Largest number of changes in the bar chart, which shows the most significant ones."""
 _MOST_IMAGES = 8
 """Largest number of differing images that the report shows."""
+
+_HEADLINES: tuple[tuple[str, str, Callable[[list[float]], float], str], ...] = (
+    ("optics.json", r"wfe_worst_waves", max, "worst wavefront error [waves]"),
+    ("optics.json", r"mtf_at_nyquist\[.*\]\.along_\w+", min, "lowest MTF of the optics at Nyquist"),
+    ("optics.json", r"first_order\.focal_length_m", max, "focal length [m]"),
+    ("quality.json", r"cameras\.[^.]+\.wfe_worst_waves", max, "worst wavefront error [waves]"),
+    ("quality.json", r"cameras\.[^.]+\.mtf_along_\w+\..*", min, "lowest MTF with the pixel at Nyquist"),
+)
+"""Results with which a verdict begins: file, pattern of their keys, which of several is meant, and name."""
 
 
 def compare_report(comparison: Comparison) -> Report:
@@ -425,10 +435,33 @@ def _plain(entry: NumberDifference | ArrayDifference, without: str, *derived: st
     return values | {key: value if value is not None and abs(value) < math.inf else None for key, value in more.items()}
 
 
+def _headline(reference: Run, run: Run, diff: Differences) -> str:
+    """Return the few results that a reader of cameras looks for first, before and after, where they differ."""
+    out = []
+    for file, pattern, worst, name in _HEADLINES:
+        if not any(n.file == file and re.fullmatch(pattern, n.key) for n in diff.numbers):
+            continue
+        before, after = (_found(side.file(file), pattern) for side in (reference, run))
+        if before and after:
+            ends = worst(before), worst(after)
+            digits = next((k for k in range(3, 10) if plain(ends[0], k) != plain(ends[1], k)), 0)
+            out += [f"{name} {plain(ends[0], digits)}, then {plain(ends[1], digits)}"] if digits else []
+    return "; ".join(out)
+
+
+def _found(path: Path | None, pattern: str) -> list[float]:
+    """Return the numbers of a result file whose keys match a pattern."""
+    numbers = {} if path is None else difference.content_of(path, path.name).numbers
+    return [value for key, value in numbers.items() if re.fullmatch(pattern, key) and isinstance(value, int | float)]
+
+
 def verdict(comparison: Comparison) -> list[str]:
     """Return the verdict: a sentence for each run compared with the first, and one on its largest change in sigmas."""
     parts = []
-    for name, diff in zip(comparison.names[1:], comparison.diffs, strict=True):
+    reference = comparison.runs[0]
+    for name, run, diff in zip(comparison.names[1:], comparison.runs[1:], comparison.diffs, strict=True):
+        if headline := _headline(reference, run, diff):
+            parts.append(f"from {comparison.names[0]} to {name}: {headline}")
         inputs = f"{len(diff.inputs)} input{'s' * (len(diff.inputs) != 1)}" if diff.inputs else "no input"
         if diff.same:
             parts.append(

@@ -9,7 +9,8 @@ if __name__ == "__main__":
 
 import sys
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 from inspect import Parameter
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -22,6 +23,7 @@ from scenes.yaml.standard_output import to_stdout
 from twin.framework import cli
 
 if TYPE_CHECKING:
+    from scenes.yaml.errors import InputError
     from twin.new.camera_numbers import CameraNumbers
 
 app = cli.program(no_args_is_help=True)
@@ -112,6 +114,8 @@ Camera = Annotated[
         help="The camera or instrument: a name in the library (gf7), or the path of a file.", show_default=False
     ),
 ]
+_FILE = "File to write, .yaml; - prints it"
+"""Last question, if no option names the file."""
 Out = Annotated[
     Path | None,
     typer.Option(readable=False, help="The file to write, .yaml. Default: standard output.", show_default=False),
@@ -130,8 +134,8 @@ def main() -> None:
         python -m twin.tolerance tolerance.yaml
 
     Defaults follow from the camera: bodies, diffraction limit, depth of focus, room for a monitor. In a terminal the
-    command asks for options that are missing; Enter takes the default. Comments say what each key does and where its
-    number comes from.
+    command asks for options that are missing, the file last, and asks again where an answer is not allowed; Enter takes
+    the default. Comments say what each key does and where its number comes from.
 
     Exit codes: 0 success, 2 bad input (nothing is written), 1 anything else.
     """
@@ -142,16 +146,67 @@ def _is_terminal() -> bool:
     return sys.stdin.isatty() and sys.stderr.isatty()
 
 
-def _answers(questions: tuple[str, ...], given: Mapping[str, str | None], numbers: CameraNumbers) -> dict[str, str]:
-    """Return the answer to every question: the option, what the user types in a terminal, or the default."""
-    out = {}
+def _ask(text: str, default: str | None, check: Callable[[str], object]) -> str:
+    """Ask in the terminal until the answer passes a check, which raises InputError for what is not allowed."""
+    from scenes.yaml.errors import InputError
+
+    def checked(value: str) -> str:
+        try:
+            check(value)
+        except InputError as error:
+            raise typer.BadParameter(_reason(error)) from None
+        return value
+
+    return str(typer.prompt(text, default=default, err=True, value_proc=checked))
+
+
+def _reason(error: InputError) -> str:
+    """Return the first fault of an input without its place in a file that is not yet written."""
+    return str(replace(error.issues[0], file="", line=None, key=())).removeprefix("input: ")
+
+
+def _answers(kind: str, given: Mapping[str, str | None], numbers: CameraNumbers) -> dict[str, str]:
+    """Return the answer to every question: the option, what the user types in a terminal, or the default.
+
+    Each is checked at once in the new file, the options before the questions.
+    """
+    from scenes.yaml.errors import InputError, Issue
+    from twin.new.template_text import checked_text
+
+    questions = NEW[kind].questions
+    out = {name: str(getattr(numbers, QUESTIONS[name].default, QUESTIONS[name].default)) for name in questions}
+
+    def check(name: str = "", value: str = "") -> None:
+        changed = {name: value} if name else {}
+        checked_text(kind, numbers, {**out, **changed, "file": f"{kind}.yaml", "base": "job.yaml"})
+
+    for name, value in given.items():
+        if value is not None:
+            try:
+                check(name, value)
+            except InputError as error:
+                raise InputError(Issue(f"--{name}: {_reason(error)}")) from None
+            out[name] = value
+    check()
     for name in questions:
-        question, value = QUESTIONS[name], given[name]
-        if value is None:
-            default = str(getattr(numbers, question.default, question.default))
-            value = typer.prompt(question.text, default=default, err=True) if _is_terminal() else default
-        out[name] = value
+        if given[name] is None and _is_terminal():
+            out[name] = _ask(QUESTIONS[name].text, out[name], partial(check, name))
     return out
+
+
+def _targets(kind: str, out: Path, force: bool) -> list[Path]:
+    """Return the files that are written; raise InputError if one cannot be."""
+    from scenes.yaml.errors import InputError, Issue
+
+    targets = [out, *([_job_of(out)] if kind == "study" else [])]
+    for path in targets:
+        if path.suffix.lower() not in (".yaml", ".yml"):
+            raise InputError(Issue("unknown suffix of an output file", str(path), allowed=".yaml, .yml"))
+        if path.exists() and not force:
+            raise InputError(Issue("the file exists", str(path), allowed="another name, or --force to replace it"))
+        if not path.parent.is_dir():
+            raise InputError(Issue("there is no such folder", str(path.parent)))
+    return targets
 
 
 def _write_new(kind: str, camera: str | None, out: Path | None, force: bool, given: Mapping[str, str | None]) -> None:
@@ -162,21 +217,21 @@ def _write_new(kind: str, camera: str | None, out: Path | None, force: bool, giv
 
         if camera is None and not _is_terminal():
             raise InputError(Issue("which camera is it for?", allowed="--camera NAME or FILE"))
-        if camera is None:
-            camera = typer.prompt("Camera or instrument: name in the library, or file", err=True)
-        targets = [] if out is None else [out, *([_job_of(out)] if kind == "study" else [])]
-        for path in targets:
-            if path.suffix.lower() not in (".yaml", ".yml"):
-                raise InputError(Issue("unknown suffix of an output file", str(path), allowed=".yaml, .yml"))
-            if path.exists() and not force:
-                raise InputError(Issue("the file exists", str(path), allowed="another name, or --force to replace it"))
-            if not path.parent.is_dir():
-                raise InputError(Issue("there is no such folder", str(path.parent)))
+        if out is not None:
+            _targets(kind, out, force)
         from twin.framework.durable import write_all_safely
         from twin.new.template_text import checked_text, numbers_of
 
+        if camera is None:
+            camera = _ask(
+                "Camera or instrument: name in the library, or file", None, lambda name: numbers_of(name, Path())
+            )
+        answers = _answers(kind, given, numbers_of(camera, Path()))
+        if out is None and _is_terminal():
+            asked = _ask(_FILE, "-", lambda name: name == "-" or _targets(kind, Path(name), force))
+            out = None if asked == "-" else Path(asked)
+        targets = [] if out is None else _targets(kind, out, force)
         numbers = numbers_of(camera, Path() if out is None else out.parent)
-        answers = _answers(NEW[kind].questions, given, numbers)
         job = Path("job.yaml") if out is None else _job_of(out)
         texts = [checked_text(kind, numbers, {**answers, "file": str(out or f"{kind}.yaml"), "base": job.name})]
         if kind == "study":

@@ -235,7 +235,7 @@ class CameraNumbers:
             if compensator in (one.label, one.name):
                 return one
         allowed = ", ".join(["focal_plane", *(one.label for one in self.elements)])
-        raise InputError(Issue("--compensator: there is no such body", "", None, (), compensator, allowed))
+        raise InputError(Issue("there is no such body", "", None, (), compensator, allowed))
 
     def compensator(self, name: str) -> str:
         """Return the motion of a compensator along the axis, with what it carries."""

@@ -279,7 +279,7 @@ def draw_samples(
     """
     study = sampling_study(setup, bench, samples, seed)
     plan = Plan.of(study)
-    x = np.stack([column.values for column in plan.columns], axis=-1).astype(np.float64)
+    x = _parameters(plan)
     seeds = plan.seeds if plan.seeds is not None else np.zeros(samples, np.int64)
     advance(part, 0, samples)
     if force.journal is None:
@@ -296,6 +296,15 @@ def draw_samples(
     return Samples(
         x, values[:, :merits], values[:, merits : merits + moves], values[:, -1], seeds, result.messages, result.seconds
     )
+
+
+def draw_parameters(setup: ToleranceSetup, bench: ToleranceBench, count: int, seed: int) -> np.ndarray:
+    """Return the random parameters of N cameras, in units of their sizes, without tracing them, (N, K)."""
+    return _parameters(Plan.of(sampling_study(setup, bench, count, seed)))
+
+
+def _parameters(plan: Plan) -> np.ndarray:
+    return np.stack([column.values for column in plan.columns], axis=-1).astype(np.float64)
 
 
 def _by_engine(plan: Plan, backend: Backend, force: Workforce, file: Path, part: str, advance: Advance) -> BlockResult:

@@ -31,6 +31,8 @@ _FEW = 3
 """Number of tolerances that the verdict names."""
 _MAIN = 0.05
 """Share of a merit's variance from which the report names a tolerance as a cause of its spread."""
+_NOISE = 2.0
+"""Number of standard errors within which two shares of variance are not distinguished."""
 _LITTLE = 0.01
 """Fraction of the variance of every merit below which the report says that a tolerance may be loosened."""
 _MOST_CURVES = 6
@@ -160,7 +162,7 @@ def _causes(run: ToleranceRun) -> tuple[str, ...]:
     out = []
     for result in _tight(run):
         order = sorted(result.shares, key=lambda name: -result.shares[name])
-        dear = [name for name in order[:_FEW] if result.shares[name] >= _MAIN]
+        dear = [name for name in order[: _few(order, result)] if result.shares[name] >= _MAIN]
         named = [f"{100.0 * result.shares[name]:.0f} %" for name in dear]
         spread = f"of the spread (variance) of {result.merit.name}"
         if len(dear) == 1:
@@ -169,6 +171,12 @@ def _causes(run: ToleranceRun) -> tuple[str, ...]:
             parts = [f"{name} {share}" for name, share in zip(dear, named, strict=True)]
             out.append(f"{', '.join(parts[:-1])} and {parts[-1]} are the largest causes {spread}")
     return tuple(out)
+
+
+def _few(order: list[str], result: MeritResult) -> int:
+    """Return how many tolerances to name: ``_FEW``, and those whose shares are the last one's within their errors."""
+    least = min((result.shares[name] - _NOISE * result.share_errors[name] for name in order[:_FEW]), default=0.0)
+    return sum(result.shares[name] + _NOISE * result.share_errors[name] >= least for name in order)
 
 
 def _loose(run: ToleranceRun) -> str:
@@ -269,7 +277,9 @@ def _shares_table(run: ToleranceRun) -> Table:
     order = sorted(worst, key=lambda name: -worst[name])
     rows: list[list[Cell]] = [[name, *(100.0 * result.shares[name] for result in run.merits)] for name in order]
     heads = ("tolerance", *(f"{result.merit.name} [percent]" for result in run.merits))
-    return Table("variance", "Shares of variance", "In percent.", heads, rows, (None, *[1] * len(run.merits)))
+    error = 100.0 * max((e for result in run.merits for e in result.share_errors.values()), default=0.0)
+    caption = f"In percent, by many draws of the second-order model; the standard error is at most {error:.2g} %."
+    return Table("variance", "Shares of variance", caption, heads, rows, (None, *[1] * len(run.merits)))
 
 
 def _sensitivity_table(run: ToleranceRun) -> Table:

@@ -27,9 +27,16 @@ from twin.framework.procedure import Advance, silent
 from twin.framework.record import Quantity, Record
 from twin.tolerance.allocation import Allocation, allocate
 from twin.tolerance.instrument_warnings import beam_warnings, instrument_warnings, interpolation_warnings
-from twin.tolerance.merit_models import InverseLimits, ScaledModel, Sensitivities, inverse_limits, sensitivities
+from twin.tolerance.merit_models import (
+    InverseLimits,
+    Sensitivities,
+    VarianceShares,
+    inverse_limits,
+    model_draws,
+    sensitivities,
+)
 from twin.tolerance.monitor_merit import Merit, merit_unit, shown_merit
-from twin.tolerance.samples import Samples, Workforce, draw_samples
+from twin.tolerance.samples import Samples, Workforce, draw_parameters, draw_samples
 from twin.tolerance.tolerance_bench import SETTLED, ToleranceBench
 from twin.tolerance.variations import states_of
 
@@ -41,6 +48,8 @@ LEVELS = (0.5, 0.9, 0.95)
 """Fractions of cameras for which the quantiles of a merit are reported."""
 _MORE = 7919
 """Number added to the seed for the independent cameras that validate an allocation."""
+_MODEL = 104_729
+"""Number added to the seed for the draws of the second-order model that give the shares of variance."""
 _NOTHING = 1e-15
 """Amplitude of a motion, in metres or radians, below which it is rounding error."""
 EXACT = 4
@@ -110,8 +119,9 @@ class MeritResult:
         Fraction of cameras that meet the requirement.
     model_passing : tuple of float
         Fraction of cameras that meet the requirement, by the first-order and by the second-order model.
-    shares : dict
-        Tolerance -> fraction of the merit's variance that vanishes without it, by the second-order model.
+    shares, share_errors : dict
+        Tolerance -> fraction of the merit's variance that vanishes without it, by many draws of the second-order model,
+        and its standard error.
     """
 
     merit: Merit
@@ -124,6 +134,7 @@ class MeritResult:
     passing: Yield
     model_passing: tuple[float, float]
     shares: Mapping[str, float]
+    share_errors: Mapping[str, float]
 
 
 @dataclass(frozen=True, eq=False)
@@ -224,8 +235,10 @@ def run_tolerance(
     samples = draw_samples(setup, bench, backend, test.samples, seed, force, "cameras", advance)
     passing = bench.passing(samples.values)
     models = ModelPredictions.of(bench, sensitivity, samples)
+    many = draw_parameters(setup, bench, model_draws(bench, sensitivity.model), seed + _MODEL)
+    shares = VarianceShares.of(bench, sensitivity.model, many)
     merits = tuple(
-        _merit_result(bench, sensitivity, samples, models, m, passing[:, m]) for m in range(len(bench.merits))
+        _merit_result(bench, sensitivity, samples, models, shares, m, passing[:, m]) for m in range(len(bench.merits))
     )
     allocation, judged = None, None
     if test.allocation is not None:
@@ -317,30 +330,22 @@ def _validated_yield(
 class ModelPredictions:
     """Merits of the Monte Carlo cameras predicted by the models of first and second order.
 
-    Array dimensions: S cameras, M merits, E tolerances.
+    Array dimensions: S cameras, M merits.
 
     Attributes
     ----------
     linear, quadratic : (S, M) ndarray
         Merits to the first and to the second order, SI units.
-    without : (E, S', M) ndarray
-        Merits to the second order with one tolerance at a time excluded, for the first S' cameras.
     """
 
     linear: np.ndarray
     quadratic: np.ndarray
-    without: np.ndarray
 
     @classmethod
     def of(cls, bench: ToleranceBench, sensitivity: Sensitivities, samples: Samples) -> ModelPredictions:
         """Evaluate the models of first and second order at the random parameters of the cameras."""
-        scaled = ScaledModel.of(sensitivity.model, samples.x, list(bench.entries.values()))
-        identity = np.eye(len(bench.entries))
-        return cls(
-            bench.values(sensitivity.model.linear(samples.x)),
-            bench.values(sensitivity.model.quadratic(samples.x)),
-            np.stack([bench.values(scaled.parts(1.0 - row)) for row in identity]),
-        )
+        model = sensitivity.model
+        return cls(bench.values(model.linear(samples.x)), bench.values(model.quadratic(samples.x)))
 
 
 def _merit_result(
@@ -348,6 +353,7 @@ def _merit_result(
     sensitivity: Sensitivities,
     samples: Samples,
     models: ModelPredictions,
+    shares: VarianceShares,
     m: int,
     passing: np.ndarray,
 ) -> MeritResult:
@@ -360,9 +366,6 @@ def _merit_result(
         known = sign * column[np.isfinite(column)]
         return tuple(float(sign * np.quantile(known, share)) for share in LEVELS) if len(known) else (np.nan,) * 3
 
-    without = np.var(models.without[:, :, m], axis=1)
-    modelled = float(np.var(models.quadratic[: models.without.shape[1], m]))
-    shares = np.maximum(0.0, 1.0 - without / modelled) if modelled > 0.0 else np.zeros(len(without))
     by_model = models.linear[:, m], models.quadratic[:, m]
     return MeritResult(
         merit,
@@ -374,7 +377,8 @@ def _merit_result(
         levels(by_model[1]),
         Yield.count(passing),
         (float(np.mean(merit.passes(by_model[0]))), float(np.mean(merit.passes(by_model[1])))),
-        FrozenMap(zip(bench.entries, shares.tolist(), strict=True)),
+        FrozenMap(zip(bench.entries, shares.values[:, m].tolist(), strict=True)),
+        FrozenMap(zip(bench.entries, shares.errors[:, m].tolist(), strict=True)),
     )
 
 
@@ -525,6 +529,7 @@ def _merit_plain(result: MeritResult, missed: float | None = None) -> dict[str, 
         "yield_quadratic": result.model_passing[1],
         "judged": result.passing.judged(merit.spec.probability),
         "variance_shares": dict(result.shares),
+        "variance_shares_error": dict(result.share_errors),
         **({} if missed is None else {"interpolation_error": missed}),
     }
 
