@@ -18,6 +18,7 @@ from tests.twin.study_bench import REFUSED
 from twin.framework.provenance import negative_verdicts
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.operate.__main__ import app
+from twin.operate.estimate.estimate_snapshot import Violation
 from twin.operate.estimate.operation_filter import Operation
 from twin.operate.estimate.operation_model import store_plan
 from twin.operate.estimate.reported_estimate import (
@@ -327,7 +328,9 @@ def test_what_goes_on_is_told_again_a_month_after_somebody_has_seen_it(
         one = RequirementStatus("forward d_f_um", "µm", 20.0, 0.95, 0.12, False, time)
         seen = ((time - DAY, 5.0, 8), (time, 80.0, 8))
         sensor = SensorState("base/forward", "doubtful", time, time, "3 of the last 10 readings")
+        span = Violation(one.quantity, one.limit, filter_result.time, time, 2, time, 19.0, 1.0, 0.12)
         now = replace(clean(filter_result), time=time, requirements=(one,), innovations=seen, sensors=(sensor,))
+        now = replace(now, violations=(span,))
         return [alarm.kind for alarm in raise_alarms(history, PLAN, now)]
 
     assert AGAIN == 30 * DAY
@@ -340,6 +343,33 @@ def test_what_goes_on_is_told_again_a_month_after_somebody_has_seen_it(
         assert raised(history, 29) == ["contradiction"]  # every reading is one of its own
         history.acknowledge(4, "Ann", "")
         assert raised(history, 30) == ["broken", "sensor", "contradiction"]
+
+
+def test_a_past_violation_raises_one_alarm_with_its_span(record: Path, filter_result: FilterResult) -> None:
+    """Spans of a requirement less than a month apart are one; one that lasted when its alarm was raised is not new."""
+    end = filter_result.time - 100 * DAY
+    first, second, third, other = (
+        Violation("forward d_f_um", limit, end + day * DAY, end + day * DAY, 1, end + day * DAY, value, 0.5, 0.8)
+        for day, value, limit in ((0, -20.4, 20.0), (10, 19.9, 20.0), (80, 20.1, 20.0), (11, 20.2, 10.0))
+    )
+    spans = other.appended_to(third.appended_to(second.appended_to(first.appended_to(()))))
+    assert spans == (replace(first, until_us=second.until_us, readings=2), third, other)
+    holds = RequirementStatus("forward d_f_um", "µm", 20.0, 0.95, 0.01, True, None)
+    now = replace(clean(filter_result), requirements=(holds,))
+    with History(str(record)) as history:
+        lasting = replace(now, time=end, violations=(first,), requirements=(replace(holds, holds_now=False),))
+        (alarm,) = raise_alarms(history, PLAN, lasting)
+        assert alarm.time == end
+        (alarm,) = raise_alarms(history, PLAN, replace(now, violations=spans))
+        assert raise_alarms(history, PLAN, replace(now, violations=spans)) == []
+    assert (alarm.kind, alarm.time) == ("broken", third.until_us)
+    assert alarm.text.startswith(f"Δf of forward exceeded 20 µm at the reading of {utc_text(third.since_us)} with a")
+    text = next(iter(told_of(replace(now, violations=spans))))[1]
+    assert text == (
+        f"Δf of forward exceeded 20 µm at 2 readings between {utc_text(end)} and {utc_text(end + 10 * DAY)} with a "
+        f"probability above 5.0 %; the largest change was −20.40 ± 0.50 µm at {utc_text(end)}, beyond the limit with a "
+        "probability of 80 %"
+    )
 
 
 def test_a_jump_whose_time_is_known_better_is_the_same(record: Path, filter_result: FilterResult) -> None:
