@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from scipy.stats import norm
 
 from optics.numerics.backend import load_backend
 from scenes.specs.operation import OperationSpec, RequirementSpec
@@ -156,11 +157,19 @@ def test_a_forecast_begins_now_and_its_sigma_grows(record: Path, life: Path) -> 
     assert told["forward"][key][0] == now["forward"][key][0]
     assert told["forward"][f"{key}_sigma"] == sorted(told["forward"][f"{key}_sigma"])
     (requirement,) = told["requirements"]
+    angle = told["intersection_angle"]
+    beyond = [
+        2.0 - norm.cdf((30.0 - value) / sigma) - norm.cdf((30.0 + value) / sigma)
+        for value, sigma in zip(angle["change_arcsec"], angle["change_arcsec_sigma"], strict=True)
+    ]
+    assert requirement["chances"] == pytest.approx(beyond, rel=1e-6, abs=1e-15)  # 1 - cdf cancels below 1e-16
+    assert requirement["chances"][0] == requirement["chance_now"]
     assert (requirement["quantity"], requirement["limit"]) == ("intersection_angle change_arcsec", 30.0)
     until = said("forecast", record, "--until", "2026-07-01T00:00:00Z", "--steps", 2)
     assert until["times_utc"][2] == "2026-07-01T00:00:00Z"
     done = run("forecast", record)
     assert "forecast from 2026-06-25T00:00:00Z to 2026-07-25T00:00:00Z" in done.stdout
+    assert "P(exceeded) of" in done.stdout
 
 
 @pytest.mark.second
@@ -284,8 +293,8 @@ def test_what_is_told_of_requirements(filter_result: FilterResult) -> None:
         ("broken", "Δf of forward exceeds 20 µm with a probability of 12 %; 5.0 % is allowed"),
         (
             "breaks",
-            "Δf of forward is expected to exceed 20 µm with a probability above 5.0 % from "
-            f"{utc_text(filter_result.time + 3 * DAY)} on",
+            f"Δf of forward may exceed 20 µm (probability above 5.0 %) from "
+            f"{utc_text(filter_result.time + 3 * DAY)[:10]} on",
         ),
     ]
 
@@ -309,6 +318,18 @@ def test_a_reading_that_contradicts_what_is_stated(filter_result: FilterResult) 
         one = replace(jump, after_us=after, detected_us=until)
         alone = tuple((time, 50.0 if time == times[2] else 8.0, 8) for time in times)
         assert [kind for kind, _ in told_of(replace(own, innovations=alone, jumps=(one,)))] == wanted
+
+
+def test_an_undecided_reading_is_not_called_rejected(filter_result: FilterResult) -> None:
+    bad = ((filter_result.time, "entry 1: far away; the next reading decides whether it is excluded"),)
+    first = replace(clean(filter_result), bad_readings=bad, undecided=True, readings=0)
+    ((_, text),) = told_of(first)
+    assert text.startswith(f"the reading of {utc_text(filter_result.time)} may be an outlier: entry 1")
+    assert first.readings_text == "0 readings of the monitor (and a newer one that may be an outlier)"
+    later = replace(first, undecided=False, readings=1)
+    ((_, text),) = told_of(later)
+    assert text.startswith(f"the reading of {utc_text(filter_result.time)} was rejected as an outlier: entry 1")
+    assert later.readings_text == "1 reading of the monitor"
 
 
 def test_bodies_that_explain_a_jump_nearly_as_well_are_named(filter_result: FilterResult) -> None:

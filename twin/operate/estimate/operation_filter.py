@@ -206,6 +206,7 @@ class Operation:
             if state is None:
                 state = entry_filter.start(int(moments[0][0]["time_us"]))
             before = state.scores.readings
+            read = any(entry["kind"] == "monitor" for entry in moments[count])
             state = entry_filter.take(state, moments[count])
             count += 1
             if state.newly_stuck:
@@ -214,7 +215,8 @@ class Operation:
                 if state is None:
                     state = entry_filter.start(int(moments[0][0]["time_us"]), self._stuck_sensors)
                 continue
-            state = self._judged(state)
+            if read:
+                state = self._judged(state)
             number = state.scores.readings // CHECKPOINT_READINGS
             if number > before // CHECKPOINT_READINGS:
                 self._save_state(state, number, newest)
@@ -227,7 +229,7 @@ class Operation:
         return state
 
     def _judged(self, state: EstimatorState) -> EstimatorState:
-        """Return the estimator's state with every requirement judged at its newest reading."""
+        """Return the estimator's state with every requirement judged at its newest reading of the monitor."""
         if not self.plan.operation.requirements:
             return state
         then = copy.copy(self)

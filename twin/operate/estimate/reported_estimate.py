@@ -294,6 +294,12 @@ class FilterResult:
     violations: tuple[Violation, ...] = ()
 
     @property
+    def readings_text(self) -> str:
+        """Number of readings of the monitor that were used, and whether the newest one is undecided, as text."""
+        text = "1 reading of the monitor" if self.readings == 1 else f"{self.readings} readings of the monitor"
+        return f"{text} (and a newer one that may be an outlier)" if self.undecided else text
+
+    @property
     def warnings(self) -> list[str]:
         """Warnings about the reliability of the estimate, one sentence each."""
         out = []
@@ -440,8 +446,8 @@ def alarms_of(plan: OperationSpec, result: FilterResult) -> Iterator[Alarm]:
         since = result.time
         for span in result.violations:
             if (span.quantity, span.limit) != (requirement.quantity, requirement.limit):
-                continue
-            if span.until_us < result.time:
+                continue  # of another requirement
+            if requirement.holds_now or result.time - span.until_us >= SAME_SPAN:
                 yield _of_violation(span, requirement, result.now.quantities)
             else:
                 since = span.since_us
@@ -456,7 +462,7 @@ def alarms_of(plan: OperationSpec, result: FilterResult) -> Iterator[Alarm]:
     if result.understated_causes:
         text = next(warning for warning in result.warnings if result.understated_causes[0] in warning)
         yield Alarm(CONTRADICTION, "temperatures", result.time, text, {"causes": list(result.understated_causes)})
-    far = [*_contradictions(plan, result), *map(_of_bad, result.bad_readings)]
+    far = [*_contradictions(plan, result), *_bad_readings(result)]
     yield from sorted(far, key=lambda occurrence: occurrence.time)[-1:]
 
 
@@ -536,7 +542,7 @@ def _of_requirement(requirement: RequirementStatus, since: int, time: int, quant
         return Alarm(BROKEN, requirement.quantity, time, text, content)
     assert requirement.breaks_us is not None
     since = utc_text(requirement.breaks_us)
-    text = f"{name} is expected to exceed {limit} with a probability above {allowed} from {since} on"
+    text = f"{name} may exceed {limit} (probability above {allowed}) from {since[:10]} on"
     return Alarm(BREAKS, requirement.quantity, time, text, requirement.to_dict())
 
 
@@ -554,11 +560,12 @@ def with_sigma(value: float, sigma: float, unit: str, sign: bool = False) -> str
     return f"{fixed(value, decimals, sign)} ± {fixed(sigma, decimals)} {unit.replace('um', 'µm')}"
 
 
-def _of_bad(bad: tuple[int, str]) -> Alarm:
-    """Return the alarm of a monitor reading that was rejected as an outlier, given its time and the reason."""
-    time, reason = bad
-    text = f"the reading of {utc_text(time)} was rejected as an outlier: {reason}; exclude --include uses it anyway"
-    return Alarm(CONTRADICTION, "monitor", time, text, {"time_utc": utc_text(time), "reason": reason})
+def _bad_readings(result: FilterResult) -> Iterator[Alarm]:
+    """Yield the alarms of monitor readings that were rejected as outliers, or may be."""
+    for k, (time, reason) in enumerate(result.bad_readings, start=1):
+        what = "may be" if result.undecided and k == len(result.bad_readings) else "was rejected as"
+        text = f"the reading of {utc_text(time)} {what} an outlier: {reason}; exclude --include uses it anyway"
+        yield Alarm(CONTRADICTION, "monitor", time, text, {"time_utc": utc_text(time), "reason": reason})
 
 
 def _contradictions(plan: OperationSpec, result: FilterResult) -> Iterator[Alarm]:
