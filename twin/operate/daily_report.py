@@ -273,7 +273,7 @@ def end_of_day(text: str | None, newest: int) -> int:
 
 
 def state_table(overview: Overview) -> Table:
-    """Return the table of all quantities: value, sigma, requirement, probability and the day from which it may be violated."""
+    """Return the table of all quantities: value, sigma, requirement, its probability and first possible violation."""
     now = overview.filter_result.now
     heads = ("change", "now", "σ", "limit", "P(exceeded) [%]", "allowed [%]", "holds", "may be violated from")
     rows: list[list[Cell]] = []

@@ -46,7 +46,7 @@ def forecast(
         int, typer.Option(min=1, max=1000, help="Number of evenly spaced times after the newest reading.")
     ] = STEPS,
 ) -> None:
-    """Forecast every quantity and the probability that it exceeds its limit, and the day from which a requirement may be violated.
+    """Forecast every quantity with its sigma, the probability that it exceeds its limit, and the first such day.
 
     A forecast begins at the newest reading. Drifts decay with their correlation times, seasons and trends continue,
     and sigma grows by the time laws of the plan's disturbances.
@@ -219,9 +219,9 @@ def report(
     """Write the daily report: one self-contained page, to be stored or sent by mail.
 
     Its first two sentences state whether the requirements are met and what changed on the day. Then follow every
-    quantity with its sigma, its requirement, the probability that it is exceeded and the day from which it may be violated;
-    trends, jumps, the quality of the predictions, sensors, alarms, and excluded readings with the reason. The report
-    of a past day is the one that would have been written then.
+    quantity with its sigma, its requirement, the probability that it is exceeded and the day from which it may be
+    violated; trends, jumps, the quality of the predictions, sensors, alarms, and excluded readings with the reason. The
+    report of a past day is the one that would have been written then.
 
     Example: `python -m twin.operate report record --day 2028-03-05 --out report.html`
 

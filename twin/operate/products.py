@@ -386,13 +386,11 @@ def _validity_limits(result: FilterResult) -> list[ValidityLimit]:
         ]
     for requirement in result.requirements:
         if requirement.breaks_us is not None:
-            marks.append(
-                ValidityLimit(
-                    requirement.breaks_us,
-                    f"{requirement.quantity} may violate its requirement (probability above "
-                    f"{percent(1.0 - requirement.probability)}) from {day_text(requirement.breaks_us)} on",
-                )
-            )
+            text = f"{requirement.quantity} violates its requirement"
+            if requirement.holds_now:
+                allowed, day = percent(1.0 - requirement.probability), day_text(requirement.breaks_us)
+                text = f"{requirement.quantity} may violate its requirement (probability above {allowed}) from {day} on"
+            marks.append(ValidityLimit(requirement.breaks_us, text))
     return marks
 
 
