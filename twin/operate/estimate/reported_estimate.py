@@ -541,8 +541,8 @@ def _of_requirement(requirement: RequirementStatus, since: int, time: int, quant
             text += f"; it has been violated since {utc_text(since)}"
         return Alarm(BROKEN, requirement.quantity, time, text, content)
     assert requirement.breaks_us is not None
-    since = utc_text(requirement.breaks_us)
-    text = f"{name} may exceed {limit} (probability above {allowed}) from {since[:10]} on"
+    day = utc_text(requirement.breaks_us)
+    text = f"{name} may exceed {limit} (probability above {allowed}) from {day[:10]} on"
     return Alarm(BREAKS, requirement.quantity, time, text, requirement.to_dict())
 
 
