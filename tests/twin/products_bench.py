@@ -66,7 +66,7 @@ class StandIn:
     def model(self) -> Any:
         cameras = self.experiment.instrument.cameras
         return SimpleNamespace(
-            series_filter=SimpleNamespace(stated=self.stated), spots=tuple((c, "left") for c in cameras)
+            series_filter=SimpleNamespace(prior=self.stated), spots=tuple((c, "left") for c in cameras)
         )
 
     @cached_property
@@ -76,7 +76,7 @@ class StandIn:
     def filter_readings(self) -> Any:
         newest, count = int(self.times[-1]), len(self.times)
         known = {"events": self.events, "jumps": self.jumps, "requirements": self.requirements, "warnings": []}
-        return SimpleNamespace(time=newest, readings=count, **known)
+        return SimpleNamespace(time=newest, readings=count, readings_text=f"{count} readings of the monitor", **known)
 
     def smoothed(self, times: list[int]) -> Estimate:
         rows = np.array([one.row for one in self.quantities])

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from scipy.stats import norm
 
 from optics.numerics.backend import load_backend
 from scenes.specs.operation import OperationSpec, RequirementSpec
@@ -18,6 +19,7 @@ from tests.twin.study_bench import REFUSED
 from twin.framework.provenance import negative_verdicts
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.operate.__main__ import app
+from twin.operate.estimate.estimate_snapshot import Violation
 from twin.operate.estimate.operation_filter import Operation
 from twin.operate.estimate.operation_model import store_plan
 from twin.operate.estimate.reported_estimate import (
@@ -155,11 +157,19 @@ def test_a_forecast_begins_now_and_its_sigma_grows(record: Path, life: Path) -> 
     assert told["forward"][key][0] == now["forward"][key][0]
     assert told["forward"][f"{key}_sigma"] == sorted(told["forward"][f"{key}_sigma"])
     (requirement,) = told["requirements"]
+    angle = told["intersection_angle"]
+    beyond = [
+        2.0 - norm.cdf((30.0 - value) / sigma) - norm.cdf((30.0 + value) / sigma)
+        for value, sigma in zip(angle["change_arcsec"], angle["change_arcsec_sigma"], strict=True)
+    ]
+    assert requirement["chances"] == pytest.approx(beyond, rel=1e-6, abs=1e-15)  # 1 - cdf cancels below 1e-16
+    assert requirement["chances"][0] == requirement["chance_now"]
     assert (requirement["quantity"], requirement["limit"]) == ("intersection_angle change_arcsec", 30.0)
     until = said("forecast", record, "--until", "2026-07-01T00:00:00Z", "--steps", 2)
     assert until["times_utc"][2] == "2026-07-01T00:00:00Z"
     done = run("forecast", record)
     assert "forecast from 2026-06-25T00:00:00Z to 2026-07-25T00:00:00Z" in done.stdout
+    assert "P(exceeded) of" in done.stdout
 
 
 @pytest.mark.second
@@ -283,8 +293,8 @@ def test_what_is_told_of_requirements(filter_result: FilterResult) -> None:
         ("broken", "Δf of forward exceeds 20 µm with a probability of 12 %; 5.0 % is allowed"),
         (
             "breaks",
-            "Δf of forward is expected to exceed 20 µm with a probability above 5.0 % from "
-            f"{utc_text(filter_result.time + 3 * DAY)} on",
+            f"Δf of forward may exceed 20 µm (probability above 5.0 %) from "
+            f"{utc_text(filter_result.time + 3 * DAY)[:10]} on",
         ),
     ]
 
@@ -310,6 +320,18 @@ def test_a_reading_that_contradicts_what_is_stated(filter_result: FilterResult) 
         assert [kind for kind, _ in told_of(replace(own, innovations=alone, jumps=(one,)))] == wanted
 
 
+def test_an_undecided_reading_is_not_called_rejected(filter_result: FilterResult) -> None:
+    bad = ((filter_result.time, "entry 1: far away; the next reading decides whether it is excluded"),)
+    first = replace(clean(filter_result), bad_readings=bad, undecided=True, readings=0)
+    ((_, text),) = told_of(first)
+    assert text.startswith(f"the reading of {utc_text(filter_result.time)} may be an outlier: entry 1")
+    assert first.readings_text == "0 readings of the monitor (and a newer one that may be an outlier)"
+    later = replace(first, undecided=False, readings=1)
+    ((_, text),) = told_of(later)
+    assert text.startswith(f"the reading of {utc_text(filter_result.time)} was rejected as an outlier: entry 1")
+    assert later.readings_text == "1 reading of the monitor"
+
+
 def test_bodies_that_explain_a_jump_nearly_as_well_are_named(filter_result: FilterResult) -> None:
     """Within a difference of log likelihoods of three, and three of them at most."""
     (jump,) = filter_result.jumps
@@ -327,7 +349,9 @@ def test_what_goes_on_is_told_again_a_month_after_somebody_has_seen_it(
         one = RequirementStatus("forward d_f_um", "µm", 20.0, 0.95, 0.12, False, time)
         seen = ((time - DAY, 5.0, 8), (time, 80.0, 8))
         sensor = SensorState("base/forward", "doubtful", time, time, "3 of the last 10 readings")
+        span = Violation(one.quantity, one.limit, filter_result.time, time, 2, time, 19.0, 1.0, 0.12)
         now = replace(clean(filter_result), time=time, requirements=(one,), innovations=seen, sensors=(sensor,))
+        now = replace(now, violations=(span,))
         return [alarm.kind for alarm in raise_alarms(history, PLAN, now)]
 
     assert AGAIN == 30 * DAY
@@ -340,6 +364,33 @@ def test_what_goes_on_is_told_again_a_month_after_somebody_has_seen_it(
         assert raised(history, 29) == ["contradiction"]  # every reading is one of its own
         history.acknowledge(4, "Ann", "")
         assert raised(history, 30) == ["broken", "sensor", "contradiction"]
+
+
+def test_a_past_violation_raises_one_alarm_with_its_span(record: Path, filter_result: FilterResult) -> None:
+    """Spans of a requirement less than a month apart are one; one that lasted when its alarm was raised is not new."""
+    end = filter_result.time - 100 * DAY
+    first, second, third, other = (
+        Violation("forward d_f_um", limit, end + day * DAY, end + day * DAY, 1, end + day * DAY, value, 0.5, 0.8)
+        for day, value, limit in ((0, -20.4, 20.0), (10, 19.9, 20.0), (80, 20.1, 20.0), (11, 20.2, 10.0))
+    )
+    spans = other.appended_to(third.appended_to(second.appended_to(first.appended_to(()))))
+    assert spans == (replace(first, until_us=second.until_us, readings=2), third, other)
+    holds = RequirementStatus("forward d_f_um", "µm", 20.0, 0.95, 0.01, True, None)
+    now = replace(clean(filter_result), requirements=(holds,))
+    with History(str(record)) as history:
+        lasting = replace(now, time=end, violations=(first,), requirements=(replace(holds, holds_now=False),))
+        (alarm,) = raise_alarms(history, PLAN, lasting)
+        assert alarm.time == end
+        (alarm,) = raise_alarms(history, PLAN, replace(now, violations=spans))
+        assert raise_alarms(history, PLAN, replace(now, violations=spans)) == []
+    assert (alarm.kind, alarm.time) == ("broken", third.until_us)
+    assert alarm.text.startswith(f"Δf of forward exceeded 20 µm at the reading of {utc_text(third.since_us)} with a")
+    text = next(iter(told_of(replace(now, violations=spans))))[1]
+    assert text == (
+        f"Δf of forward exceeded 20 µm at 2 readings between {utc_text(end)} and {utc_text(end + 10 * DAY)} with a "
+        f"probability above 5.0 %; the largest change was −20.40 ± 0.50 µm at {utc_text(end)}, beyond the limit with a "
+        "probability of 80 %"
+    )
 
 
 def test_a_jump_whose_time_is_known_better_is_the_same(record: Path, filter_result: FilterResult) -> None:

@@ -279,6 +279,36 @@ def test_a_requirement_that_is_going_to_break(known, tmp_path) -> None:
 
 
 @pytest.mark.second
+def test_requirements_are_judged_at_every_reading(known, tmp_path) -> None:
+    """Readings that come all at once leave the violations that the same readings show when they come one by one."""
+    life = life_of(known[2], 60.0, 3.0, 9, {})
+    entries, now = entries_of(known, life, 9), []
+    history = record_of(tmp_path / "one_by_one", known[0])
+    for time in life.times.tolist():
+        history.ingest(given(str(time), [entry for entry in entries if entry.time == time]))
+        now.append(Operation(history, known[0]).filter_readings().now)
+    column = [one.name for one in now[0].quantities].index("intersection_angle change_arcsec")
+    values, sigmas = (np.array([getattr(one, part)[0, column] for one in now]) for part in ("values", "sigmas"))
+    worst = int(np.argmax(np.abs(values[:-1])))
+    limit = 0.5 * (abs(values[worst]) + abs(values[-1]))
+    tight = known[0].operation.requirements[0].model_copy(update={"limit": f"{limit} arcsec"})
+    chances = beyond(values, sigmas, tight.largest)
+    bad = np.flatnonzero(chances > 1.0 - tight.probability)
+    assert 0 < len(bad)
+    assert bad[-1] < len(values) - 1
+    plan = known[0].model_copy(update={"operation": known[0].operation.model_copy(update={"requirements": (tight,)})})
+    history = record_of(tmp_path / "at_once", plan)
+    history.ingest(given("at_once", entries))
+    result = Operation(history, plan).filter_readings()
+    (span,) = result.violations
+    assert (span.since_us, span.until_us) == (life.times[bad[0]], life.times[bad[-1]])
+    assert (span.readings, span.worst_us) == (len(bad), life.times[worst])
+    assert (span.value, span.sigma, span.chance) == pytest.approx((values[worst], sigmas[worst], chances[worst]))
+    alarms = [alarm for alarm in alarms_of(plan.operation, result) if alarm.kind == "broken"]
+    assert [alarm.time for alarm in alarms] == [span.until_us]
+
+
+@pytest.mark.second
 def test_times_that_nobody_knows_anything_of(known, tmp_path) -> None:
     stated = known[2]
     estimate = followed(known, tmp_path, entries_of(known, life_of(stated, 12.0, 3.0, 1, {}), 1))

@@ -278,7 +278,9 @@ def test_events_jumps_and_requirements_limit_the_span(history: History) -> None:
     base = {
         "events": ((START + hour, "safe_mode", ("settling",)), (START + 1, "heater_set_point", ())),
         "jumps": (SimpleNamespace(body="base/forward/M2", after_us=START + 4 * hour, until_us=START + 5 * hour),),
-        "requirements": (SimpleNamespace(quantity=quantity, breaks_us=START + 9 * hour, holds_now=True),),
+        "requirements": (
+            SimpleNamespace(quantity=quantity, breaks_us=START + 9 * hour, probability=0.99, holds_now=True),
+        ),
     }
     operation = replace(stand_in(drawn(3), **base), experiment=told)
     spans = []
@@ -287,6 +289,8 @@ def test_events_jumps_and_requirements_limit_the_span(history: History) -> None:
         spans.append(tuple(round((t - START) / hour) for t in (held.since, held.until)))
         assert held.since_reason
     assert spans == [(0, 1), (1, 4), (5, 9), (9, 720)]
+    text = f"{quantity} may violate its requirement (probability above 1.0 %) from {utc_text(START + 9 * hour)[:10]} on"
+    assert text in products_of(operation, history, START + 6 * hour, None, load_backend()).validity.until_reason
     broken = replace(operation, requirements=(SimpleNamespace(quantity=quantity, breaks_us=None, holds_now=False),))
     found = products_of(broken, history, START, None, load_backend())
     assert found.warnings == ("ground height_m violates its requirement",)

@@ -26,7 +26,7 @@ from twin.operate.estimate.operation_filter import Operation
 from twin.operate.estimate.operation_model import stored_plan
 from twin.operate.estimate.reported_estimate import percent
 from twin.operate.overview import Overview, coverage, evenly_spaced, monitor_span, readings, single_readings, trend
-from twin.operate.record.entries import Alarm, Entry, micros
+from twin.operate.record.entries import Alarm, Entry, micros, utc_text
 from twin.operate.record.history import History, content_of, initialise_record
 
 
@@ -62,7 +62,7 @@ def test_the_first_sentence_is_the_state_and_the_second_what_changed(history, ov
     assert first.endswith("; 1 alarm is open")
     assert made.unmet
     assert made.lead[0].startswith(
-        "Δθ between the cameras is expected to violate its requirement of 20 arcsec on 2026-01-29, 9 days after"
+        "Δθ between the cameras may violate its requirement of 20 arcsec (probability above 5.0 %) from 2026-01-29 on"
     )
     assert any("alarm is open" in one for one in made.warnings)
     assert "all sigmas are inflated by a factor of 1.5" in made.warnings[0]
@@ -80,7 +80,7 @@ def test_the_first_sentence_is_the_state_and_the_second_what_changed(history, ov
     [
         (True, None, 0, "Both requirements hold now", False),
         (True, None, 5, "5 alarms are open; both requirements hold now", True),
-        (True, 36 * HOUR, 0, "Δα of forward is expected to violate its requirement of 0.4 arcsec on", True),
+        (True, 36 * HOUR, 0, "Δα of forward may violate its requirement of 0.4 arcsec (probability above", True),
         (False, None, 2, "2 of 2 requirements do not hold", True),
     ],
 )
@@ -94,10 +94,26 @@ def test_the_headline_leads_with_what_is_urgent(overview, holds, breaks, opened,
     assert sentences[0].startswith(first)
     assert asked.unmet == unmet
     if breaks is not None:
-        assert sentences[0].endswith("36 h after the newest reading")
+        assert sentences[0].endswith(f" %) from {utc_text(when)[:10]} on")
         assert any(one.startswith("Both requirements hold now") for one in sentences[1:])
     elif opened and not holds:
         assert sentences[0].endswith("; 2 alarms are open")
+
+
+def test_the_most_critical_requirement_is_the_next_to_be_violated(overview) -> None:
+    """The soonest date decides, then the change plus its sigma over the limit; a present probability does not."""
+    alpha, theta = overview.filter_result.requirements
+    result, soon = overview.filter_result, overview.time + 3 * DAY
+    for dates, named in (((None, soon), "Δθ"), ((soon, soon - DAY), "Δθ"), ((None, None), "Δα"), ((soon, soon), "Δα")):
+        needs = [
+            replace(one, holds_now=True, breaks_us=date, chance_now=chance)
+            for one, date, chance in zip((alpha, theta), dates, (1e-9, 1e-12), strict=True)
+        ]
+        sentence = replace(overview, filter_result=replace(result, requirements=needs)).state_sentence()
+        assert sentence.startswith(f"Both requirements hold now; the most critical: {named}")
+    needs = [replace(one, holds_now=False) for one in (alpha, theta)]
+    sentence = replace(overview, filter_result=replace(result, requirements=needs)).state_sentence()
+    assert sentence.startswith("2 of 2 requirements do not hold; the worst: Δα of forward is 1.014 ±")
 
 
 def test_the_table_has_every_quantity_with_its_requirement(overview):

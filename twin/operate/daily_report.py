@@ -231,7 +231,7 @@ def daily_report(history: History, overview: Overview, end: int) -> Report:
     facts = (
         ("Instrument", f"{history.name} ({history.sha256[:12]})"),
         ("Record", history.url),
-        ("Readings", f"{result.readings}, the newest of {minute_text(overview.time)} UTC"),
+        ("Readings", f"{result.readings_text}, the newest entry of {minute_text(overview.time)} UTC"),
         ("Disturbances", str(overview.operation.plan.operation.disturbances)),
         ("Forecast", f"{overview.horizon / DAY:g} d"),
     )
@@ -273,9 +273,9 @@ def end_of_day(text: str | None, newest: int) -> int:
 
 
 def state_table(overview: Overview) -> Table:
-    """Return the table of all quantities: value, sigma, requirement, probability and time of a violation."""
+    """Return the table of all quantities: value, sigma, requirement, its probability and first possible violation."""
     now = overview.filter_result.now
-    heads = ("change", "now", "σ", "limit", "P(exceeded) [%]", "allowed [%]", "holds", "expected violation")
+    heads = ("change", "now", "σ", "limit", "P(exceeded) [%]", "allowed [%]", "holds", "may be violated from")
     rows: list[list[Cell]] = []
     full: list[list[Cell]] = []
     bands: dict[int, str] = {}
@@ -291,7 +291,7 @@ def state_table(overview: Overview) -> Table:
     caption = (
         f"Changes since the reference images at {minute_text(overview.time)} UTC, from all readings until then. A "
         "requirement holds while the probability that the change exceeds its limit is at most the allowed one. "
-        "The expected violation is the day from which the forecast no longer meets this."
+        "It may be violated from the first day of the forecast on which the probability is larger."
     )
     name = "state"
     digits = Table(name, "State", "", ("of", *heads), full, within="")

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from analysis.monitor.kalman_filter import DetectionPower
     from twin.framework.report import Report
     from twin.operate.estimate.operation_filter import Operation
-    from twin.operate.estimate.reported_estimate import Course, FilterResult
+    from twin.operate.estimate.reported_estimate import Course, FilterResult, RequirementStatus
     from twin.operate.record.history import History
 
 STEPS = 4
@@ -46,7 +46,7 @@ def forecast(
         int, typer.Option(min=1, max=1000, help="Number of evenly spaced times after the newest reading.")
     ] = STEPS,
 ) -> None:
-    """Forecast every quantity until the horizon, with sigmas, and the time at which a requirement is violated.
+    """Forecast every quantity with its sigma, the probability that it exceeds its limit, and the first such day.
 
     A forecast begins at the newest reading. Drifts decay with their correlation times, seasons and trends continue,
     and sigma grows by the time laws of the plan's disturbances.
@@ -55,6 +55,7 @@ def forecast(
 
     Exit codes: 0 success, 2 bad input, 1 anything else.
     """
+    from twin.operate.estimate.reported_estimate import name_of, percent
     from twin.operate.record.entries import MICRO
 
     operation = call.filtered_operation(call.resolve_plan(plan))
@@ -64,18 +65,31 @@ def forecast(
     if end <= start:
         raise InputErrorText(f"--until: {until} is not after the newest reading, {result.now.utc[0]}")
     course = operation.forecast([start + round((end - start) * k / steps) for k in range(steps + 1)])
-    requirements = [requirement.to_dict() for requirement in result.requirements]
+    chances = {status.quantity: _chances(course, status) for status in result.requirements}
+    requirements = [{**status.to_dict(), "chances": chances[status.quantity]} for status in result.requirements]
     name, warnings = call.history.name, result.warnings
     data = {"record": call.history.url, "instrument": name, **course.to_dict(), "requirements": requirements}
 
     def show(console: Console) -> None:
         print_verdict(console, f"{name}: forecast from {course.utc[0]} to {course.utc[-1]}")
         _show_course(course, console)
+        if chances:
+            rows = [[name_of(key, course.quantities), *map(percent, values)] for key, values in chances.items()]
+            show_table(console, ("P(exceeded) of", *course.utc), rows, range(1, len(course.utc) + 1))
         show_requirements(result, console)
         for text in warnings:
             print_line(console, f"warning: {text}")
 
     call.print_result({**data, "warnings": warnings}, show)
+
+
+def _chances(course: Course, status: RequirementStatus) -> list[float]:
+    """Return the probabilities that a requirement's limit is exceeded at the times of an estimate."""
+    from twin.operate.estimate.reported_estimate import beyond
+
+    k = [quantity.name for quantity in course.quantities].index(status.quantity)
+    chances: list[float] = beyond(course.values[:, k], course.sigmas[:, k], status.limit).tolist()
+    return chances
 
 
 @on_record
@@ -87,7 +101,7 @@ def alarms(
 ) -> None:
     """List the alarms of a record, open ones first; or acknowledge one.
 
-    `ingest` and `status` raise an alarm once: for a requirement that is violated or is expected to be, a jump, a
+    `ingest` and `status` raise an alarm once: for a requirement that is or was violated or may be, a jump, a
     sensor that is dead, stuck or doubtful, and a reading that contradicts the prior. Alarms are never removed.
 
     Example: `python -m twin.operate alarms record --acknowledge 1 --by Ann --note "safe mode of 5 March"`
@@ -205,9 +219,9 @@ def report(
     """Write the daily report: one self-contained page, to be stored or sent by mail.
 
     Its first two sentences state whether the requirements are met and what changed on the day. Then follow every
-    quantity with its sigma, its requirement, the probability that it is exceeded and the expected day of a violation;
-    trends, jumps, the quality of the predictions, sensors, alarms, and excluded readings with the reason. The report
-    of a past day is the one that would have been written then.
+    quantity with its sigma, its requirement, the probability that it is exceeded and the day from which it may be
+    violated; trends, jumps, the quality of the predictions, sensors, alarms, and excluded readings with the reason. The
+    report of a past day is the one that would have been written then.
 
     Example: `python -m twin.operate report record --day 2028-03-05 --out report.html`
 
@@ -323,8 +337,8 @@ def show_estimate(result: FilterResult, rows: Sequence[Mapping[str, Any]], conso
     """
     from twin.operate.record.entries import utc_text
 
-    scores, count = result.scores, result.readings
-    print_line(console, f"estimate at {utc_text(result.time)} from {count} readings of the monitor")
+    scores = result.scores
+    print_line(console, f"estimate at {utc_text(result.time)} from {result.readings_text}")
     _show_course(result.now, console)
     show_requirements(result, console)
     if scores.components:
@@ -343,7 +357,8 @@ def show_estimate(result: FilterResult, rows: Sequence[Mapping[str, Any]], conso
     for sensor in bad:
         print_line(console, f"  {sensor.body}: {sensor.state} since {utc_text(sensor.since_us)}: {sensor.reason}")
     if result.excluded:
-        print_line(console, f"excluded from the estimate: {len(result.excluded)} of the latest entries; the newest:")
+        what = "excluded from the estimate, or not yet decided" if result.undecided else "excluded from the estimate"
+        print_line(console, f"{what}: {len(result.excluded)} of the latest entries; the newest:")
         for time, _, subject, reason in result.excluded[-3:]:
             print_line(console, f"  {utc_text(time)} {subject}: {reason}")
     waiting = [row for row in rows if row["acknowledged"] is None]
@@ -395,10 +410,10 @@ def show_requirements(result: FilterResult, console: Console) -> None:
                 percent(requirement.chance_now),
                 percent(1.0 - requirement.probability),
                 "yes" if requirement.holds_now else "no",
-                utc_text(requirement.breaks_us)
+                utc_text(requirement.breaks_us)[:10]
                 if requirement.holds_now and requirement.breaks_us is not None
                 else later,
             ]
         )
-    heads = ("requirement on", "limit", "P(exceeded)", "allowed", "holds now", "expected violation")
+    heads = ("requirement on", "limit", "P(exceeded)", "allowed", "holds now", "may be violated from")
     show_table(console, heads, rows, (1, 2, 3, 5))

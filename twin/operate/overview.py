@@ -330,14 +330,14 @@ class Overview:
         if not requirements:
             return "The plan states no requirement"
         broken = [requirement for requirement in requirements if not requirement.holds_now]
-        worst = max(requirements, key=lambda status: status.chance_now / (1.0 - status.probability))
+        worst = max(broken or requirements, key=self._urgency)
         which = f"{self._now(worst)}, limit {_limit(worst)} (exceeded with a probability of "
         which += f"{percent(worst.chance_now)}; {percent(1.0 - worst.probability)} is allowed)"
         if len(requirements) == 1:
             return f"The requirement {'does not hold' if broken else 'holds'}: {which}"
         if broken:
-            verb, link = ("does", "") if len(broken) == 1 else ("do", "the worst is ")
-            return f"{len(broken)} of {len(requirements)} requirements {verb} not hold: {link}{which}"
+            verb = "does not hold:" if len(broken) == 1 else "do not hold; the worst:"
+            return f"{len(broken)} of {len(requirements)} requirements {verb} {which}"
         count = "Both" if len(requirements) == 2 else f"All {len(requirements)}"
         return f"{count} requirements hold now; the most critical: {which}"
 
@@ -359,7 +359,7 @@ class Overview:
 
     @property
     def unmet(self) -> bool:
-        """True if a requirement does not hold or is expected to be violated, or an alarm is open."""
+        """True if a requirement does not hold or may be violated, or an alarm is open."""
         requirements = self.filter_result.requirements
         coming = any(not requirement.holds_now or requirement.breaks_us is not None for requirement in requirements)
         return coming or bool(self.open_alarms())
@@ -385,16 +385,15 @@ class Overview:
         return f"{text[0].upper()}{text[1:]} {when}"
 
     def break_sentences(self) -> list[str]:
-        """Return the sentences on requirements that are expected to be violated, the earliest first."""
+        """Return the sentences on requirements that may be violated within the horizon, the earliest first."""
         coming = [
             requirement
             for requirement in self.filter_result.requirements
             if requirement.holds_now and requirement.breaks_us is not None
         ]
         return [
-            f"{_capital(self._name(status))} is expected to violate its requirement of {_limit(status)} on "
-            f"{day_text(status.breaks_us or 0)}, {_days_text((status.breaks_us or 0) - self.time)} after the "
-            "newest reading"
+            f"{_capital(self._name(status))} may violate its requirement of {_limit(status)} (probability above "
+            f"{percent(1.0 - status.probability)}) from {day_text(status.breaks_us or 0)} on"
             for status in sorted(coming, key=lambda status: status.breaks_us or 0)
         ]
 
@@ -416,6 +415,16 @@ class Overview:
         """Return the open alarms, the newest first."""
         alarms = [alarm for alarm in self.alarms if alarm["acknowledged"] is None]
         return sorted(alarms, key=lambda row: -int(row["time_us"]))
+
+    def _urgency(self, requirement: RequirementStatus) -> tuple[float, float]:
+        """Return the negative time at which a requirement may be violated, and the share of its limit in use.
+
+        The share is the absolute change plus its sigma, over the limit.
+        """
+        breaks, q = requirement.breaks_us, self.quantities.index(self._quantity(requirement))
+        now = self.filter_result.now
+        used = (abs(float(now.values[0, q])) + float(now.sigmas[0, q])) / requirement.limit
+        return -math.inf if breaks is None else -float(breaks), used
 
     def _name(self, requirement: RequirementStatus) -> str:
         return name_of(requirement.quantity, self.quantities)
@@ -443,12 +452,6 @@ _COUNTED: Mapping[str, tuple[str, str]] = FrozenMap(
 
 def _count_text(count: int, singular: str, plural: str) -> str:
     return singular if count == 1 else plural.format(count)
-
-
-def _days_text(span: int) -> str:
-    """Return a span of microseconds in days, or in hours below two days."""
-    days = span / DAY
-    return f"{days:.0f} days" if days >= 2.0 else f"{24.0 * days:.0f} h"
 
 
 def _capital(text: str) -> str:

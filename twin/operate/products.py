@@ -39,7 +39,9 @@ from twin.framework.procedure import BenchError
 from twin.framework.record import Quantity, Record
 from twin.framework.reference_frames import described
 from twin.operate.estimate.operation_model import plan_digest
+from twin.operate.estimate.reported_estimate import percent
 from twin.operate.estimated_motions import EstimatedMotions, OmittedComponent, Prior, prior_files, state_file
+from twin.operate.overview import day_text, minute_text
 from twin.operate.record.entries import MICRO, digest_of_data, instrument_digest, micros, utc_text
 from twin.operate.record.schema import ENTRY
 from twin.orbit.export.export_report import LINE, export_files
@@ -384,9 +386,11 @@ def _validity_limits(result: FilterResult) -> list[ValidityLimit]:
         ]
     for requirement in result.requirements:
         if requirement.breaks_us is not None:
-            marks.append(
-                ValidityLimit(requirement.breaks_us, f"{requirement.quantity} violates its requirement from then on")
-            )
+            text = f"{requirement.quantity} violates its requirement"
+            if requirement.holds_now:
+                allowed, day = percent(1.0 - requirement.probability), day_text(requirement.breaks_us)
+                text = f"{requirement.quantity} may violate its requirement (probability above {allowed}) from {day} on"
+            marks.append(ValidityLimit(requirement.breaks_us, text))
     return marks
 
 
@@ -598,10 +602,10 @@ def product_files(products: Products) -> tuple[dict[str, bytes], dict[str, Any]]
 def summary(products: Products) -> str:
     """Return a summary of the products in words, for the terminal."""
     lines = [
-        f"{products.history.name} at {utc_text(products.time)}, from {products.filter_result.readings} readings up to "
+        f"{products.history.name} at {utc_text(products.time)}, from {products.filter_result.readings_text} up to "
         f"{utc_text(products.filter_result.time)}",
-        f"valid from {utc_text(products.validity.since)}: {products.validity.since_reason}",
-        f"valid until {utc_text(products.validity.until)}: {products.validity.until_reason}",
+        f"valid from {minute_text(products.validity.since)} UTC: {products.validity.since_reason}",
+        f"valid until {minute_text(products.validity.until)} UTC: {products.validity.until_reason}",
     ]
     for name, model in (products.export.lines if products.export is not None else {}).items():
         if model.ground is not None:

@@ -319,6 +319,8 @@ class EstimatorState:
         Innovations of the first readings of the record, in the form of `innovations`.
     disagreeing : tuple[str, ...]
         Bodies whose sensors have disagreed with the prior at the same time as other sensors.
+    violations : tuple[Violation, ...]
+        Spans of readings at which a requirement was violated, in the order of their beginnings.
     """
 
     filter_state: FilterState
@@ -338,6 +340,7 @@ class EstimatorState:
     bad_readings: tuple[tuple[int, str], ...] = ()
     first_innovations: tuple[tuple[int, float, int], ...] = ()
     disagreeing: tuple[str, ...] = ()
+    violations: tuple[Violation, ...] = ()
 
     @property
     def explained(self) -> Array:
@@ -436,7 +439,53 @@ class EstimatorState:
     @classmethod
     def from_bytes(cls, content: bytes) -> EstimatorState:
         """Return the estimator's state that was serialised by `packed`."""
-        return cast("EstimatorState", unpacked(content, cls, Scores, Sensor, JumpDetection))
+        return cast("EstimatorState", unpacked(content, cls, Scores, Sensor, JumpDetection, Violation))
+
+
+SAME_SPAN = 30 * 86_400 * MICRO
+"""Time between two readings that violate a requirement below which they belong to one span, in microseconds."""
+
+
+@dataclass(frozen=True)
+class Violation:
+    """Span of readings at which a requirement was violated, as estimated from the readings up to each of them.
+
+    Attributes
+    ----------
+    quantity : str
+        Group and key of the quantity.
+    limit : float
+        Limit of its absolute change, in its unit.
+    since_us, until_us : int
+        Times of the first and the last violating reading, in microseconds of TAI since 2000.
+    readings : int
+        Number of violating readings.
+    worst_us : int
+        Time of the largest absolute change.
+    value, sigma, chance : float
+        This change, its standard deviation, and the probability that it exceeds the limit.
+    """
+
+    quantity: str
+    limit: float
+    since_us: int
+    until_us: int
+    readings: int
+    worst_us: int
+    value: float
+    sigma: float
+    chance: float
+
+    def appended_to(self, earlier: tuple[Violation, ...]) -> tuple[Violation, ...]:
+        """Return earlier violations with this one, joined to the span of the same requirement that it continues."""
+        for k, span in enumerate(earlier):
+            same = (span.quantity, span.limit) == (self.quantity, self.limit)
+            if same and self.since_us - span.until_us < SAME_SPAN:
+                worst = max(span, self, key=lambda violation: abs(violation.value))
+                count = span.readings + self.readings
+                joined = replace(worst, since_us=span.since_us, until_us=self.until_us, readings=count)
+                return (*earlier[:k], joined, *earlier[k + 1 :])
+        return (*earlier, self)
 
 
 @dataclass(frozen=True, eq=False)

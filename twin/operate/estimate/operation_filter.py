@@ -7,6 +7,7 @@ checkpoint (stored state) before it. The result is identical to the bit, however
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import cached_property
@@ -35,7 +36,7 @@ from scenes.specs.operation import OperationSetup
 from scenes.yaml.errors import Problem
 from twin.framework.provenance import source_digest
 from twin.monitor.monitor_experiment import MonitorExperiment
-from twin.operate.estimate.estimate_snapshot import EntryFilter, EstimatorState, packed, unpacked
+from twin.operate.estimate.estimate_snapshot import EntryFilter, EstimatorState, Violation, packed, unpacked
 from twin.operate.estimate.operation_model import OperationModel, plan_digest, traced_model
 from twin.operate.estimate.reported_estimate import (
     Course,
@@ -118,8 +119,9 @@ class Operation:
         self._sensors = tuple(body for body in history.subjects("temperature") if body in history.bodies["warm"])
         self._plan_digest: str = plan_digest(plan) if previous is None else previous._plan_digest
         order = [list(plan.model.instrument.cameras), list(plan.disturbances.causes)]
+        needs = [[each.name, each.largest, each.probability] for each in plan.operation.requirements]
         parts = [self._plan_digest, order, self.epoch, list(self._sensors), [list(reading) for reading in before]]
-        self.key = digest_of_data([source_digest(), *parts])
+        self.key = digest_of_data([source_digest(), needs, *parts])
         """SHA-256 of everything besides the readings that the estimate depends on."""
         if previous is not None and previous.key == self.key:
             known = vars(previous)
@@ -204,6 +206,7 @@ class Operation:
             if state is None:
                 state = entry_filter.start(int(moments[0][0]["time_us"]))
             before = state.scores.readings
+            read = any(entry["kind"] == "monitor" for entry in moments[count])
             state = entry_filter.take(state, moments[count])
             count += 1
             if state.newly_stuck:
@@ -212,6 +215,8 @@ class Operation:
                 if state is None:
                     state = entry_filter.start(int(moments[0][0]["time_us"]), self._stuck_sensors)
                 continue
+            if read:
+                state = self._judged(state)
             number = state.scores.readings // CHECKPOINT_READINGS
             if number > before // CHECKPOINT_READINGS:
                 self._save_state(state, number, newest)
@@ -222,6 +227,24 @@ class Operation:
             self._save_state(state, _HEAD, newest)
             self._saved = state.scores.readings
         return state
+
+    def _judged(self, state: EstimatorState) -> EstimatorState:
+        """Return the estimator's state with every requirement judged at its newest reading of the monitor."""
+        if not self.plan.operation.requirements:
+            return state
+        then = copy.copy(self)
+        for name in ("_now", "_sigma_inflation", "too_many_jumps"):  # they depend on the state
+            vars(then).pop(name, None)
+        vars(then)["estimator_state"] = state
+        now, names, violations = then.forecast([state.time]), [each.name for each in self.quantities], state.violations
+        for requirement in self.plan.operation.requirements:
+            k, limit = names.index(requirement.name), requirement.largest
+            value, sigma = float(now.values[0, k]), float(now.sigmas[0, k])
+            chance = float(beyond(now.values[0, k], now.sigmas[0, k], limit))
+            if chance > 1.0 - requirement.probability:
+                times = state.time, state.time, 1, state.time
+                violations = Violation(requirement.name, limit, *times, value, sigma, chance).appended_to(violations)
+        return replace(state, violations=violations)
 
     def _rewind(self, state: EstimatorState) -> EstimatorState | None:
         """Return the newest checkpoint before a sensor got stuck; None if there is none.
@@ -295,6 +318,7 @@ class Operation:
             state.bad_readings,
             state.pending is not None,
             self._understated_causes(),
+            state.violations,
         )
 
     def power(self) -> tuple[DetectionPower, ...]:

@@ -1,7 +1,7 @@
 """Reported estimate of an instrument in operation: values with sigmas over time, jumps, sensors and alarms.
 
-An alarm reports that a requirement is violated or will be, that a body jumped, that a sensor fails, or that readings
-contradict the prior. Each alarm is raised once, and stays open in the record until somebody acknowledges it. A
+An alarm reports that a requirement is or was violated or may be, that a body jumped, that a sensor fails, or that
+readings contradict the prior. Each alarm is raised once, and stays open in the record until somebody acknowledges it. A
 continuing condition, such as a requirement that stays violated, is not raised again while its alarm is open, nor within
 a month of an acknowledged alarm.
 """
@@ -23,7 +23,7 @@ from analysis.monitor.parameters import ANGLE_GROUP, GROUND_GROUP
 from analysis.statistics import limit_of, p_value_of
 from scenes.specs.operation import OperationSpec
 from twin.framework.artefact import decimals_for, fixed, plain
-from twin.operate.estimate.estimate_snapshot import SPANS, Scores
+from twin.operate.estimate.estimate_snapshot import SAME_SPAN, SPANS, Scores, Violation
 from twin.operate.record.entries import MICRO, Alarm, utc_text
 from twin.operate.record.history import History
 
@@ -271,6 +271,8 @@ class FilterResult:
         True if the newest rejected reading may be the first one after a jump; the sigmas then include both cases.
     understated_causes : tuple[str, ...]
         Causes of the prior with which the sensors of several bodies jointly disagree.
+    violations : tuple[Violation, ...]
+        Spans of readings at which a requirement was violated, past ones and those that last.
     """
 
     time: int
@@ -289,6 +291,13 @@ class FilterResult:
     bad_readings: tuple[tuple[int, str], ...] = ()
     undecided: bool = False
     understated_causes: tuple[str, ...] = ()
+    violations: tuple[Violation, ...] = ()
+
+    @property
+    def readings_text(self) -> str:
+        """Number of readings of the monitor that were used, and whether the newest one is undecided, as text."""
+        text = "1 reading of the monitor" if self.readings == 1 else f"{self.readings} readings of the monitor"
+        return f"{text} (and a newer one that may be an outlier)" if self.undecided else text
 
     @property
     def warnings(self) -> list[str]:
@@ -396,7 +405,7 @@ def inflation_factors(
     return out
 
 
-AGAIN = 30 * 86_400 * MICRO
+AGAIN = SAME_SPAN
 """Time after an acknowledged alarm from which a continuing condition raises it again, in microseconds."""
 LEAST = 1e-6
 """Probability below which reports print "less than" and this bound instead of a number."""
@@ -434,8 +443,16 @@ def raise_alarms(history: History, plan: OperationSpec, result: FilterResult) ->
 def alarms_of(plan: OperationSpec, result: FilterResult) -> Iterator[Alarm]:
     """Yield all alarms that follow from the estimate, including those that have been raised before."""
     for requirement in result.requirements:
+        since = result.time
+        for span in result.violations:
+            if (span.quantity, span.limit) != (requirement.quantity, requirement.limit):
+                continue  # of another requirement
+            if requirement.holds_now or result.time - span.until_us >= SAME_SPAN:
+                yield _of_violation(span, requirement, result.now.quantities)
+            else:
+                since = span.since_us
         if not requirement.holds_now or requirement.breaks_us is not None:
-            yield _of_requirement(requirement, result.time, result.now.quantities)
+            yield _of_requirement(requirement, since, result.time, result.now.quantities)
     for jump in result.jumps:
         yield _of_jump(jump)
     for sensor in result.sensors:
@@ -445,7 +462,7 @@ def alarms_of(plan: OperationSpec, result: FilterResult) -> Iterator[Alarm]:
     if result.understated_causes:
         text = next(warning for warning in result.warnings if result.understated_causes[0] in warning)
         yield Alarm(CONTRADICTION, "temperatures", result.time, text, {"causes": list(result.understated_causes)})
-    far = [*_contradictions(plan, result), *map(_of_bad, result.bad_readings)]
+    far = [*_contradictions(plan, result), *_bad_readings(result)]
     yield from sorted(far, key=lambda occurrence: occurrence.time)[-1:]
 
 
@@ -461,6 +478,15 @@ def _is_repeated(alarm: Alarm, before: Sequence[Row]) -> bool:
         return any(
             earlier["content"]["after_us"] < ended and began < earlier["content"]["until_us"] for earlier in same
         )
+    if alarm.kind == BROKEN:  # each span of readings raises its own alarm, which may have been raised at its beginning
+        began = alarm.content["since_us"]
+        same = [
+            earlier
+            for earlier in same
+            if earlier["time_us"] >= began and earlier["content"].get("since_us", earlier["time_us"]) <= alarm.time
+        ]
+        if alarm.content["ended"]:
+            return bool(same)
     if alarm.kind == CONTRADICTION:  # each reading raises its own alarm
         return any(earlier["acknowledged"] is None or alarm.time <= earlier["time_us"] for earlier in same)
     return any(earlier["acknowledged"] is None or abs(alarm.time - earlier["time_us"]) < AGAIN for earlier in same)
@@ -491,16 +517,32 @@ def percent(probability: float) -> str:
     return f"{fixed(100.0 * probability, decimals_for(100.0 * rest))} %"
 
 
-def _of_requirement(requirement: RequirementStatus, time: int, quantities: Sequence[Quantity]) -> Alarm:
-    """Return the alarm of a requirement that is violated or is expected to be."""
+def _of_violation(span: Violation, requirement: RequirementStatus, quantities: Sequence[Quantity]) -> Alarm:
+    """Return the alarm of a requirement that was violated in the past, at the time of the last violating reading."""
+    name, allowed = name_of(span.quantity, quantities), percent(1.0 - requirement.probability)
+    when = f"between {utc_text(span.since_us)} and {utc_text(span.until_us)}"
+    count = f"{span.readings} readings {when}" if span.readings > 1 else f"the reading of {utc_text(span.since_us)}"
+    worst = f"{with_sigma(span.value, span.sigma, requirement.unit)} at {utc_text(span.worst_us)}"
+    text = (
+        f"{name} exceeded {plain(span.limit)} {requirement.unit} at {count} with a probability above {allowed}; the "
+        f"largest change was {worst}, beyond the limit with a probability of {percent(span.chance)}"
+    )
+    return Alarm(BROKEN, span.quantity, span.until_us, text, {**vars(span), "ended": True})
+
+
+def _of_requirement(requirement: RequirementStatus, since: int, time: int, quantities: Sequence[Quantity]) -> Alarm:
+    """Return the alarm of a requirement that is violated, from a time on, or may be."""
     name, allowed = name_of(requirement.quantity, quantities), percent(1.0 - requirement.probability)
     limit = f"{plain(requirement.limit)} {requirement.unit}"
     if not requirement.holds_now:
         text = f"{name} exceeds {limit} with a probability of {percent(requirement.chance_now)}; {allowed} is allowed"
-        return Alarm(BROKEN, requirement.quantity, time, text, requirement.to_dict())
+        content = {**requirement.to_dict(), "since_us": since, "ended": False}
+        if since < time:
+            text += f"; it has been violated since {utc_text(since)}"
+        return Alarm(BROKEN, requirement.quantity, time, text, content)
     assert requirement.breaks_us is not None
-    since = utc_text(requirement.breaks_us)
-    text = f"{name} is expected to exceed {limit} with a probability above {allowed} from {since} on"
+    day = utc_text(requirement.breaks_us)
+    text = f"{name} may exceed {limit} (probability above {allowed}) from {day[:10]} on"
     return Alarm(BREAKS, requirement.quantity, time, text, requirement.to_dict())
 
 
@@ -518,11 +560,12 @@ def with_sigma(value: float, sigma: float, unit: str, sign: bool = False) -> str
     return f"{fixed(value, decimals, sign)} ± {fixed(sigma, decimals)} {unit.replace('um', 'µm')}"
 
 
-def _of_bad(bad: tuple[int, str]) -> Alarm:
-    """Return the alarm of a monitor reading that was rejected as an outlier, given its time and the reason."""
-    time, reason = bad
-    text = f"the reading of {utc_text(time)} was rejected as an outlier: {reason}; exclude --include uses it anyway"
-    return Alarm(CONTRADICTION, "monitor", time, text, {"time_utc": utc_text(time), "reason": reason})
+def _bad_readings(result: FilterResult) -> Iterator[Alarm]:
+    """Yield the alarms of monitor readings that were rejected as outliers, or may be."""
+    for k, (time, reason) in enumerate(result.bad_readings, start=1):
+        what = "may be" if result.undecided and k == len(result.bad_readings) else "was rejected as"
+        text = f"the reading of {utc_text(time)} {what} an outlier: {reason}; exclude --include uses it anyway"
+        yield Alarm(CONTRADICTION, "monitor", time, text, {"time_utc": utc_text(time), "reason": reason})
 
 
 def _contradictions(plan: OperationSpec, result: FilterResult) -> Iterator[Alarm]:
