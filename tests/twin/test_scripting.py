@@ -260,6 +260,24 @@ def test_a_script_gets_a_commands_run_folder(name: str, file: Path | str, shot: 
 
 
 @pytest.mark.second
+def test_a_script_refocuses_a_perturbed_camera(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A move of the image plane alone, 0.2 waves rms, is undone up to the nominal camera's own best focus."""
+    monkeypatch.setattr("twin.camera.camera_run.MAX_WAVES_FOR_MTF", 0.0)  # no MTF, which takes most of the time
+    perturb = ["focal_plane shift z 400 um"]
+    focused = twin.perform("camera", "ritchey_chretien", perturb=perturb, refocus=True)
+    assert focused.run.refocus.errors_before.max() > 0.2
+    assert focused.run.errors.max() < 0.07
+    assert focused.numbers["refocus"]["perturb"][0].startswith("focal_plane shift z")
+    assert focused._facts.options == ("--refocus",)  # of the command that repeats the run
+
+
+def test_options_of_a_command_are_checked() -> None:
+    for chosen, words in (({"tilt": True}, "tilt goes with refocus"), ({"refocus": "yes"}, "True or False")):
+        with pytest.raises(twin.InputError, match=words):
+            twin.perform("camera", "ritchey_chretien", **chosen)
+
+
+@pytest.mark.second
 def test_another_camera_of_a_test_is_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The camera that is named is the one that is measured, not that of the file."""
     monkeypatch.setattr(
