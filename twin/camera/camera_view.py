@@ -225,7 +225,7 @@ class CameraView(CameraOptics, Plottable):
 
     @property
     def prescription(self) -> Camera:
-        """Nominal camera as an `optics.Camera`, for `optics.psf`, `optics.encircled_energy`, `optics.seidel` and others.
+        """Nominal camera as an `optics.Camera`, for `optics.psf`, `optics.ensquared_energy`, `optics.seidel` and more.
 
         The frame of its surfaces is that of the camera's file, with the origin at the first vertex; `field_angles`
         converts fields. Colour and best image plane of this camera are included.
