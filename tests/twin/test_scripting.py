@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import subprocess
 import sys
 import time
@@ -220,6 +221,26 @@ def test_the_jacobian_is_what_small_motions_do(pair: twin.InstrumentTwin) -> Non
             own = found.true.sel(camera=camera, motion=name)
             assert own.values[:3] == pytest.approx(vector[:, 0] - vector[:, 1], abs=1e-6)
             assert own.values[3] == pytest.approx(1e6 * (change.d_f[0] - change.d_f[1]), abs=1e-4)
+
+
+def test_a_study_names_what_it_takes(tmp_path: Path) -> None:
+    """A name is loaded, so that a file that is not there is reported; a camera's view is refused in a sentence."""
+    vary = {"M2 shift z": "(-5 .. 5) um"}
+    camera = twin.load_camera("ritchey_chretien")
+    with pytest.raises(twin.InputError, match=r"CameraTwin is not an instrument.*twin\.load\(NAME or FILE\)"):
+        twin.study(camera, vary)
+    with pytest.raises(twin.InputError, match=r"nowhere\.yaml"):
+        twin.study(str(tmp_path / "nowhere.yaml"), vary)
+    with pytest.raises(twin.InputError, match="nothing varies"):
+        twin.study("ritchey_chretien", {})
+
+
+def test_an_mtf_shows_the_frequencies_that_were_asked_for() -> None:
+    camera = twin.load_camera("ritchey_chretien")
+    single, table = repr(camera.mtf((0, 0), "80 cycles/mm")), repr(camera.mtf((0, 0)))
+    assert re.search(r"frequency 80 cycles/mm; along line 0\.27\d+; along track 0\.27\d+", single)
+    assert "nan" not in single
+    assert re.search(r"nyquist 71\.43 cycles/mm; mtf at nyquist \(0\.\d+, 0\.\d+\)", table)
 
 
 @pytest.mark.parametrize(("motion", "found", "says"), refusals("motions"))

@@ -32,7 +32,8 @@ def optics_camera(model: CameraModel, wavelength: float) -> Camera:
     """
     spec = model.spec
     heights = [*(mirror.z for mirror in spec.mirrors.values()), spec.image.z]
-    surfaces, medium = [], 1.0
+    surfaces: list[OpticalSurface] = []
+    medium: str | float = 1.0
     for (name, mirror), thickness in zip(spec.mirrors.items(), np.diff(heights), strict=True):
         if mirror.sag:
             problem = f"optics.Camera has conics and even aspheric terms only, and {name} has further terms of its sag"
@@ -83,7 +84,10 @@ def _edges(model: CameraModel, name: str) -> tuple[float, float, tuple[tuple[flo
         `OpticalSurface` cannot describe these edges.
     """
     key: KeyPath = ("mirrors", name, "edges")
-    rims, holes, vanes, centres = [], [], [], []
+    rims: list[float] = []
+    holes: list[float] = []
+    vanes: list[tuple[float, float]] = []
+    centres: list[tuple[float, float]] = []
     if name == model.spec.stop:
         x_min, x_max, y_min, y_max = model.apertures[name].bounds
         rims.append(0.5 * (x_max - x_min))
