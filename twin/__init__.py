@@ -10,7 +10,8 @@
 Functions, each with its own help, such as help(twin.load):
 
     load(what)           an instrument: InstrumentTwin, with perturbed, render, recover, camera, refocused, jacobian
-    load_camera(what)    a single camera, with wavefront, spot, mtf (each with plot), first_order, refocused, perturbed
+    load_camera(what)    a single camera, with wavefront, spot, mtf (each with plot), first_order, refocused, perturbed,
+                         and prescription, the camera as an optics.Camera
     study(pair, vary)    runs an instrument many times with factors that vary: a table of all runs
     perform(name, file)  runs the procedure of a command on a file, such as "lab focus" or "tolerance": TestResult
 

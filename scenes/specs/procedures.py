@@ -50,6 +50,8 @@ class Procedure:
         True if the user is warned of cameras that are blurred even as designed.
     seeded : bool
         True if the test draws random numbers; config.yaml then has the seed.
+    options : tuple[str, ...]
+        Options of the command that are named arguments of ``run``, True or False; `twin.perform` takes them as well.
     about : str
         Text of ``--help`` in Markdown; its first paragraph is shown in the list of subcommands.
     frames : Mapping[str, str]
@@ -67,6 +69,7 @@ class Procedure:
     varied: bool = False
     judged: bool = True
     seeded: bool = True
+    options: tuple[str, ...] = ()
     about: str = ""
     frames: Mapping[str, str] = field(default_factory=FrozenMap)
 
@@ -417,6 +420,7 @@ _PROCEDURES: dict[str, Procedure] = {
         run="twin.camera.camera_run:run_camera",
         numbers="twin.camera.camera_run:CAMERA",
         report="twin.camera.camera_report:camera_report",
+        options=("refocus", "tilt"),
     ),
     "recover": Procedure(
         "recovered",

@@ -32,9 +32,10 @@ from tests.twin.test_blurred_cameras import GF7, gf7_with
 from twin.camera import camera_plots
 from twin.camera.__main__ import app
 from twin.camera.camera_optics import CameraOptics
+from twin.camera.camera_report import camera_report
 from twin.camera.camera_run import aberration_name, find_focus, perturbed_text, refocus_text, run_camera, verdict
 from twin.camera.field_maps import distortion
-from twin.camera.first_order_data import obstacles
+from twin.camera.first_order_data import FIRST_ORDER, detector_beyond_field, first_order_data, obstacles
 from twin.design.__main__ import app as design_app
 from twin.design.design_run import HELD_BY, _held_text, run_design
 from twin.design.layout_bench import BeamFacts
@@ -203,6 +204,26 @@ def test_what_it_refuses(tmp_path) -> None:
         assert result.exit_code == 2, words
         assert re.search(message, " ".join(result.stderr.split())), (words, result.stderr)
         assert not (tmp_path / "out").exists(), words
+
+
+@pytest.mark.second
+def test_an_area_detector_has_its_size_and_may_be_larger_than_the_field(tmp_path, backend, monkeypatch) -> None:
+    """0.3 deg by 0.04 deg at 5 m are 26 by 3.5 mm, and 2048 pixels of 7 um 14.3 mm."""
+    monkeypatch.setattr("twin.camera.camera_run.MAX_WAVES_FOR_MTF", 0.0)  # no MTF, which takes most of the time
+    spec = load_camera("ritchey_chretien")
+    data = first_order_data(CameraOptics.alone(spec, backend))
+    assert "detector_mm" not in FIRST_ORDER(data)
+    area = spec.line.model_copy(update={"pixels": 2048, "rows": 2048})
+    told = replace(data, spec=spec.model_copy(update={"line": area}))
+    assert FIRST_ORDER(told)["detector_mm"] == pytest.approx([14.336, 14.336])
+    assert "14.34 by 14.34 mm, is larger across the line than the image" in detector_beyond_field(told)
+    for line in (spec.line, area.model_copy(update={"rows": 498})):  # 3.486 mm: the image of the field
+        assert not detector_beyond_field(replace(data, spec=spec.model_copy(update={"line": line})))
+    text = (LIBRARY / "cameras" / "ritchey_chretien.yaml").read_text("utf-8")
+    (tmp_path / "own.yaml").write_text(text.replace("{pixels: 3700,", "{pixels: 2048, rows: 2048,"), "utf-8")
+    report = camera_report(run_camera(resolve_camera(tmp_path / "own.yaml"), backend))
+    assert ("detector", "2048 × 2048 pixels, 14.34 × 14.34 mm") in report.summary.rows
+    assert any("is larger across the line" in text for text in report.lead)
 
 
 @pytest.mark.second

@@ -3,12 +3,15 @@
 import json
 import shutil
 from dataclasses import replace
+from io import BytesIO
 from pathlib import Path
+from types import SimpleNamespace
 
 import h5py
 import numpy as np
 import pytest
 import tifffile
+from matplotlib.image import imread
 from typer.testing import CliRunner
 
 from twin.compare import compare_report
@@ -218,3 +221,25 @@ def test_other_versions_and_warnings_of_a_run_are_told(runs: Path) -> None:
     assert said[1:] == ("again: dim",)
     turned = compare_report._warnings(replace(changed, runs=(changed.runs[1], first)))
     assert turned[-1].endswith(" only: dim")
+
+
+def test_a_map_with_nan_outside_a_pupil_keeps_its_scale(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without a scale all of the pupil has one colour."""
+    x, y = np.meshgrid(*[np.linspace(-1.0, 1.0, 33)] * 2)
+    first = np.where(np.hypot(x, y) <= 1.0, x**2 - y, np.nan)[None].repeat(3, axis=0)
+    arrays = {"a": first, "b": first + 0.25}
+    array = array_difference("optics.nc", "wavefront", arrays["a"], arrays["b"])
+    nowhere = array_difference("optics.nc", "wavefront", np.full_like(first, np.nan), arrays["b"])
+
+    def content(path: Path, _: str) -> SimpleNamespace:
+        return SimpleNamespace(arrays={"wavefront": arrays[path.parent.name]})
+
+    monkeypatch.setattr(compare_report.difference, "content_of", content)
+    sides = [SimpleNamespace(folder=Path(name)) for name in "ab"]
+    (figure,) = compare_report._pictures(*sides, SimpleNamespace(arrays=[array]), ("a", "b"), 0)
+    assert figure.caption == "Differences up to 0.250."
+    pixels = imread(BytesIO(figure.png))[..., :3]
+    left = pixels[:, : pixels.shape[1] // 4].reshape(-1, 3)
+    assert len(np.unique(left, axis=0)) > 100
+    arrays["a"] = np.full_like(first, np.nan)
+    assert compare_report._pictures(*sides, SimpleNamespace(arrays=[nowhere]), ("a", "b"), 0) == []

@@ -5,13 +5,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from markupsafe import Markup
 
 from optics.geometry.tree import Motion
 from scenes.specs.resolved import resolve
 from twin.main_job.render_folder import render_report
 from twin.main_job.render_job import render_job
 from twin.pictures.light_paths import trace_light_paths
-from twin.pictures.scene_file import scene_bytes
+from twin.pictures.scene_file import scene_bytes, viewer_page
 
 CHROMIUM = shutil.which("chromium")
 pytestmark = [pytest.mark.second, pytest.mark.skipif(CHROMIUM is None, reason="chromium is not installed")]
@@ -144,6 +145,21 @@ def test_the_view_turns_and_its_motions_grow(report, open_page) -> None:
     page.mouse.move(1.0, 1.0)
     assert canvas.screenshot() != turned
     assert reader.wrong == []
+
+
+def test_the_slider_is_named_only_where_something_moved(run, tmp_path, open_page) -> None:
+    instrument = run.experiment.instrument
+    state = {"base/backward/focal_plane": Motion(shift=(0.0, 1e-5, 0.0))}
+    for moved in ({}, state):
+        paths = trace_light_paths(instrument, run.experiment.backend, moved)
+        page = viewer_page("view", scene_bytes(instrument, moved, paths), "", Markup(""))
+        (tmp_path / "view.html").write_text(page, encoding="utf-8")
+        reader = open_page(tmp_path / "view.html", 1000, "light")
+        reader.page.locator("#viewer[data-ready]").wait_for(timeout=60_000)
+        assert ("whatever the slider says" in reader.page.inner_text("#viewer")) == bool(moved)
+        assert reader.page.locator("#viewer input[type=range]").is_visible() == bool(moved)
+        assert "scene.glb" in reader.page.inner_text("#viewer")
+        assert reader.wrong == []
 
 
 def test_a_drawing_stands_in_where_there_is_no_webgl(launcher, report) -> None:

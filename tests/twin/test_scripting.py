@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import subprocess
 import sys
 import time
@@ -222,6 +223,26 @@ def test_the_jacobian_is_what_small_motions_do(pair: twin.InstrumentTwin) -> Non
             assert own.values[3] == pytest.approx(1e6 * (change.d_f[0] - change.d_f[1]), abs=1e-4)
 
 
+def test_a_study_names_what_it_takes(tmp_path: Path) -> None:
+    """A name is loaded, so that a file that is not there is reported; a camera's view is refused in a sentence."""
+    vary = {"M2 shift z": "(-5 .. 5) um"}
+    camera = twin.load_camera("ritchey_chretien")
+    with pytest.raises(twin.InputError, match=r"CameraTwin is not an instrument.*twin\.load\(NAME or FILE\)"):
+        twin.study(camera, vary)
+    with pytest.raises(twin.InputError, match=r"nowhere\.yaml"):
+        twin.study(str(tmp_path / "nowhere.yaml"), vary)
+    with pytest.raises(twin.InputError, match="nothing varies"):
+        twin.study("ritchey_chretien", {})
+
+
+def test_an_mtf_shows_the_frequencies_that_were_asked_for() -> None:
+    camera = twin.load_camera("ritchey_chretien")
+    single, table = repr(camera.mtf((0, 0), "80 cycles/mm")), repr(camera.mtf((0, 0)))
+    assert re.search(r"frequency 80 cycles/mm; along line 0\.27\d+; along track 0\.27\d+", single)
+    assert "nan" not in single
+    assert re.search(r"nyquist 71\.43 cycles/mm; mtf at nyquist \(0\.\d+, 0\.\d+\)", table)
+
+
 @pytest.mark.parametrize(("motion", "found", "says"), refusals("motions"))
 def test_a_wrong_motion_is_explained(pair: twin.InstrumentTwin, motion: str, found: str, says: str) -> None:
     with pytest.raises(twin.InputError) as error:
@@ -257,6 +278,24 @@ def test_a_script_gets_a_commands_run_folder(name: str, file: Path | str, shot: 
     manifests = [json.loads((folder / "manifest.json").read_text("utf-8")) for folder in folders]
     for key in ("program", "test", "seed", "again", "checks", "inputs", "warnings"):
         assert manifests[0].get(key) == manifests[1].get(key), key
+
+
+@pytest.mark.second
+def test_a_script_refocuses_a_perturbed_camera(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A move of the image plane alone, 0.2 waves rms, is undone up to the nominal camera's own best focus."""
+    monkeypatch.setattr("twin.camera.camera_run.MAX_WAVES_FOR_MTF", 0.0)  # no MTF, which takes most of the time
+    perturb = ["focal_plane shift z 400 um"]
+    focused = twin.perform("camera", "ritchey_chretien", perturb=perturb, refocus=True)
+    assert focused.run.refocus.errors_before.max() > 0.2
+    assert focused.run.errors.max() < 0.07
+    assert focused.numbers["refocus"]["perturb"][0].startswith("focal_plane shift z")
+    assert focused._facts.options == ("--refocus",)  # of the command that repeats the run
+
+
+def test_options_of_a_command_are_checked() -> None:
+    for chosen, words in (({"tilt": True}, "tilt goes with refocus"), ({"refocus": "yes"}, "True or False")):
+        with pytest.raises(twin.InputError, match=words):
+            twin.perform("camera", "ritchey_chretien", **chosen)
 
 
 @pytest.mark.second

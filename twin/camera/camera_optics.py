@@ -266,17 +266,22 @@ class CameraOptics:
         stop = np.concatenate([[[0.0, 0.0]], stop_nodes_xy, edge, INSIDE * np.stack([x[inside], y[inside]], axis=-1)])
         rays = self.rays(fields, stop)
         wavelength = self.wavelength
-        error = -self.path_error(rays) / wavelength
+
+        def in_waves(rays: LineRays) -> np.ndarray:
+            return -self.path_error(rays) / wavelength
+
+        error = in_waves(rays)
         out = []
         node_slice = slice(1, 1 + nodes.count)
         light, is_vignetted = rays.valid[:, node_slice] @ nodes.share, self.cut is not None or bool(self.model.edges)
         sight = self.directions(fields)[:, None]
+        state = self.path.coloured(self.state, wavelength)
         for k, where in enumerate(fields):
             passed = rays.valid[k]
             weight = nodes.weight * passed[node_slice]
             exact = None
             if is_vignetted and not by_rays:
-                exact = fit_illuminated(self.path, self.state, sight[k], RINGS, float(light[k]), self.path_error, terms)
+                exact = fit_illuminated(self.path, state, sight[k], RINGS, float(light[k]), in_waves, terms)
             fit = fit_part(nodes.x, nodes.y, weight, error[k, node_slice], terms) if exact is None else exact.fit
             flat = error[k] - zernike.basis(3, *stop.T) @ fit.level
             table = np.full(inside.shape, np.nan)

@@ -17,7 +17,7 @@ from twin.camera import camera_plots as plots
 from twin.camera.aberrations import COEFFICIENTS
 from twin.camera.camera_run import CameraRun, built_text, camera_data, perturbed_text, refocus_text, verdict
 from twin.camera.colour import Colours
-from twin.camera.first_order_data import FIRST_ORDER, unmodelled_obscuration
+from twin.camera.first_order_data import FIRST_ORDER, detector_beyond_field, unmodelled_obscuration
 from twin.camera.layout_plot import dimensions, layout_figure
 from twin.camera.solid_view import solid_view
 from twin.framework.artefact import Artefact, CameraFile, Cell, SvgFigure, Table, fixed, significant
@@ -82,7 +82,7 @@ def _first_order_text(run: CameraRun) -> str:
         f"{n['field_deg'][1]:.3g} deg; principal distance along the line {d.line_distance:.6g} m, "
         f"distortion at most {1e6 * d.line_largest:.3g} µm there; "
         + (f"obscuration by its own parts: {blocked}." if blocked else "no obscuration by its own parts.")
-        + (f" {unmodelled}." if unmodelled else "")
+        + "".join(f" {text}." for text in (unmodelled, detector_beyond_field(run.first_order)) if text)
     )
 
 
@@ -138,6 +138,9 @@ def first_order_table(run: CameraRun) -> Table:
         ("obscuration by its own parts" + (", as designed" if state != "as designed" else ""),
          ", ".join(f"{b} {100 * s:.2f}%" for b, s in n["obscuration"].items()) or "none"),
     ]  # fmt: skip
+    if "detector_mm" in n:
+        line, size = run.camera.line, "{:.2f} × {:.2f} mm".format(*n["detector_mm"])
+        rows.append(("detector", f"{line.pixels} × {line.rows} pixels, {size}"))
     if n["hole_radius_mm"]:
         holes = ", ".join(f"{b} needs a hole of at least {r:.1f} mm radius" for b, r in n["hole_radius_mm"].items())
         rows.append(("central holes", f"{holes} (not in the file; specify edges: [{{blocks: circle, radius: ...}}])"))

@@ -229,7 +229,15 @@ class Spot:
         return xr.Dataset(data, attrs={**attributes, "rms_m": self.rms, "airy_m": self.airy})
 
 
-@shows("field_rad [deg]", "at_nyquist", "nyquist [cycles/m]", "frequency [cycles/m]", "wavelengths [nm]")
+@shows(
+    "field_rad [deg]",
+    "frequency [cycles/mm]",
+    "along_line",
+    "along_track",
+    "nyquist [cycles/mm]",
+    "mtf_at_nyquist",
+    "wavelengths [nm]",
+)
 @dataclass(frozen=True, eq=False)
 class Mtf:
     """Modulation transfer function at one field, of the optics alone.
@@ -275,6 +283,21 @@ class Mtf:
         """MTF along the line and along the track at the Nyquist frequency, (2,); NaN if not tabulated."""
         ends = {"left": np.nan, "right": np.nan}
         return np.array([np.interp(self.nyquist, self.frequency, row, **ends) for row in self.values])
+
+    @property
+    def mtf_at_nyquist(self) -> np.ndarray | None:
+        """MTF along the line and along the track at the Nyquist frequency, (2,); None if not tabulated."""
+        return None if np.isnan(self.at_nyquist).any() else self.at_nyquist
+
+    @property
+    def along_line(self) -> np.ndarray:
+        """MTF along the line, (M,)."""
+        return self.values[0]
+
+    @property
+    def along_track(self) -> np.ndarray:
+        """MTF along the track, (M,)."""
+        return self.values[1]
 
     def at(self, frequency: float | str) -> np.ndarray:
         """Return the MTF along the line and along the track at a frequency.

@@ -23,8 +23,10 @@ from matplotlib.patches import Circle
 
 from analysis.arrays import summary
 from optics.camera.ghosts import Ghost
+from optics.camera.prescription import Camera
 from twin.camera.camera_optics import CameraOptics
 from twin.camera.camera_results import Field, FieldText, Frequencies, Mtf, Spot, Wavefront
+from twin.camera.prescription import optics_camera
 from twin.framework.svg import BLUE, DIVERGING, GREY, INK, LIGHT, VERMILION, look, plain_axes, to_svg
 
 LINE, TRACK = BLUE, VERMILION
@@ -220,6 +222,43 @@ class CameraView(CameraOptics, Plottable):
 
         along, across = map(float, self.fractions([field])[0])
         return camera_ghosts(self.model, self.path.backend, (along, across))
+
+    @property
+    def prescription(self) -> Camera:
+        """Nominal camera as an `optics.Camera`, for `optics.psf`, `optics.ensquared_energy`, `optics.seidel` and more.
+
+        The frame of its surfaces is that of the camera's file, with the origin at the first vertex; `field_angles`
+        converts fields. Colour and best image plane of this camera are included.
+
+        Raises
+        ------
+        InputError
+            `optics.Camera` cannot describe the surfaces or their edges.
+        ValueError
+            The camera is perturbed or as built, or prisms of its instrument block light.
+        """
+        if self.state or self.built:
+            raise ValueError(
+                "prescription: it describes the nominal camera, and this one is perturbed or as built; take that of "
+                "the nominal camera and set decenter, tilt or figure of its surfaces"
+            )
+        if self.cut is not None:
+            raise ValueError(
+                "prescription: prisms of the instrument block light of this camera, which optics.Camera cannot "
+                "describe; camera(NAME, obstruction=False) has its full beam"
+            )
+        return optics_camera(self.model, self.wavelength)
+
+    def field_angles(self, field: Field | FieldText = (0.0, 0.0)) -> tuple[float, float]:
+        """Return the angles x and y of a field from the axis of ``prescription``, radians, as `optics` takes a field.
+
+        Parameters
+        ----------
+        field : Field or FieldText
+            Field, as for `wavefront`.
+        """
+        along, across = self._angles(self.fractions([field])[0])
+        return along, self.model.spec.field_bias + across
 
     def spot(self, field: Field | FieldText = (0.0, 0.0), defocus: float | str = 0.0) -> SpotView:
         """Compute the spot at a field, on the line CCD moved downstream.

@@ -73,7 +73,7 @@ def fit_illuminated(
     direction: np.ndarray,
     rings: int,
     light: float,
-    to_sphere: Callable[[LineRays], np.ndarray],
+    wavefront_error: Callable[[LineRays], np.ndarray],
     terms: int,
 ) -> VignettedFit | None:
     """Fit a wavefront over the light of a beam by a quadrature that ends at the edges.
@@ -83,15 +83,15 @@ def fit_illuminated(
     path : TargetPath
         Light path of the camera.
     state : State
-        State of its assembly.
+        State of its assembly, with the refractive indices at the wavelength of the light.
     direction : (1, 3) ndarray
         Direction of the light in the world frame.
     rings : int
         Rings of the quadrature over the whole stop.
     light : float
         Fraction of the stop's light that passes, counted by traced rays.
-    to_sphere : callable
-        Function from N rays to their optical paths to the reference spheres, (1, N), metres.
+    wavefront_error : callable
+        Function from N rays to their wavefront errors on the reference spheres, (1, N), waves of the light.
     terms : int
         Number of Zernike terms.
 
@@ -120,7 +120,7 @@ def fit_illuminated(
     # boxes about shadows extend a little beyond the stop, which vignettes these rays; their paths are valid
     if not np.all(rays.valid[0] | (np.hypot(*all_points.T) > 1.0)):
         return None
-    waves = np.split(-to_sphere(rays)[0, 1:] / path.model.spec.wavelength, [len(points[0])])
+    waves = np.split(wavefront_error(rays)[0, 1:], [len(points[0])])
     both = list(zip(stops, waves, strict=True))
     continued = [
         (stop, _tamed(stop, pieces, rings + r, wave)) for (stop, wave), (r, _) in zip(both, refinement, strict=True)

@@ -159,6 +159,30 @@ def obscuration(model: CameraModel, backend: Backend) -> ObscurationData:
     return ObscurationData(FrozenMap({body: share for body, share in shares.items() if share > 0.0}), FrozenMap(holes))
 
 
+def detector_size(spec: CameraSpec) -> np.ndarray:
+    """Return the size of the detector along the line and along the track, (2,), metres."""
+    return np.array([spec.line.pixels, spec.line.rows]) * spec.line.pitch
+
+
+def detector_beyond_field(data: FirstOrderData) -> str:
+    """Describe an area detector that is larger than the image of the field; empty for others and for a line CCD."""
+    size, image = 1e3 * detector_size(data.spec), 1e3 * np.array(data.image)
+    # the image of the field is traced with distortion, so that a detector of its size may exceed it a little
+    beyond = size > (1.0 + _SAME_SIZE) * image
+    if data.spec.line.rows == 1 or not np.any(beyond):
+        return ""
+    where = " and ".join(name for name, is_beyond in zip(("along", "across"), beyond, strict=True) if is_beyond)
+    return (
+        f"The detector, {size[0]:.4g} by {size[1]:.4g} mm, is larger {where} the line than the image of the field, "
+        f"{image[0]:.4g} by {image[1]:.4g} mm: image quality is that of the field. To cover the detector, enlarge "
+        "`field: {x: ..., y: ...}` in the camera file"
+    )
+
+
+_SAME_SIZE = 0.01
+"""Relative excess of a detector over the image of the field up to which both count as equal."""
+
+
 LEAST_SHARE = 0.005
 """Smallest fraction of a beam blocked by the camera's parts that is reported if the camera's file models no
 obscuration.
@@ -349,6 +373,12 @@ FIRST_ORDER: Record[FirstOrderData] = Record(
         converted=False,
     ),
     Quantity("pitch_um", lambda d: d.spec.line.pitch, "pitch of the line's pixels"),
+    Quantity(
+        "detector_mm",
+        lambda d: detector_size(d.spec) if d.spec.line.rows > 1 else None,
+        "size of an area detector along the line and along the track",
+        where_known=True,
+    ),
     Quantity("pixel_arcsec", lambda d: d.spec.line.pitch / d.principal_distance_line, "angle of a pixel"),
     Quantity("nyquist_per_mm", lambda d: 0.5 / d.spec.line.pitch, "Nyquist frequency of the line's pixels"),
     Quantity(

@@ -175,10 +175,14 @@ def _pictures(reference: Run, run: Run, diff: Differences, names: tuple[str, str
         for label, first, second in _views(*(file.arrays[array.name].astype(np.float64) for file in files)):
             if len(out) == _MOST_IMAGES:
                 break
+            delta = np.abs(second - first)
+            if not np.isfinite(delta).any():
+                continue
             title = " ".join(filter(None, (array.file, array.name, label)))
             png = _picture(first, second, names, title)
             where = f"{len(out) + 1}"
-            caption = f"Differences up to {significant(float(np.max(np.abs(second - first))), 3, floor=0.0)}."
+            # NaN has no difference, as outside a pupil
+            caption = f"Differences up to {significant(float(np.nanmax(delta)), 3, floor=0.0)}."
             out.append(PngFigure(f"image-{k}-{where}", title, caption, png))
     return out
 
@@ -201,7 +205,7 @@ def _picture(first: np.ndarray, second: np.ndarray, names: tuple[str, str], titl
     with look("image"):
         figure = new_figure(3.6)
         axes = figure.subplots(1, 3)
-        low, high = min(first.min(), second.min()), max(first.max(), second.max())
+        low, high = np.nanmin([first, second]), np.nanmax([first, second])
         for axis, image, name in zip(axes[:2], (first, second), names, strict=True):
             shown = axis.imshow(image, cmap="magma", vmin=low, vmax=high, interpolation="nearest")
             axis.set_title(name)

@@ -117,7 +117,7 @@ class CameraTwin(CameraView):
         """
         experiment = twin.experiment
         seen = CameraView.within(experiment.instrument, name, experiment.backend, twin.state, obstruction)
-        return cls(seen.path, seen.state, twin=twin, name=name, obstruction=obstruction)
+        return cls(seen.path, seen.state, built=seen.built, twin=twin, name=name, obstruction=obstruction)
 
     def perturbed(self, *perturb: Perturbation | Sequence[Perturbation]) -> CameraTwin:
         """Return the same camera with bodies of its instrument perturbed, in addition to what they are already.

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from functools import partial
 from html import escape
 from pathlib import Path
 from typing import Any
@@ -13,8 +14,8 @@ import pandas as pd
 
 from analysis.arrays import shows
 from optics.numerics.backend import load_backend
-from scenes.specs.procedures import PROCEDURES
-from scenes.yaml.errors import InputError, unknown
+from scenes.specs.procedures import PROCEDURES, Procedure
+from scenes.yaml.errors import InputError, Issue, unknown
 from scenes.yaml.spec import Source, Spec, validate
 from scenes.yaml.yaml_file import YamlFile
 from twin.framework.artefact import cell_text
@@ -103,6 +104,7 @@ def perform(
     changes : keyword arguments
         Keys of the test's file with other values, for ``camera`` and ``uncertainty`` those of the run's config.yaml; a
         mapping replaces single keys of a mapping. A key that refers to another file, such as ``camera``, is read anew.
+        For ``camera`` also its options ``refocus=True`` and, with it, ``tilt=True``.
 
     Raises
     ------
@@ -112,6 +114,8 @@ def perform(
     if name not in PROCEDURES:
         raise InputError(unknown("no such test", name, PROCEDURES).at())
     procedure = PROCEDURES[name]
+    chosen = {key: changes.pop(key) for key in procedure.options if key in changes}
+    procedure = _with_options(procedure, chosen)
     setup = procedure.resolve(file)
     if changes:
         tree, test = setup.plain(), getattr(setup, "test", None)
@@ -129,9 +133,22 @@ def perform(
     report = with_warnings(procedure.report(run), warnings)
     program, _, command = name.partition(" ")
     run_times = (f"twin.{program}", started, seconds, backend)
-    facts = RunFacts(options.pop("config"), *run_times, command=command, checks=report.checks, **options)
+    options |= {"options": tuple(f"--{key}" for key, value in chosen.items() if value), "checks": report.checks}
+    facts = RunFacts(options.pop("config"), *run_times, command=command, **options)
     numbers = report.with_verdict(procedure.numbers(run))
     return TestResult(name, numbers, report, setup, run, facts, procedure.kind)
+
+
+def _with_options(procedure: Procedure, chosen: Mapping[str, Any]) -> Procedure:
+    """Return the procedure of a command with some of its options set; raise `InputError` where they are not allowed."""
+    for key, value in chosen.items():
+        if not isinstance(value, bool):
+            raise InputError(Issue("an option is set or not", key=(key,), found=repr(value), allowed="True or False"))
+    if chosen.get("tilt") and not chosen.get("refocus"):
+        raise InputError(Issue("tilt goes with refocus", key=("tilt",), allowed="refocus=True, tilt=True"))
+    # a refocused camera is not judged: its verdict states its image quality
+    judged = procedure.judged and not chosen.get("refocus")
+    return replace(procedure, run=partial(procedure.run, **chosen), judged=judged) if chosen else procedure
 
 
 def _merged(base: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:

@@ -14,7 +14,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from itertools import takewhile
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Protocol, cast
 
 import xarray as xr
 
@@ -76,7 +76,7 @@ class Spread:
 
 
 def study(
-    instrument: Perturbed,
+    instrument: Perturbed | str | Path,
     vary: Mapping[str, Mapping[str, Any] | str],
     n: int = 100,
     *,
@@ -92,8 +92,9 @@ def study(
 
     Parameters
     ----------
-    instrument : Perturbed
-        Instrument at the start; its other perturbations stay.
+    instrument : Perturbed or str or Path
+        Instrument at the start, from `twin.load`; its other perturbations stay. Or a name or path that `twin.load`
+        takes.
     vary : dict
         Motion as text -> range, ``{"M2 shift z": "(-5 .. 5) um"}``: a uniform distribution from -5 to 5; ``(0 +- 2)``
         is a normal one with sigma 2. Or body -> keys of a perturbation with ranges, ``{"M2": {"shift": "0 0 (-5 .. 5)
@@ -130,7 +131,7 @@ def study(
     RuntimeError
         The study could not be completed; the message gives the reason.
     """
-    config = config_text(instrument, vary, n, seed, design, responses)
+    config = config_text(_loaded(instrument), vary, n, seed, design, responses)
     with scratch("twin-study") as folder:
         file, target = folder / "config.yaml", folder / "study" if out is None else Path(out)
         file.write_text(config, "utf-8")
@@ -143,6 +144,24 @@ def study(
             raise RuntimeError(f"the study ended with exit code {code}{why}")
         with xr.open_dataset(target / "study.nc", engine="h5netcdf") as data:
             return data.load()
+
+
+def _loaded(instrument: Any) -> Perturbed:
+    """Return the instrument to be varied, read where a name or path names it; raise `InputError` for other objects."""
+    if isinstance(instrument, str | Path):
+        # imported late, since a command's study needs no twin
+        from twin.scripting.instrument_twin import load
+
+        return load(instrument)
+    if not hasattr(instrument, "with_perturbations"):
+        raise InputError(
+            Issue(
+                f"{type(instrument).__name__} is not an instrument that a study can vary",
+                key=("instrument",),
+                allowed="twin.load(NAME or FILE), which reads camera files as well, or the name or file itself",
+            )
+        )
+    return cast(Perturbed, instrument)
 
 
 def _run(command: list[str], quiet: bool, progress: bool | ProgressCallback) -> tuple[int, str]:

@@ -160,6 +160,7 @@
     };
     slider.disabled = last === 1;
     slider.parentElement.hidden = !moved.length;
+    root.querySelector('.caption span').hidden = !moved.length;
     slider.value = last > 1 ? Math.round(slider.max * Math.log(first) / Math.log(last)) : 0;
     slider.addEventListener('input', exaggerate);
     light.addEventListener('change', () => {
