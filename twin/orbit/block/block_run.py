@@ -20,6 +20,7 @@ from analysis.block.error_processes import BlockError
 from analysis.block.network import DatumTest, Network, OpenCombination, datum_test, network_of, open_combinations
 from analysis.block.point_reduction import Pool
 from analysis.orbit.forward_intersection import Accuracy, level_axes, predicted, realised
+from optics.numerics.array_math import UnphysicalError
 from optics.numerics.backend import one_blas_thread
 from optics.numerics.number_tree import FrozenMap
 from scenes.specs.orbit.setup import AnyAdjust, MeasuredAdjustSetup, RationalAdjustSetup
@@ -29,6 +30,7 @@ from twin.framework.procedure import Advance, BenchError, silent
 from twin.orbit.block.drawn_block import DrawnBlock, draw_block
 from twin.orbit.block.measured_block import MonitorSource, measured_block
 from twin.orbit.block.rational_block import AdjustedImage, adjusted_images, rational_block
+from twin.orbit.measured.measurement_tables import LINES_SEE_POINTS
 
 if TYPE_CHECKING:
     from optics.numerics.backend import Backend
@@ -221,7 +223,10 @@ def run_adjustment(
         if isinstance(setup, RationalAdjustSetup):
             block, places = rational_block(setup, advance)
         else:
-            block, places = measured_block(setup, advance, monitor)
+            try:
+                block, places = measured_block(setup, advance, monitor)
+            except (MeasurementError, UnphysicalError) as error:
+                raise BenchError(str(error), ("data",), LINES_SEE_POINTS) from error
         reference = _Reference(places, block.points.covariance, {})
     else:
         _require_memory(setup.test)
@@ -243,7 +248,8 @@ def run_adjustment(
         images = adjusted_images(adjustment)
     except (MeasurementError, np.linalg.LinAlgError) as error:
         key = "points" if drawn else "image_points" if isinstance(setup, RationalAdjustSetup) else "data"
-        raise BenchError(str(error), (key,), "more points, or scenes that see the same ground") from error
+        remedy = LINES_SEE_POINTS if key == "data" else "more points, or scenes that see the same ground"
+        raise BenchError(str(error), (key,), remedy) from error
     where, wrong, spread = _check(adjustment, reference)
     level = level_axes(adjustment.ground[where])
     sigma = np.sqrt(np.einsum("nij,njk,nik->ni", level, spread, level))
