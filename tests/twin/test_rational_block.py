@@ -10,6 +10,7 @@ import pytest
 import tifffile
 from scipy.stats import chi2
 
+from analysis.orbit.forward_intersection import level_axes
 from analysis.orbit.rational_polynomial import RationalPolynomial
 from scenes.specs.procedures import PROCEDURES
 from scenes.yaml.errors import InputError
@@ -78,6 +79,14 @@ def test_it_is_the_least_squares_solution_of_all_unknowns_together(tmp_path: Pat
     )
     assert np.allclose(run.adjustment.point_covariance(np.arange(25)), blocks, rtol=1e-6, atol=1e-6 * blocks.max())
     assert run.adjustment.chi_square == pytest.approx(float(residual @ residual), rel=1e-6)
+    up = level_axes(run.adjustment.ground)[:, 2]
+    joint = np.einsum("mi,minj,nj->mn", up, covariance[first:, first:].reshape(25, 3, 25, 3), up)
+    minus_mean = np.eye(25) - 1.0 / 25.0
+    relative = np.sqrt(np.diag(minus_mean @ joint @ minus_mean))
+    # derivatives are differences of 0.5 m, to 1e-8 of the common part of the variance
+    assert np.allclose(run.relative_height_sigma, relative, rtol=1e-4)
+    if not control:
+        assert np.all(10.0 * relative < np.sqrt(np.diag(joint)))
 
 
 @pytest.mark.second

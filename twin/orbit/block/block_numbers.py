@@ -174,6 +174,11 @@ BLOCK: Record[BlockRun] = Record(
     Quantity("agrees", lambda run: run.adjustment.p_value >= ALARM, "true if residuals agree with their sigmas"),
     Quantity("unknowns", lambda run: len(run.adjustment.x), "number of unknowns beside the points"),
     Quantity("points", lambda run: int(np.isfinite(run.adjustment.ground[:, 0]).sum()), "number of adjusted points"),
+    Quantity(
+        "relative_height_sigma_m",
+        lambda run: float(np.median(run.relative_height_sigma)),
+        "sigma of a point's height relative to the mean height of all points, median of the points",
+    ),
     Quantity("groups", lambda run: run.adjustment.groups, "group of observations, or law -> its test", record=GROUP),
     Quantity(
         "laws",

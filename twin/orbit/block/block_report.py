@@ -58,6 +58,8 @@ def _verdict(run: BlockRun) -> tuple[str, tuple[str, ...]]:
         f"{control} ground control, predicted 90% errors at {where} are {predicted.ce90:.2f} m in plan and"
         f" {predicted.le90:.2f} m in height{checked}",
         contribution,
+        f"relative to the mean height of all points, σ of a height is {np.median(run.relative_height_sigma):.2g} m in the"
+        " median: errors that all points share do not count",
         f"chi-square of the residuals is {run.adjustment.chi_square:.0f} for {run.adjustment.degrees_of_freedom}"
         f" degrees of freedom (p = {run.adjustment.p_value:.2g})",
     )

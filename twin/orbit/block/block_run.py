@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -176,6 +177,13 @@ class BlockRun:
     def used(self) -> tuple[str, ...]:
         """Names of the sensors whose measurements the adjustment uses."""
         return self.adjustment.assembly.block.sensors
+
+    @cached_property
+    def relative_height_sigma(self) -> np.ndarray:
+        """Sigmas of the heights of all adjusted points relative to their mean height, (k,), in metres."""
+        where = np.flatnonzero(np.isfinite(self.adjustment.ground).all(axis=1))
+        up = level_axes(self.adjustment.ground[where])[:, 2]
+        return np.sqrt(self.adjustment.relative_variance(where, up))
 
     @property
     def datum_p_value(self) -> float:
