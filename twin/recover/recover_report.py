@@ -53,7 +53,8 @@ def _verdict(run: RecoverRun) -> tuple[str, tuple[str, ...]]:
     basis = "noise alone" if reading.disturbances is None else f"noise and disturbances {reading.disturbances.name}"
     if run.setup.model is None:
         largest = max(readings, key=lambda row: abs(row.size))
-        first = f"The largest reading of the {title}{when} against the noise of the images is {largest.name}, {largest.read}"
+        first = f"The largest reading of the {title}{when} against the noise of the images alone is {largest.name}"
+        first += f", {largest.read}"
         second = ""
     elif out:
         clearest = max(out, key=lambda row: abs(row.size))

@@ -61,7 +61,13 @@ from twin.orbit.calibration.schemes import (
     study_monitoring,
 )
 from twin.orbit.calibration.screening import require_correct_names, screen_campaign
-from twin.orbit.measured.measurement_tables import CAMERA_FILE, LINES_SEE_POINTS, TEST_FILE, campaign_files, read_measurements
+from twin.orbit.measured.measurement_tables import (
+    CAMERA_FILE,
+    LINES_SEE_POINTS,
+    TEST_FILE,
+    campaign_files,
+    read_measurements,
+)
 
 if TYPE_CHECKING:
     from optics.numerics.backend import Backend
