@@ -244,17 +244,15 @@ class BlockAdjustment:
         direction : (k, 3) ndarray
             Unit vector of each point's coordinate, ITRS; for heights that of the vertical.
         """
-        parts = [
-            (numbers, columns, np.einsum("ni,niw->nw", direction[numbers], coupling))
-            for numbers, columns, coupling in self._couplings(points)
-        ]
         mean = np.zeros(len(self.x))
-        for _, columns, slope in parts:
-            np.add.at(mean, columns, slope.sum(axis=0) / len(points))
+        for numbers, columns, coupling in self._couplings(points):
+            np.add.at(mean, columns, np.einsum("ni,niw->w", direction[numbers], coupling) / len(points))
         of_mean = self.covariance @ mean
         alone = np.einsum("ni,nij,nj->n", direction, self.spread[points], direction)
         variance = alone * (1.0 - 2.0 / len(points)) + alone.sum() / len(points) ** 2 + mean @ of_mean
-        for numbers, columns, slope in parts:
+        # a second pass, since the derivatives of all points at once would exceed the memory of a large block
+        for numbers, columns, coupling in self._couplings(points):
+            slope = np.einsum("ni,niw->nw", direction[numbers], coupling)
             known = self.covariance[np.ix_(columns, columns)]
             variance[numbers] += np.einsum("nv,vw,nw->n", slope, known, slope) - 2.0 * slope @ of_mean[columns]
         return np.maximum(variance, 0.0)

@@ -106,10 +106,10 @@ def found(folder: Path) -> Any:
 def test_matches_lie_where_the_terrain_is_seen(landscape: Landscape, found: Any) -> None:
     wrong, squares = [], []
     for source, points in found.points.items():
-        ground = landscape.ground(source, points.lines[source].place)
+        ground = landscape.ground(source, points.lines[source].position)
         for name, line in points.searched_lines.items():
             assert line.accepted.mean() > 0.4, (source, name)
-            miss = (line.place - landscape.seen(name, ground))[line.accepted]
+            miss = (line.position - landscape.seen(name, ground))[line.accepted]
             wrong.append(np.abs(miss).max())
             spread = line.covariance[line.accepted]
             squares.append(np.einsum("ni,nij,nj->n", miss, np.linalg.inv(spread), miss))

@@ -63,11 +63,11 @@ def _verdict(run: BlockRun) -> tuple[str, tuple[str, ...]]:
         contribution,
         f"relative to the mean height of all points, σ of a height is {relative:.2g} m in the median: errors that all"
         " points share do not count",
-        _agreement(run.adjustment),
+        _residuals_text(run.adjustment),
     )
 
 
-def _agreement(adjustment: BlockAdjustment) -> str:
+def _residuals_text(adjustment: BlockAdjustment) -> str:
     """Return whether the residuals are as large as stated, by a two-sided test of chi-square."""
     square, degrees = adjustment.chi_square, adjustment.degrees_of_freedom
     chance = 2.0 * min(adjustment.p_value, 1.0 - adjustment.p_value) if degrees else 1.0
