@@ -14,7 +14,7 @@ really white noise gives negatively correlated ones. The size of the errors is t
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Literal
@@ -213,17 +213,49 @@ class BlockAdjustment:
 
     def point_covariance(self, points: Indices) -> Array:
         """Return the covariances of k selected points, (k, 3, 3), ITRS, in m^2; NaN for undetermined points."""
-        reduction = self.assembly.reduction
         covariance = np.full((len(points), 3, 3), np.nan)
-        for rows in reduction.restricted(points).rows(reduction.state_of(points, self.state)):
-            numbers, columns = rows.bundle.points, rows.bundle.columns
-            inner = self.spread[points[numbers]]
-            coupling = inner @ np.swapaxes(rows.by_point, 1, 2) @ rows.by_x
-            covariance[numbers] = inner + coupling @ self.covariance[np.ix_(columns, columns)] @ np.swapaxes(
-                coupling, 1, 2
-            )
+        for numbers, columns, coupling in self._couplings(points):
+            covariance[numbers] = self.spread[points[numbers]] + coupling @ self.covariance[
+                np.ix_(columns, columns)
+            ] @ np.swapaxes(coupling, 1, 2)
         covariance[~np.isfinite(self.ground[points]).all(axis=1)] = np.nan
         return covariance
+
+    def _couplings(self, points: Indices) -> Iterator[tuple[Indices, Indices, Array]]:
+        """Yield numbers of n of the selected points, W unknowns, and minus the points' derivatives by them (n, 3, W).
+
+        The derivatives are those of the adjusted coordinates, in metres for one sigma of the unknowns.
+        """
+        reduction = self.assembly.reduction
+        for rows in reduction.restricted(points).rows(reduction.state_of(points, self.state)):
+            inner = self.spread[points[rows.bundle.points]]
+            coupling = inner @ np.swapaxes(rows.by_point, 1, 2) @ rows.by_x
+            yield rows.bundle.points, rows.bundle.columns, coupling
+
+    def relative_variance(self, points: Indices, direction: Array) -> Array:
+        """Return the variances (k,) of coordinates of k determined points relative to their mean, in m^2.
+
+        Errors that all points share, as of images that may be shifted alike, do not count.
+
+        Parameters
+        ----------
+        points : (k,) ndarray of int
+            Indices of the points.
+        direction : (k, 3) ndarray
+            Unit vector of each point's coordinate, ITRS; for heights that of the vertical.
+        """
+        mean = np.zeros(len(self.x))
+        for numbers, columns, coupling in self._couplings(points):
+            np.add.at(mean, columns, np.einsum("ni,niw->w", direction[numbers], coupling) / len(points))
+        of_mean = self.covariance @ mean
+        alone = np.einsum("ni,nij,nj->n", direction, self.spread[points], direction)
+        variance = alone * (1.0 - 2.0 / len(points)) + alone.sum() / len(points) ** 2 + mean @ of_mean
+        # a second pass, since the derivatives of all points at once would exceed the memory of a large block
+        for numbers, columns, coupling in self._couplings(points):
+            slope = np.einsum("ni,niw->nw", direction[numbers], coupling)
+            known = self.covariance[np.ix_(columns, columns)]
+            variance[numbers] += np.einsum("nv,vw,nw->n", slope, known, slope) - 2.0 * slope @ of_mean[columns]
+        return np.maximum(variance, 0.0)
 
     def change(self, scene: str) -> tuple[Array, Array]:
         """Return the change of a scene's camera and its covariance (4, 4), in radians and metres.

@@ -36,6 +36,9 @@ positions follow the blocks and not the scene. JPEG of quality 30 to 95 gives 1.
 sigmas are right, 2.3 to 4.3 if positions lock to whole pixels.
 """
 
+EXPLAINED = 1e-9
+"""Scatter of a consensus, in pixels, whose matches scatter as their covariances predict or less."""
+
 
 @dataclass(frozen=True, eq=False)
 class Matches:
@@ -393,9 +396,8 @@ def consensus(
     inside, coefficients, scatter, distance = _converged(design, displacement, noise, coefficients, limit)
     accepted, apart = np.zeros(len(start), bool), np.full(len(start), np.nan)
     accepted[usable], apart[usable] = inside, distance
-    share = (
-        f"{int(inside.sum())} of {int(usable.sum())} matches agree within {limit:.1f} sigma (scatter {scatter:.3g} px)"
-    )
+    beyond = f"scatter {scatter:.3g} px" if scatter > EXPLAINED else "no scatter beyond their covariances"
+    share = f"{int(inside.sum())} of {int(usable.sum())} matches agree within {limit:.1f} sigma ({beyond})"
     if scatter > largest_scatter or inside.sum() < max(2 * terms, 5):
         accepted[:] = False
         share = f"no consensus: {share}, at most {largest_scatter:g} px allowed; improve prediction or matches"
@@ -475,8 +477,8 @@ def _scatter(residual: Array, noise: Array) -> float:
     It brings the median normalised square to that of a chi-square with two degrees of freedom.
     """
     high = math.sqrt(max(float(np.median(np.sum(residual**2, axis=1))) / _MEDIAN, 1e-18))
-    if np.median(_square(residual, noise, 1e-9)) <= _MEDIAN:
-        return 1e-9
+    if np.median(_square(residual, noise, EXPLAINED)) <= _MEDIAN:
+        return EXPLAINED
     low = 0.0
     for _ in range(40):
         middle = 0.5 * (low + high)

@@ -1,5 +1,6 @@
 """Calibration in orbit on files: the simulation's measurements read back, other conventions, independent solutions."""
 
+import shutil
 from dataclasses import replace
 from functools import partial
 
@@ -225,6 +226,21 @@ def test_conventions_units_and_order_do_not_matter(files) -> None:
     set_keys(files.parent / "data.yaml", conventions=said)
     _, again = read_back(files)
     same(before, simultaneous(again), 1e-7)
+
+
+@pytest.mark.second
+@pytest.mark.parametrize("procedure", ["calibrate", "adjust"])
+@pytest.mark.parametrize(("key", "value"), [("scalar", "first"), ("turns", "frame_to_body")])
+def test_a_wrong_quaternion_is_named_as_the_likeliest_cause(tmp_path, procedure, key, value) -> None:
+    shutil.copytree(SCENES / ORBIT / "measured", tmp_path, dirs_exist_ok=True)
+    data = read_yaml(tmp_path / "data.yaml").data
+    data["conventions"]["quaternion"][key] = value
+    (tmp_path / "data.yaml").write_text(dump_yaml(data))
+    result = run(procedure, tmp_path / f"{procedure}.yaml", "--out", tmp_path / "run")
+    said = " ".join(result.stderr.split())
+    assert (result.exit_code, (tmp_path / "run").exists()) == (2, False)
+    assert "see the points: `scalar` first or last, `turns`, `body_axes`" in said
+    assert "`twin.orbit check` finds" in said
 
 
 @pytest.mark.second

@@ -10,10 +10,14 @@ import pytest
 import tifffile
 from scipy.stats import chi2
 
+import twin.orbit.__main__ as command
+from analysis.orbit.forward_intersection import level_axes
 from analysis.orbit.rational_polynomial import RationalPolynomial
 from scenes.specs.procedures import PROCEDURES
 from scenes.yaml.errors import InputError
+from tests.twin.commands import invoke
 from tests.twin.rational_bench import HALF, SIDE, Bench, bench, polynomial
+from twin.framework.artefact import Table
 from twin.framework.data_files import FrameFacts, tiff
 from twin.framework.procedure import BenchError
 from twin.orbit.export.rational_polynomial import PolynomialImage, read_rpc
@@ -78,6 +82,14 @@ def test_it_is_the_least_squares_solution_of_all_unknowns_together(tmp_path: Pat
     )
     assert np.allclose(run.adjustment.point_covariance(np.arange(25)), blocks, rtol=1e-6, atol=1e-6 * blocks.max())
     assert run.adjustment.chi_square == pytest.approx(float(residual @ residual), rel=1e-6)
+    up = level_axes(run.adjustment.ground)[:, 2]
+    joint = np.einsum("mi,minj,nj->mn", up, covariance[first:, first:].reshape(25, 3, 25, 3), up)
+    minus_mean = np.eye(25) - 1.0 / 25.0
+    relative = np.sqrt(np.diag(minus_mean @ joint @ minus_mean))
+    # derivatives are differences of 0.5 m, to 1e-8 of the common part of the variance
+    assert np.allclose(run.relative_height_sigma, relative, rtol=1e-4)
+    if not control:
+        assert np.all(10.0 * relative < np.sqrt(np.diag(joint)))
 
 
 @pytest.mark.second
@@ -117,6 +129,27 @@ def test_gross_errors_are_rejected_and_named(
     assert max(image.rms_after.max() for image in run.images.values()) < 0.25
     assert min(image.rms_before.max() for image in run.images.values()) > 0.5
     assert any("p7 in second" in text for text in ADJUST.report(run).warnings)
+
+
+def test_the_report_states_the_residuals_once_and_has_nothing_empty(tmp_path: Path) -> None:
+    one = replace(bench({"shift": 5.0}), sigma=1.0)  # five times the noise
+    report = ADJUST.report(adjusted(one.write(tmp_path, {"shift": [5.0, 5.0]})))
+    (said,) = (text for text in (report.verdict, *report.lead) if "chi-square" in text)
+    assert "The residuals are 0.19 times as large as stated" in said
+    assert "p < 1e\N{MINUS SIGN}6 two-sided" in said
+    assert any("not CE90 and LE90, which the priors determine" in text for text in report.warnings)
+    assert report.summary.heads == ["sensors", "CE90 predicted [m]", "LE90 predicted [m]"]
+    assert all(table.rows for section in report.sections for table in section.artefacts if isinstance(table, Table))
+    report = ADJUST.report(adjusted(bench({"shift": 5.0}).write(tmp_path, {"shift": [5.0, 5.0]}, 4)))
+    assert any("agree with the stated errors" in text for text in report.lead)
+    assert "Weakly observable combinations" not in [section.title for section in report.sections]
+
+
+def test_the_terminal_names_what_it_exported(tmp_path: Path) -> None:
+    file = bench({"shift": 5.0}).write(tmp_path, {"shift": [5.0, 5.0]}, 3)
+    result = invoke(command.app, "adjust", file, "--out", tmp_path / "run", "--export", tmp_path / "out")
+    assert f"exported:   {tmp_path / 'out'}: points.csv, first_RPC.TXT" in result.stdout
+    assert "sigma_up_relative [m]" in (tmp_path / "out/points.csv").read_text()
 
 
 def test_another_program_projects_alike() -> None:

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter, map_coordinates
 
+from analysis.matching.matches import EXPLAINED, consensus
 from scenes.specs.procedures import PROCEDURES
 from scenes.yaml.csv_table import read_table
 from scenes.yaml.errors import InputError
@@ -18,6 +19,7 @@ from twin.framework.procedure import BenchError
 from twin.orbit.block.rational_block import IMAGE_POINTS
 from twin.orbit.export.rational_polynomial import PolynomialImage
 from twin.orbit.flight.earth import Earth
+from twin.orbit.images.simulate_run import MATCHED
 
 MATCH, ADJUST = PROCEDURES["orbit match"], PROCEDURES["orbit adjust"]
 SIDE = 360
@@ -104,10 +106,10 @@ def found(folder: Path) -> Any:
 def test_matches_lie_where_the_terrain_is_seen(landscape: Landscape, found: Any) -> None:
     wrong, squares = [], []
     for source, points in found.points.items():
-        ground = landscape.ground(source, points.lines[source].place)
+        ground = landscape.ground(source, points.lines[source].position)
         for name, line in points.searched_lines.items():
             assert line.accepted.mean() > 0.4, (source, name)
-            miss = (line.place - landscape.seen(name, ground))[line.accepted]
+            miss = (line.position - landscape.seen(name, ground))[line.accepted]
             wrong.append(np.abs(miss).max())
             spread = line.covariance[line.accepted]
             squares.append(np.einsum("ni,nij,nj->n", miss, np.linalg.inv(spread), miss))
@@ -133,8 +135,9 @@ def test_the_block_of_the_matches_has_the_heights_of_the_terrain(
 
 @pytest.mark.second
 def test_heights_without_ground_are_refused(folder: Path) -> None:
-    with pytest.raises(BenchError, match="no two images have common points"):
+    with pytest.raises(BenchError, match="no two images have common points at heights of 8000 to 8100 m") as error:
         run(MATCH, folder, heights=["8000 m", "8100 m"], points={"tie": 20})
+    assert "this range probably does not contain it" in error.value.remedy
 
 
 @pytest.mark.parametrize(
@@ -160,3 +163,14 @@ def test_the_table_is_what_adjust_reads(folder: Path, found: Any) -> None:
     assert set(table["image"]) == set(LOOKS)
     assert len(table) == MATCH.numbers(found)["image_points"]
     assert f"{MATCH.numbers(found)['tie_points']} tie points" in MATCH.report(found).verdict
+
+
+def test_a_scatter_that_the_covariances_explain_is_no_number(folder: Path, found: Any) -> None:
+    line = next(iter(found.points.values())).searched_lines["second"]
+    assert MATCHED(replace(line, scatter=EXPLAINED))["consensus_scatter_px"] is None
+    assert MATCHED(replace(line, scatter=0.02))["consensus_scatter_px"] == 0.02
+    rng = np.random.default_rng(3)
+    place = rng.uniform(0.0, 900.0, (30, 2))
+    agreed = consensus(place, place + 0.01 * rng.standard_normal((30, 2)), covariance=np.tile(np.eye(2), (30, 1, 1)))
+    assert agreed.scatter == EXPLAINED
+    assert "no scatter beyond their covariances" in agreed.text

@@ -151,6 +151,13 @@ def test_without_an_instrument_its_geometry_and_a_learnt_shape_will_do(run, imag
     np.testing.assert_array_less(sigma, 1.2 * own)
     np.testing.assert_array_less(own, 1.5 * sigma)
     assert list(found.last.estimators) == ["paper_single", "paper_joint", "derived", "model"]
+    # motions of the prisms look like changes of the cameras: many sigmas of noise beside the truth
+    numbers, report = recover_numbers(found), recover_report(found)
+    assert numbers["sigma_holds"] is False
+    assert "motions of the monitor's own parts" in numbers["doubts"][0]
+    assert sum("motions of the monitor's own parts" in text for text in report.warnings) == 1
+    assert "exceed" not in report.verdict
+    assert "in σ" not in report.summary.heads
     for name in run.experiment.cameras:
         one, other = whole.parameters[name]["paper_single"], r.parameters[name]["paper_single"]
         np.testing.assert_array_less(np.abs(one.vector - other.vector), 3.0 * np.sqrt(2.0) * one.sigma_noise)

@@ -21,6 +21,7 @@ from scenes.specs.file_kinds import read_for
 from scenes.specs.procedures import PROCEDURES
 from scenes.yaml.standard_output import FAILURE, Terminal, print_error, print_json, to_stdout
 from twin.framework import cli, durable
+from twin.framework.owned_files import first_names
 from twin.framework.procedure import Advance, Session, performed, seeded
 
 if TYPE_CHECKING:
@@ -267,12 +268,15 @@ def run_test(
         from twin.framework.run_folder import write_manifest
 
         # a folder that cannot be made is reported before the run
+        exported = ""
         folder = None if options.export is None else _export_folder(setup, options.export, options.force)
         setup, number, facts = seeded(procedure, setup, options.seed)
         run, input_warnings = performed(procedure, setup, session.backend, number, session.advance)
         if folder is not None:
             with folder:
-                for name, content in procedure.export(run).items():
+                contents = procedure.export(run)
+                exported = f"exported:   {options.export}: {first_names(list(contents))}"
+                for name, content in contents.items():
                     folder.write_bytes(name, content if isinstance(content, bytes) else content.encode())
                 facts_of_export = {"test": procedure.kind, "backend": session.backend.name, "seed": number}
                 write_manifest(folder, program, session.started, session.seconds, **facts_of_export)
@@ -284,9 +288,16 @@ def run_test(
             Console(stderr=True).print(traceback.format_exc(), markup=False, highlight=False, soft_wrap=True)
         shown, numbers = with_warnings(made, input_warnings), procedure.numbers(run)
         facts |= {"program": program, "command": command, "options": words}
-        return replace(finished(session, procedure.kind, shown, numbers, **facts), problem=problem)
+        result = replace(finished(session, procedure.kind, shown, numbers, **facts), problem=problem)
+        return replace(result, show=partial(_show_with, result.show, exported)) if exported else result
 
     run_command(file.stem, options, read or partial(read_for, called, file, procedure.resolve), work, storage)
+
+
+def _show_with(show: Callable[[Console], None], exported: str, console: Console) -> None:
+    """Print a result and the line that names the exported files."""
+    show(console)
+    console.print(exported, markup=False, highlight=False, soft_wrap=True)
 
 
 def _export_folder(setup: Any, target: Path, force: bool) -> RunFolder:

@@ -51,7 +51,12 @@ def _verdict(run: RecoverRun) -> tuple[str, tuple[str, ...]]:
     out = [row for row in readings if abs(row.size) > FAR]
     when = f" at {moment(run.times[-1])}, the last of {len(run.times)} times" if run.times else ""
     basis = "noise alone" if reading.disturbances is None else f"noise and disturbances {reading.disturbances.name}"
-    if out:
+    if run.setup.model is None:
+        largest = max(readings, key=lambda row: abs(row.size))
+        first = f"The largest reading of the {title}{when} against the noise of the images alone is {largest.name}"
+        first += f", {largest.read}"
+        second = ""
+    elif out:
         clearest = max(out, key=lambda row: abs(row.size))
         exceed = "exceeds" if len(out) == 1 else "exceed"
         first = f"{len(out)} of {len(readings)} readings of the {title}{when} {exceed} {FAR:g} σ (σ: {basis})"
@@ -128,26 +133,24 @@ def _frames_text(run: RecoverRun) -> str:
 
 def _summary(run: RecoverRun) -> Table:
     """Return the table of the cameras' changes by every estimator, with the sigma of the one that the verdict uses."""
-    reading = run.last
+    reading, alone = run.last, run.setup.model is None
     heads = [
         "camera",
         "change",
         *(estimator.title for estimator in reading.estimators.values()),
-        "σ",
-        "σ of noise",
-        "in σ",
+        *(("σ of noise",) if alone else ("σ", "σ of noise", "in σ")),
     ]
     rows: list[list[Cell]] = []
     for rows_of_change in reading.table.by_change():
         judged_row = next(row for row in rows_of_change if row.estimator == reading.judged)
         values = [fixed(row.value, decimals_for(judged_row.sigma, 3)) for row in rows_of_change]
-        sigmas = [significant(judged_row.sigma, 3, floor=0.0), significant(judged_row.noise, 3, floor=0.0)]
-        rows.append(
-            [judged_row.where, judged_row.parameter.label, *values, *sigmas, fixed(judged_row.size, 1, sign=True)]
-        )
+        sigma, noise = (significant(part, 3, floor=0.0) for part in (judged_row.sigma, judged_row.noise))
+        sigmas = [noise] if alone else [sigma, noise, fixed(judged_row.size, 1, sign=True)]
+        rows.append([judged_row.where, judged_row.parameter.label, *values, *sigmas])
     at = f" at {moment(run.times[-1])}" if run.times else ""
     title = f"{_name(run)}: recovered from measured frames{at}"
-    caption = f"σ and the last column are those of the {reading.estimators[reading.judged].title}."
+    whose = "σ of noise is that" if alone else "σ and the last column are those"
+    caption = f"{whose} of the {reading.estimators[reading.judged].title}."
     return Table("changes", title, caption, heads, rows)
 
 

@@ -42,6 +42,12 @@ from twin.recover.measured_frames import (
 )
 from twin.sensors.area_detector import EmvaDetector, coarse_step_warnings
 
+_GEOMETRY_ALONE = (
+    "σ does not hold: without a model of the instrument it contains the noise of the images only, and two spots of a"
+    " camera have four coordinates for its four changes: motions of the monitor's own parts, such as its prisms, are"
+    " read as changes of the cameras; `instrument` with `disturbances` includes them in σ"
+)
+"""Reason to doubt the sigmas of a measurement without a prior on the motions of the monitor's parts."""
 CALIBRATE, READ, MEASURE = "calibrate", "read the frames", "search and measure the spots"
 
 
@@ -181,12 +187,14 @@ def run_recover(
     if setup.test.photon_transfer == "measured":
         source = "the dark and flat frames give"
     tables: Mapping[str, CameraCrosstalk] | None = None
+    alone = (_GEOMETRY_ALONE,) if setup.model is None else ()
     readings: list[MonitorReading] = []
     for k, recovery in enumerate(recoveries):
         tables = bench.crosstalk(recovery) if tables is None else tables
         frames = min(len(result.channel.after[k].frames) for result in results)
         results_of_state = tuple(replace(result, after=result.after[k : k + 1]) for result in results)
         state_doubts = (
+            *alone,
             *_shape_warnings(results_of_state, times, k),
             *_noise_warnings(results_of_state, times, source, k),
         )
@@ -195,7 +203,7 @@ def run_recover(
         arguments = bench.cameras, ground, bench.disturbances, recovery, tables, frames, centroid, state_doubts
         readings.append(MonitorReading(names, *arguments, together=len(recoveries)))
     frame_warnings = (*_shape_warnings(results, times), *_noise_warnings(results, times, source))
-    input_warnings = (*bench.warnings, *order_warnings(channels, times), *_coarse_warnings(channels, setup))
+    input_warnings = (*alone, *bench.warnings, *order_warnings(channels, times), *_coarse_warnings(channels, setup))
     warnings = (*input_warnings, *frame_warnings, *_reading_warnings(readings, times), *readings[-1].unobserved)
     return RecoverRun(setup, tuple(readings), results, bench.pitch, smoothed, warnings)
 

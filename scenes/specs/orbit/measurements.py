@@ -197,7 +197,7 @@ class GroundFileSpec(_HeightsFileSpec):
     Attributes
     ----------
     file
-        Path of the file.
+        Path of the file. docs/orbit_files.md, ground points, has its columns.
     crs
         Coordinate reference system, in PROJ's notation: EPSG:4979 and EPSG:4978 are complete, EPSG:4326 and EPSG:32650
         also need `heights`.

@@ -46,7 +46,10 @@ def exported(run: BlockRun) -> dict[str, str | bytes]:
 
 
 def _points(run: BlockRun) -> dict[str, Any]:
-    """Return the columns of the table of adjusted points: geodetic coordinates with sigmas, and the ITRS covariance."""
+    """Return the columns of the table of adjusted points: geodetic coordinates with sigmas, and the ITRS covariance.
+
+    `sigma_up_relative` is the sigma of a point's height relative to the mean height of all points of the table.
+    """
     adjustment = run.adjustment
     points = adjustment.assembly.block.points
     where = np.flatnonzero(np.isfinite(adjustment.ground).all(axis=1))
@@ -62,6 +65,7 @@ def _points(run: BlockRun) -> dict[str, Any]:
         "height [m]": height,
     }
     columns |= {f"sigma_{axis} [m]": sigma[:, k] for k, axis in enumerate(("east", "north", "up"))}
+    columns["sigma_up_relative [m]"] = run.relative_height_sigma
     columns |= {f"{axis} [m]": ground[:, k] for k, axis in enumerate("xyz")}
     pairs = ((i, j) for i in range(3) for j in range(i, 3))
     return columns | {f"covariance_{'xyz'[i]}{'xyz'[j]} [m^2]": covariance[:, i, j] for i, j in pairs}

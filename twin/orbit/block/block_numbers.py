@@ -47,9 +47,8 @@ GROUP: Record[GroupTest] = Record(
         lambda group: group.ratio if np.isfinite(group.ratio) else None,
         "variance of the residuals over that expected from the sigmas",
         "variance ratio",
-        2,
     ),
-    Quantity("p_value", lambda group: group.p_value, "two-sided p-value of the residuals, approximate", "p", 3),
+    Quantity("p_value", lambda group: group.p_value, "two-sided p-value of the residuals, approximate", "p"),
     Quantity("factor", lambda group: group.factor, "variance factor, estimated where asked for", "factor", 2),
 )
 LAW: Record[LawTest] = Record(
@@ -171,9 +170,14 @@ BLOCK: Record[BlockRun] = Record(
     Quantity("chi_square", lambda run: run.adjustment.chi_square, "chi-square of all observations and priors"),
     Quantity("degrees_of_freedom", lambda run: run.adjustment.degrees_of_freedom, "degrees of freedom of chi-square"),
     Quantity("p_value", lambda run: run.adjustment.p_value, "probability of a chi-square at least as large"),
-    Quantity("agrees", lambda run: run.adjustment.p_value >= ALARM, "true if residuals agree with their sigmas"),
+    Quantity("agrees", lambda run: run.adjustment.p_value >= ALARM, "true if residuals are not larger than stated"),
     Quantity("unknowns", lambda run: len(run.adjustment.x), "number of unknowns beside the points"),
     Quantity("points", lambda run: int(np.isfinite(run.adjustment.ground[:, 0]).sum()), "number of adjusted points"),
+    Quantity(
+        "relative_height_sigma_m",
+        lambda run: float(np.median(run.relative_height_sigma)),
+        "sigma of a point's height relative to the mean height of all points, median of the points",
+    ),
     Quantity("groups", lambda run: run.adjustment.groups, "group of observations, or law -> its test", record=GROUP),
     Quantity(
         "laws",

@@ -10,7 +10,9 @@ from collections.abc import Sequence
 
 import numpy as np
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 
+from analysis.block.block_adjustment import BlockAdjustment
 from analysis.orbit.forward_intersection import level_axes
 from scenes.specs.orbit.setup import RationalAdjustSetup
 from twin.framework import svg
@@ -53,14 +55,31 @@ def _verdict(run: BlockRun) -> tuple[str, tuple[str, ...]]:
         largest = max(observed.ce90 / predicted.ce90, observed.le90 / predicted.le90)
         if largest < _FAR_BELOW:
             checked += f", at most {largest:.1g} of the prediction, which covers errors common to all points"
+    relative = float(np.median(run.relative_height_sigma))
     control = "with" if "control" in run.used else "without"
     return answer(
         f"{control} ground control, predicted 90% errors at {where} are {predicted.ce90:.2f} m in plan and"
         f" {predicted.le90:.2f} m in height{checked}",
         contribution,
-        f"chi-square of the residuals is {run.adjustment.chi_square:.0f} for {run.adjustment.degrees_of_freedom}"
-        f" degrees of freedom (p = {run.adjustment.p_value:.2g})",
+        f"relative to the mean height of all points, σ of a height is {relative:.2g} m in the median: errors that all"
+        " points share do not count",
+        _residuals_text(run.adjustment),
     )
+
+
+def _residuals_text(adjustment: BlockAdjustment) -> str:
+    """Return whether the residuals are as large as stated, by a two-sided test of chi-square."""
+    square, degrees = adjustment.chi_square, adjustment.degrees_of_freedom
+    chance = 2.0 * min(adjustment.p_value, 1.0 - adjustment.p_value) if degrees else 1.0
+    agree = "agree with the stated errors"
+    if chance < ALARM:
+        agree = f"are {np.sqrt(square / degrees):.2g} times as large as stated"
+    test = f"chi-square {square:.0f} for {degrees} degrees of freedom, p {_chance(chance)} two-sided"
+    return f"the residuals {agree} ({test})"
+
+
+def _chance(p: float) -> str:
+    return "< 1e-6" if p < 1e-6 else f"= {p:.2g}"
 
 
 def _facts(run: BlockRun) -> tuple[tuple[str, str], ...]:
@@ -83,13 +102,25 @@ def _facts(run: BlockRun) -> tuple[tuple[str, str], ...]:
 
 
 def _summary(run: BlockRun) -> Table:
-    return CONTRIBUTION.flat().table(
+    """Return the table of errors by sensor, without columns that have no numbers or none but 1."""
+    observed, several = run.contributions[ALL].observed is not None, len(run.contributions) > 1
+    omitted = (*(() if observed else ("observed", "normalised")), *(() if several else ("plan", "height")))
+    record = CONTRIBUTION.flat()
+    caption = "90% errors of the tie points, predicted by the covariances"
+    if observed:
+        caption = "90% errors of the check points, predicted by the covariances and observed"
+    caption += "; ratios of the predicted errors to those with all sensors." if several else "."
+    if observed:
+        caption += (
+            " χ²/dof: mean square of the errors over their sigmas. Errors of a block's points are correlated, so that"
+            " the observed errors of one block scatter."
+        )
+    return record.table(
         "sensors",
         "Contribution of each sensor",
-        "90% errors of the check points, predicted by the covariances and observed; ratios of the predicted errors to"
-        " those with all sensors. χ²/dof: mean square of the errors over their sigmas. Errors of a block's points are"
-        " correlated, so that the observed errors of one block scatter.",
+        caption,
         {name: CONTRIBUTION(contribution) for name, contribution in run.contributions.items()},
+        [quantity.key for quantity in record if not quantity.key.startswith(omitted or "-")],
         label="sensors",
     )
 
@@ -103,6 +134,7 @@ def _sections(run: BlockRun) -> tuple[Section, ...]:
         " the same error model are a group.",
         {name: GROUP(group) for name, group in run.adjustment.groups.items()},
         label="group",
+        digits=3,
     )
     omitted = ("_sigma_before",) if run.drawn is not None else ("_sigma_before", "_true")
     keys = [quantity.key for quantity in CHANGE if not quantity.key.endswith(omitted)]
@@ -132,8 +164,8 @@ def _sections(run: BlockRun) -> tuple[Section, ...]:
         *_ground_section(run),
         Section("Tests of the stated errors", (), (groups,)),
         Section("Images", (), (_images(run),)) if run.images else Section("Cameras", (), (cameras,)),
-        Section("Weakly observable combinations", (), (weak,)),
-        Section("Check points", (), (points,), folded=1),
+        *((Section("Weakly observable combinations", (), (weak,)),) if weak.rows else ()),
+        *((Section("Check points", (), (points,), folded=1),) if points.rows else ()),
     )
 
 
@@ -199,13 +231,15 @@ def _ground_figure(ground: np.ndarray, cases: Sequence[tuple[str, np.ndarray, np
         arrows = axes.quiver(
             east[where], north[where], *errors.T, cmap="viridis", clim=(-extent, extent), width=0.005, scale=12.0 * size
         )
-        axes.quiverkey(arrows, 0.8, 1.03, size, f"{size:g} m in plan", labelpos="E", coordinates="axes")
+        # below the title and left of its arrow, the label stays within a narrow map
+        axes.quiverkey(arrows, 0.88, 1.03, size, f"{size:g} m in plan", labelpos="W", coordinates="axes")
         axes.set_title(f"{len(where)} {title}", loc="left", pad=20)
         axes.set(xlabel="east [km]", ylabel="north [km]")
         axes.set_aspect("equal", adjustable="datalim")
         axes.margins(0.1)
         svg.gridded(axes)
-        figure.colorbar(arrows, ax=axes, shrink=0.75, label="error in height [m]", location="bottom")
+        bar = figure.colorbar(arrows, ax=axes, shrink=0.75, label="error in height [m]", location="bottom")
+        bar.locator = MaxNLocator(4)
     return figure
 
 
@@ -226,9 +260,14 @@ def _warnings(run: BlockRun) -> tuple[str, ...]:
     for name, group in run.adjustment.groups.items():
         if group.p_value < ALARM:
             size = float(np.sqrt(group.ratio))
+            common = ""
+            if name == "image" and run.images and "control" not in run.used:
+                common = (
+                    "; it changes σ of heights relative to other points, not CE90 and LE90, which the priors determine"
+                )
             warnings.append(
-                f"{name}: residuals are {size:.2g} times as large as stated (p = {group.p_value:.1g});"
-                f" `components: [{name}]` estimates their variance, and another law may describe them better"
+                f"{name}: residuals are {size:.2g} times as large as stated (p {_chance(group.p_value)});"
+                f" `components: [{name}]` estimates their variance, and another law may describe them better{common}"
             )
     if run.adjustment.p_value < ALARM:
         warnings.append("the residuals of the whole block are larger than the stated errors; its sigmas are too small")

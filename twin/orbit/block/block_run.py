@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -20,6 +21,7 @@ from analysis.block.error_processes import BlockError
 from analysis.block.network import DatumTest, Network, OpenCombination, datum_test, network_of, open_combinations
 from analysis.block.point_reduction import Pool
 from analysis.orbit.forward_intersection import Accuracy, level_axes, predicted, realised
+from optics.numerics.array_math import UnphysicalError
 from optics.numerics.backend import one_blas_thread
 from optics.numerics.number_tree import FrozenMap
 from scenes.specs.orbit.setup import AnyAdjust, MeasuredAdjustSetup, RationalAdjustSetup
@@ -29,6 +31,7 @@ from twin.framework.procedure import Advance, BenchError, silent
 from twin.orbit.block.drawn_block import DrawnBlock, draw_block
 from twin.orbit.block.measured_block import MonitorSource, measured_block
 from twin.orbit.block.rational_block import AdjustedImage, adjusted_images, rational_block
+from twin.orbit.measured.measurement_tables import LINES_SEE_POINTS
 
 if TYPE_CHECKING:
     from optics.numerics.backend import Backend
@@ -175,6 +178,13 @@ class BlockRun:
         """Names of the sensors whose measurements the adjustment uses."""
         return self.adjustment.assembly.block.sensors
 
+    @cached_property
+    def relative_height_sigma(self) -> np.ndarray:
+        """Sigmas of the heights of all adjusted points relative to their mean height, (k,), in metres."""
+        where = np.flatnonzero(np.isfinite(self.adjustment.ground).all(axis=1))
+        up = level_axes(self.adjustment.ground[where])[:, 2]
+        return np.sqrt(self.adjustment.relative_variance(where, up))
+
     @property
     def datum_p_value(self) -> float:
         """p-value of the common shift of the control points; 1 without control points."""
@@ -221,7 +231,10 @@ def run_adjustment(
         if isinstance(setup, RationalAdjustSetup):
             block, places = rational_block(setup, advance)
         else:
-            block, places = measured_block(setup, advance, monitor)
+            try:
+                block, places = measured_block(setup, advance, monitor)
+            except (MeasurementError, UnphysicalError) as error:
+                raise BenchError(str(error), ("data",), LINES_SEE_POINTS) from error
         reference = _Reference(places, block.points.covariance, {})
     else:
         _require_memory(setup.test)
@@ -243,7 +256,8 @@ def run_adjustment(
         images = adjusted_images(adjustment)
     except (MeasurementError, np.linalg.LinAlgError) as error:
         key = "points" if drawn else "image_points" if isinstance(setup, RationalAdjustSetup) else "data"
-        raise BenchError(str(error), (key,), "more points, or scenes that see the same ground") from error
+        remedy = LINES_SEE_POINTS if key == "data" else "more points, or scenes that see the same ground"
+        raise BenchError(str(error), (key,), remedy) from error
     where, wrong, spread = _check(adjustment, reference)
     level = level_axes(adjustment.ground[where])
     sigma = np.sqrt(np.einsum("nij,njk,nik->ni", level, spread, level))

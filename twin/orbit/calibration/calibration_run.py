@@ -61,7 +61,13 @@ from twin.orbit.calibration.schemes import (
     study_monitoring,
 )
 from twin.orbit.calibration.screening import require_correct_names, screen_campaign
-from twin.orbit.measured.measurement_tables import CAMERA_FILE, TEST_FILE, campaign_files, read_measurements
+from twin.orbit.measured.measurement_tables import (
+    CAMERA_FILE,
+    LINES_SEE_POINTS,
+    TEST_FILE,
+    campaign_files,
+    read_measurements,
+)
 
 if TYPE_CHECKING:
     from optics.numerics.backend import Backend
@@ -285,7 +291,7 @@ def _key_and_remedy(error: ValueError, measured: bool) -> tuple[tuple[str, ...],
             return ("data",), f"{remedy}, state a larger launch.bias, or reject points (`screening: robust`)"
         return ("errors",), "a datum and biases within the range that launch.bias allows"
     if measured:
-        return ("data",), "points whose names, images and coordinates belong together, and more of them"
+        return ("data",), LINES_SEE_POINTS
     return ("errors",), "errors that an adjustment can take, and more points"
 
 

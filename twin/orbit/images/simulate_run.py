@@ -17,6 +17,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from analysis.arrays import Array
+from analysis.matching.matches import EXPLAINED
 from analysis.orbit.calibration_parameters import level_covariance
 from optics.geometry.pose import about_axis, rotation_matrix
 from optics.numerics.array_math import in_span
@@ -311,7 +312,11 @@ MATCHED: Record[MatchedLine] = Record(
     Quantity("displacement_pixels_px", lambda line: line.median_shift[1], "shift along the line", "shift, line"),
     Quantity("displacement_lines_px_sigma", lambda line: line.median_sigma[0], "1 sigma along track", "σ track"),
     Quantity("displacement_pixels_px_sigma", lambda line: line.median_sigma[1], "1 sigma along line", "σ line"),
-    Quantity("consensus_scatter_px", lambda line: line.scatter, "scatter of the shifts beyond their covariances"),
+    Quantity(
+        "consensus_scatter_px",
+        lambda line: line.scatter if line.scatter > EXPLAINED else None,
+        "scatter of the shifts beyond their covariances; none where these explain it",
+    ),
 )
 POINTS: Record[MatchedPoints] = Record(
     "Points of one kind; for ties without the line in which they are chosen.",

@@ -117,9 +117,12 @@ def run_rational_match(setup: RationalMatchSetup, advance: Advance = silent) -> 
         points[source] = _points_of(source, frames, spec.heights, spec.points)
     advance("points", len(frames), len(frames))
     if not any(line.accepted.any() for group in points.values() for line in group.searched_lines.values()):
-        texts = [line.text for group in points.values() for line in group.searched_lines.values()]
-        problem = f"no two images have common points: {texts[0] if texts else 'they show different ground'}"
-        raise BenchError(problem, ("heights",), "the heights of the ground that they show, or a larger points.reach")
+        low, high = spec.heights
+        problem = f"no two images have common points at heights of {low:g} to {high:g} m above the ellipsoid"
+        remedy = (
+            "heights of the ground that they show (this range probably does not contain it), images of the same ground"
+        )
+        raise BenchError(problem, ("heights",), f"{remedy}, or a larger points.reach")
     return RationalMatch(setup, FrozenMap(points))
 
 
@@ -282,10 +285,13 @@ def rational_report(run: RationalMatch) -> Report:
         for name, line in points.searched_lines.items()
     }
     rows = {name: MATCHED(line) for name, line in pairs.items() if line.accepted.any()}
+    for row in rows.values():
+        row["consensus_scatter_px"] = row["consensus_scatter_px"] or "\N{EM DASH}"
     keys = ("found", "matched", "accepted", "displacement_lines_px", "displacement_pixels_px", "consensus_scatter_px")
     caption = (
         "Displacement: median of the accepted from the prediction at the height of each point, in lines and samples;"
-        " it is that of the polynomials across the epipolar lines. Scatter: beyond the covariances."
+        " it is that of the polynomials across the epipolar lines. Scatter: beyond the covariances; a dash where these"
+        " explain it."
     )
     table = MATCHED.table("points-found", "Matching", caption, rows, keys, "points", digits=4)
     heads = sorted(pairs, key=lambda name: float(pairs[name].accepted.mean()))

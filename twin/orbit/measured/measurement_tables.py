@@ -401,6 +401,12 @@ CONVENTIONS: Mapping[str, Any] = {
 """Conventions (frames, quaternion order, pixel origin) of the files that are written, those of the project."""
 CAMERA_FILE = "camera.yaml"
 TEST_FILE = "calibrate.yaml"
+LINES_SEE_POINTS = (
+    "an attitude whose lines see the points: `scalar` first or last, `turns`, `body_axes`, frame and times of the"
+    " attitude file (`twin.orbit check` finds which agree with the ground points); names, images and coordinates that"
+    " belong together"
+)
+"""Remedy for measured passes whose lines see no ground, or ground far from their points; the likeliest cause first."""
 
 
 def campaign_files(passes: Sequence[PassMeasurements], camera: Mapping[str, Any]) -> dict[str, str]:
