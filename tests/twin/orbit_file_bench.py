@@ -250,14 +250,14 @@ def match_files(folder: Path, flown: Any) -> dict[str, object]:
     from twin.framework.data_files import FrameFacts, tiff
     from twin.orbit.flight.platform_table import PlatformTable
     from twin.orbit.images.simulate_report import map_facts
-    from twin.orbit.measured.measurement_tables import _csv
+    from twin.orbit.measured.measurement_tables import csv_text
 
     table = PlatformTable.sampled(flown.measured, 1.0, 0.125)
     orbit = {"time [s]": table.orbit_time, **dict(zip(("x [m]", "y [m]", "z [m]"), table.position.T, strict=True))}
     orbit |= dict(zip(("vx [m/s]", "vy [m/s]", "vz [m/s]"), table.velocity.T, strict=True))
     attitude = {"time [s]": table.attitude_time, **dict(zip(("q1", "q2", "q3", "q4"), table.quaternion.T, strict=True))}
-    (folder / "orbit.csv").write_text(_csv(orbit))
-    (folder / "attitude.csv").write_text(_csv(attitude))
+    (folder / "orbit.csv").write_text(csv_text(orbit))
+    (folder / "attitude.csv").write_text(csv_text(attitude))
     rows, images = [], {}
     for name, image in flown.patch.images.items():
         window = image.window
