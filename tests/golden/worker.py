@@ -40,7 +40,8 @@ def run(words: list[str]) -> dict[str, Any]:
     handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)}
     try:
         # runpy warns of a module that an earlier job has imported
-        sys.modules.pop(words[0], None)
+        for name in (words[0], f"{words[0]}.__main__"):
+            sys.modules.pop(name, None)
         runpy.run_module(words[0], run_name="__main__", alter_sys=True)
     except SystemExit as stop:
         code = stop.code if isinstance(stop.code, int) else int(stop.code is not None)
