@@ -406,6 +406,8 @@ def compute(pipe: Connection, what: str, backend: str, run: int | None) -> None:
         except (InputError, BackendUnavailable, LibraryMissing, ValueError) as error:
             pipe.send(("failed", str(error)))
             return
+        except BrokenPipeError:  # the server has ended, by Ctrl-C while this process was starting
+            return
         while True:
             try:
                 kind, question = pipe.recv()
