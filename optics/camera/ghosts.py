@@ -17,7 +17,7 @@ from optics.camera.prescription import Camera
 from optics.camera.ray_bundle import Field, launch_rays
 from optics.materials.fresnel_scatter import reflectance
 from optics.numerics.backend import Backend, default_backend
-from optics.numerics.quadrature import even_disk
+from optics.numerics.quadrature import circle, even_disk
 from optics.raytrace.assembly import Assembly, Element, Interaction
 from optics.raytrace.system import assemble
 from optics.raytrace.trace import make_rays, trace
@@ -41,15 +41,10 @@ _INSIDE = 1.0 - 1e-9
 _TOUCHING = 1e-15
 """Distance of two surfaces, metres, and length of a vector that count as zero."""
 
-
-def _ring(radius: float, count: int) -> np.ndarray:
-    """Return points evenly around a circle, (count, 2)."""
-    angle = 2.0 * np.pi * np.arange(count) / count
-    return radius * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
-
-
 _EVEN = even_disk(_NODES)
-PUPIL = np.concatenate([np.zeros((1, 2)), _ring(_NEAR, 4), _ring(_INSIDE, _RIM), np.stack([_EVEN.x, _EVEN.y], axis=-1)])
+PUPIL = np.concatenate(
+    [np.zeros((1, 2)), _NEAR * circle(4), _INSIDE * circle(_RIM), np.stack([_EVEN.x, _EVEN.y], axis=-1)]
+)
 """Points of the stop, in units of its radius, through which ghosts are traced, (N, 2): the chief ray, 4 rays close to
 it, the rim, and points of equal weight over the area."""
 
