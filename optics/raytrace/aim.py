@@ -174,6 +174,36 @@ def aim(
     )
 
 
+def aimed_rays(
+    backend: Backend, systems: SystemBatch, start: np.ndarray, guess: np.ndarray, target: np.ndarray, tolerance: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Aim N rays in each of B systems at points of the last element, starting from approximate directions.
+
+    Parameters
+    ----------
+    backend : Backend
+        Backend that traces the rays.
+    systems : SystemBatch
+        B systems.
+    start : (B, N or 1, 3) ndarray
+        Start points, metres.
+    guess : ndarray
+        Approximate unit vectors, broadcastable to (B, N, 3).
+    target : (B, N, 2) ndarray
+        Points to hit in the last element's x, y, metres.
+    tolerance : float
+        Largest distance of a hit from its point, metres.
+
+    Returns
+    -------
+    tuple of ndarray
+        Positions (metres) and unit vectors of the rays, (B, N, 3) each.
+    """
+    fan = RayFan.toward(np.broadcast_to(start, (*target.shape[:2], 3)), guess)
+    q, _ = aim(backend, systems, fan, target, tolerance=tolerance)
+    return fan.at(q)
+
+
 def surviving_rays(
     backend: Backend,
     assembly: Assembly,

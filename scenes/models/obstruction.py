@@ -23,10 +23,10 @@ from optics.geometry.solid import Face, Solid, SolidError, face_plane, solid_mes
 from optics.geometry.tree import PlacedBodies, State
 from optics.numerics.backend import Backend
 from optics.numerics.quadrature import circle, even_disk
-from optics.raytrace.aim import AimError, RayFan, aim, surviving_rays
+from optics.raytrace.aim import AimError, aimed_rays, surviving_rays
 from optics.raytrace.assembly import Assembly, Element, points_to_world
 from optics.raytrace.element_numbers import media_along
-from optics.raytrace.system import SystemBatch, assemble
+from optics.raytrace.system import assemble
 from optics.raytrace.trace import make_rays, trace
 from scenes.models.camera_model import line_body
 from scenes.models.instrument_model import Instrument, MisplacedError, key_of
@@ -603,7 +603,7 @@ def monitor_beams(
     guess = np.array([instrument.toward_optics(placed, c.camera)[0] for c in channels])[:, None]
     systems = assemble(assembly, [f"{c.key}/outgoing" for c in channels], states, placed=placed)
     target = np.array(radius)[:, None, None] * points
-    position, direction = _through(backend, systems, start, guess, target)
+    position, direction = aimed_rays(backend, systems, start, guess, target, _AIM)
     chains = [assembly.sequences[f"{c.key}/monitor"] for c in channels]
     systems = assemble(assembly, chains, states, placed=placed)
     traced = trace(backend, systems, make_rays(backend, position, direction), keep=range(len(chains[0])))
@@ -795,35 +795,7 @@ def _aimed_rays(
         Positions and unit vectors of the rays, (1, N, 3) each.
     """
     guess = instrument.toward_optics(instrument.assembly.place(), camera)[0]
-    return _through(backend, assemble(instrument.assembly, [sequence]), start, guess, target[None])
-
-
-def _through(
-    backend: Backend, systems: SystemBatch, start: np.ndarray, guess: np.ndarray, target: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Aim N rays in each of B systems at points of the last element, starting from approximate directions.
-
-    Parameters
-    ----------
-    backend : Backend
-        Backend that traces the rays.
-    systems : SystemBatch
-        B systems.
-    start : (B, N or 1, 3) ndarray
-        Start points, in metres.
-    guess : ndarray
-        Approximate unit vectors.
-    target : (B, N, 2) ndarray
-        Points to hit in the last element's x, y, in metres.
-
-    Returns
-    -------
-    tuple of ndarray
-        Positions and unit vectors of the rays, (B, N, 3) each.
-    """
-    fan = RayFan.toward(np.broadcast_to(start, (*target.shape[:2], 3)), guess)
-    q, _ = aim(backend, systems, fan, target, tolerance=_AIM)
-    return fan.at(q)
+    return aimed_rays(backend, assemble(instrument.assembly, [sequence]), start, guess, target[None], _AIM)
 
 
 def _used(instrument: Instrument, path: str, segments: np.ndarray) -> np.ndarray:

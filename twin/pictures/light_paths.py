@@ -10,9 +10,10 @@ import numpy as np
 from optics.geometry.aperture import Aperture
 from optics.geometry.tree import PlacedBodies, State
 from optics.numerics.backend import Backend
-from optics.raytrace.aim import RayFan, aim, transverse_axes
+from optics.numerics.quadrature import circle
+from optics.raytrace.aim import aimed_rays
 from optics.raytrace.assembly import points_to_world
-from optics.raytrace.system import SystemBatch, assemble
+from optics.raytrace.system import assemble
 from optics.raytrace.trace import make_rays, trace
 from scenes.models.camera_model import line_body
 from scenes.models.instrument_model import Instrument
@@ -113,9 +114,7 @@ def _length(instrument: Instrument, placed: PlacedBodies) -> float:
 
 def _circle(radius: float) -> np.ndarray:
     """Return the centre and ``RIM`` points along the edge of a circle, (1 + RIM, 2), in the unit of its ``radius``."""
-    angle = 2.0 * np.pi * np.arange(RIM) / RIM
-    edge = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
-    return np.concatenate([np.zeros((1, 2)), radius * edge])
+    return np.concatenate([np.zeros((1, 2)), radius * circle(RIM)])
 
 
 def _radius(aperture: Aperture | None) -> float:
@@ -139,7 +138,9 @@ def _imaging(instrument: Instrument, backend: Backend, state: State, placed: Pla
         stop = assembly.elements[f"{camera}/{model.spec.stop}"].aperture
         targets.append(np.tile(_circle(_radius(stop)), (len(FIELDS), 1)))
     to_stop = assemble(assembly, [f"{camera}/image_to_stop" for camera in names], [state], placed=placed)
-    position, direction = _aimed(backend, to_stop, np.array(points), np.array(guesses)[:, None], np.array(targets))
+    position, direction = aimed_rays(
+        backend, to_stop, np.array(points), np.array(guesses)[:, None], np.array(targets), _AIM
+    )
     chains = [assembly.sequences[f"{camera}/image_to_object"] for camera in names]
     systems = assemble(assembly, chains, [state], placed=placed)
     traced = trace(backend, systems, make_rays(backend, position, direction), keep=range(len(chains[0])), world=True)
@@ -170,7 +171,7 @@ def _monitor(instrument: Instrument, backend: Backend, state: State, placed: Pla
     start = np.array([placed.pose(c.reticle_body).translation for c in channels])[:, None]
     outgoing = assemble(assembly, [f"{c.key}/outgoing" for c in channels], [state], placed=placed)
     target = np.array([_circle(_radius(assembly.elements[f"{c.key}/return_face"].aperture)) for c in channels])
-    position, direction = _aimed(backend, outgoing, start, guess, target)
+    position, direction = aimed_rays(backend, outgoing, start, guess, target, _AIM)
     systems = assemble(assembly, [f"{c.key}/monitor" for c in channels], [state], placed=placed)
     count = len(assembly.sequences[f"{channels[0].key}/monitor"])
     traced = trace(backend, systems, make_rays(backend, position, direction), keep=range(count))
@@ -186,33 +187,3 @@ def _monitor(instrument: Instrument, backend: Backend, state: State, placed: Pla
                 prints[mirror, int((mirror, 0) in prints)] = hits[k][i][:, :2]
         out.append(Beam(channel.camera, f"monitor/{channel.name}", np.stack(path, axis=1), prints))
     return out
-
-
-def _aimed(
-    backend: Backend, systems: SystemBatch, points: np.ndarray, guess: np.ndarray, target: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Aim rays of B systems from N points each at given points of the last element.
-
-    Parameters
-    ----------
-    backend : Backend
-        Array backend of the trace.
-    systems : SystemBatch
-        B optical systems.
-    points : (B, N or 1, 3) ndarray
-        Start points, metres.
-    guess : ndarray
-        Approximate directions.
-    target : (B, N, 2) ndarray
-        Points to hit in the last element's x, y, metres.
-
-    Returns
-    -------
-    tuple of ndarray
-        Position and direction, (B, N, 3) each.
-    """
-    points = np.broadcast_to(points, (*target.shape[:2], 3))
-    guesses = np.broadcast_to(guess, points.shape)
-    fan = RayFan(points, guesses, transverse_axes(guesses, np.broadcast_to([0.0, 1.0, 0.0], guesses.shape)))
-    q, _ = aim(backend, systems, fan, target, tolerance=_AIM)
-    return fan.at(q)
