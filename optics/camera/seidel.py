@@ -143,17 +143,12 @@ def seidel_sums(
     n = signs * indices[0]
     gaps = np.diff([pose.translation[2] for pose in poses])
 
-    def rays(slope: float, height: float) -> tuple[np.ndarray, np.ndarray]:
-        """Trace a paraxial ray; return its heights at the K surfaces and its K + 1 slopes."""
-        heights, slopes = [height], [slope]
-        for k, gap in enumerate([*gaps, 0.0]):
-            slopes.append((n[k] * slopes[k] - heights[k] * c[k] * (n[k + 1] - n[k])) / n[k + 1])
-            heights.append(heights[k] + slopes[k + 1] * gap)
-        return np.array(heights[:-1]), np.array(slopes)
+    def ray(height: float, slope: float) -> tuple[np.ndarray, np.ndarray]:
+        return paraxial_ray(c, gaps, n, height, slope)
 
-    per_height, per_slope = rays(0.0, 1.0)[0][stop], rays(1.0, 0.0)[0][stop]
-    y, u = rays(0.0, radius / per_height)
-    yb, ub = rays(np.tan(field), -np.tan(field) * per_slope / per_height)
+    per_height, per_slope = ray(1.0, 0.0)[0][stop], ray(0.0, 1.0)[0][stop]
+    y, u = ray(radius / per_height, 0.0)
+    yb, ub = ray(-np.tan(field) * per_slope / per_height, np.tan(field))
     a, ab = n[:-1] * (u[:-1] + y * c), n[:-1] * (ub[:-1] + yb * c)
     h = float(a[0] * yb[0] - ab[0] * y[0])
     step, inverse = np.diff(u / n), np.diff(1.0 / n)
@@ -167,3 +162,38 @@ def seidel_sums(
         spread = np.diff((indices[1] - indices[2]) / indices[0])
         colour = np.stack([a * y * spread, ab * y * spread], axis=-1)
     return SeidelSums(tuple(names), sums, colour, h, float(n[-1] * np.sum(c * inverse)))
+
+
+def paraxial_ray(
+    curvatures: Sequence[float] | np.ndarray,
+    gaps: Sequence[float] | np.ndarray,
+    indices: Sequence[float] | np.ndarray,
+    height: float,
+    slope: float,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Trace a paraxial ray through K surfaces centred on the z axis.
+
+    Parameters
+    ----------
+    curvatures : (K,) array
+        Curvatures of the surfaces, 1/m.
+    gaps : (K - 1,) array
+        Distances along z from each vertex to the next, metres.
+    indices : (K + 1,) array
+        Refractive indices before the first and after each surface, negative where the light runs toward -z.
+    height, slope : float
+        Height at the first surface, metres, and slope before it, per distance along z.
+
+    Returns
+    -------
+    heights : (K,) ndarray
+        Heights at the surfaces, metres.
+    slopes : (K + 1,) ndarray
+        Slopes before the first and after each surface.
+    """
+    heights, slopes = [height], [slope]
+    for k, gap in enumerate([*gaps, 0.0]):
+        bending = heights[k] * curvatures[k] * (indices[k + 1] - indices[k])
+        slopes.append((indices[k] * slopes[k] - bending) / indices[k + 1])
+        heights.append(heights[k] + slopes[k + 1] * gap)
+    return np.array(heights[:-1]), np.array(slopes)

@@ -10,6 +10,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.optimize import least_squares
 
+from optics.camera.seidel import paraxial_ray
 from optics.materials.glass import refractive_index
 
 GLASSES: tuple[str | float, ...] = ("N-SK16", 1.0, "F2", 1.0, "N-SK16", 1.0)
@@ -97,20 +98,17 @@ def _unit_lens(values: np.ndarray, index: np.ndarray) -> tuple[np.ndarray, np.nd
     """Return curvatures and distances, the last to the image, of a lens of focal length 1 from the variables."""
     curvatures, gaps = values[:6], _GAPS.copy()
     gaps[list(_AIR)] = values[6:8]
-    height, slope = 1.0, 0.0
-    for k in range(6):
-        slope = (index[k] * slope - height * curvatures[k] * (index[k + 1] - index[k])) / index[k + 1]
-        height += slope * gaps[k] if k < 5 else 0.0
-    return curvatures / -slope, np.array([*(-slope * gaps), height + values[8]])
+    heights, slopes = paraxial_ray(curvatures, gaps, index, 1.0, 0.0)
+    power = -slopes[-1]
+    return curvatures / power, np.array([*(power * gaps), heights[-1] + values[8]])
 
 
 def _entrance_pupil(curvatures: np.ndarray, gaps: np.ndarray, index: np.ndarray) -> float:
     """Return the position of the paraxial entrance pupil behind the first face."""
-    height, slope = 0.0, 1.0
-    for k in range(STOP - 1, -1, -1):
-        height -= slope * gaps[k]
-        slope = (index[k + 1] * slope + height * curvatures[k] * (index[k + 1] - index[k])) / index[k]
-    return -height / slope
+    # a ray through the middle of the stop, back to the first face
+    backward = curvatures[STOP - 1 :: -1], -gaps[STOP - 2 :: -1], index[STOP::-1]
+    heights, slopes = paraxial_ray(*backward, -float(gaps[STOP - 1]), 1.0)
+    return float(-heights[-1] / slopes[-1])
 
 
 def _traced(

@@ -6,8 +6,11 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import takewhile
-from math import atan, degrees, isfinite, sqrt, tan
+from math import atan, copysign, degrees, isfinite, sqrt, tan
 
+import numpy as np
+
+from optics.camera.seidel import paraxial_ray
 from optics.numerics.number_tree import FrozenMap
 from scenes.specs.camera import CameraSpec, MirrorSpec
 from scenes.yaml.errors import InputError, Issue
@@ -193,17 +196,16 @@ class CameraNumbers:
 
         Faces are shifted (metres), radii change by a share, refractive indices of glasses by a number.
         """
-        height, slope, before, place, way = 1.0, 0.0, 1.0, 0.0, 1.0
-        for name, one in self._powered.items():
-            vertex = one.z + shifts.get(name, 0.0)
-            height, place = height + slope * (vertex - place), vertex
-            way = way if one.light == "refracts" else -way
-            after = way * (
-                self.camera.index_behind(name) + indices.get(name, 0.0) if one.light == "refracts" else abs(before)
-            )
-            power = (after - before) / (one.radius * (1.0 + radii.get(name, 0.0)))
-            slope, before = (before * slope - height * power) / after, after
-        return place - height / slope
+        vertices, curvatures, media = [], [], [1.0]
+        for name, face in self._powered.items():
+            vertices.append(face.z + shifts.get(name, 0.0))
+            curvatures.append(1.0 / (face.radius * (1.0 + radii.get(name, 0.0))))
+            if face.light == "refracts":
+                media.append(copysign(self.camera.index_behind(name) + indices.get(name, 0.0), media[-1]))
+            else:
+                media.append(-media[-1])
+        heights, slopes = paraxial_ray(curvatures, np.diff(vertices), media, 1.0, 0.0)
+        return float(vertices[-1] - heights[-1] / slopes[-1])
 
     def _defocus(self, element: OpticalElement, shift: float) -> float:
         """Return by how much the focus moves, metres, where an element moves along the axis."""
