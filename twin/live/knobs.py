@@ -64,18 +64,18 @@ KINDS: Mapping[str, _KnobKind] = {
 
 @dataclass(frozen=True)
 class Knob:
-    """Adjustable number of the page, the amount of one motion of a body.
+    """Adjustable number of the page: the amount of one motion of a body, or a number of a camera's design.
 
     Attributes
     ----------
     name : str
-        Name, such as ``base/forward/M2 shift z``.
+        Name, such as ``base/forward/M2 shift z`` or ``design/M2 radius``.
     node : str
-        Path of the body.
+        Path of the body, or of the part of the design, in the page's tree.
     kind : str
-        Key in ``KINDS``.
+        Key in ``KINDS``; ``design`` or ``field`` for the knobs of `CameraDesign`.
     axis : str
-        Axis or term, such as ``x`` or ``Z5``; empty if there is only one.
+        Axis, term or number of a surface, such as ``x``, ``Z5`` or ``radius``; empty if there is only one.
     unit : str
         Unit of the values.
     value : float

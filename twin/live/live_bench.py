@@ -20,6 +20,7 @@ from analysis.monitor.parameters import Parameter
 from analysis.spots.spot_positions import SpotError
 from optics.geometry.tree import PlacedBodies, State
 from scenes.models.disturbances import Component, state_of
+from scenes.models.instrument_model import Instrument
 from scenes.models.obstruction import Clearances
 from scenes.specs.course import DEFAULT_PIVOT, CourseSpec, moment
 from scenes.specs.job import checked_nodes
@@ -227,11 +228,10 @@ class LiveBench:
             A knob does not exist, a job's file could not have its value, or the designed camera forms no image.
         """
         design = {} if self.design is None else self.design.knobs
-        drawn = tuple(
-            (name, checked_knob(name, v, design).kind, v) for name, v in asked.knobs.items() if name in design
-        )
-        motions = tuple(item for item in asked.knobs.items() if item[0] not in design)
-        changed = tuple((name, value) for name, kind, value in drawn if kind == DESIGN and value)
+        drawn = {name: value for name, value in asked.knobs.items() if name in design}
+        kinds = {name: checked_knob(name, value, design).kind for name, value in drawn.items()}
+        changed = tuple((name, value) for name, value in drawn.items() if kinds[name] == DESIGN and value)
+        motions = tuple((name, value) for name, value in asked.knobs.items() if name not in design)
         return self._perturbed_twin(changed, motions, tuple(asked.pivots.items()))
 
     def _new_perturbed_twin(
@@ -319,14 +319,13 @@ class LiveBench:
                 *([BLURRED] if blurred else []),
             ),
         )
-        overlaps = self._clearances(experiment.instrument).overlaps(placed)
         return {
             **optics,
             "truth": run.truth_dict(),
             **({"quality": quality} if quality else {}),
             "motions": motions(experiment.instrument, state, placed),
             "warnings": list(run.warnings),
-            "collisions": [f"{o.first} overlaps {o.second} by {1e3 * o.depth:.3g} mm" for o in overlaps],
+            "collisions": self._collisions(experiment.instrument, placed),
         }
 
     def before(self, asked: AskedState) -> np.ndarray:
@@ -463,8 +462,7 @@ class LiveBench:
 
         They are estimated and true changes, spots and warnings.
         """
-        experiment = self.twin.experiment
-        instrument = experiment.instrument
+        instrument = self.twin.experiment.instrument
         message: dict[str, Any] = {"readings": stated(run.recovered_dict())}
         if not isinstance(asked, BlindState):
             message["truth"] = run.truth_dict()
@@ -474,10 +472,13 @@ class LiveBench:
         light = run.photons_after.sum(axis=(1, 2)) / run.photons_before.sum(axis=(1, 2))
         message["light"] = [float(share) for share in light]
         message["warnings"] = [*self._warnings(run, light), *doubted(run), *contradiction(run)]
-        message["collisions"] = [
-            f"{o.first} overlaps {o.second} by {1e3 * o.depth:.3g} mm" for o in self.clearances.overlaps(placed)
-        ]
+        message["collisions"] = self._collisions(instrument, placed)
         return message
+
+    def _collisions(self, instrument: Instrument, placed: PlacedBodies) -> list[str]:
+        """Return a sentence on each pair of bodies that overlap in a state."""
+        overlaps = self._clearances(instrument).overlaps(placed)
+        return [f"{o.first} overlaps {o.second} by {1e3 * o.depth:.3g} mm" for o in overlaps]
 
     def _guess(self, asked: AskedState) -> dict[str, Any]:
         """Return the expected images and spots for the knobs alone, as the user's guess of the hidden motions."""

@@ -73,8 +73,8 @@ def camera_file(bench: LiveBench, asked: AskedState) -> str:
     if bench.design is None:
         raise ValueError("only the design of a single camera without a monitor can be saved")
     made = bench.perturbed(asked).resolved
-    knobs = {name: f"{value:g} {bench.knobs[name].unit}".strip() for name, value in asked.knobs.items()}
-    changes = [f"{name} {text}" for name, text in knobs.items() if name.startswith(DESIGN)]
+    knobs = ((bench.knobs[name], value) for name, value in asked.knobs.items())
+    changes = [f"{knob.name} {value:g} {knob.unit}".strip() for knob, value in knobs if knob.kind == DESIGN]
     lines = [f"{bench.design.spec.name}, saved with python -m twin.live: {'; '.join(changes) or 'unchanged'}"]
     if made.job.perturb:
         lines.append("Motions and temperatures of bodies are not part of a camera's file.")
