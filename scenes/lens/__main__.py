@@ -66,7 +66,7 @@ def _quantity(option: str, text: str | None, kind: Kind) -> float | None:
     return value
 
 
-def _check_out(out: Path, suffixes: Sequence[str], force: bool) -> None:
+def check_out(out: Path, suffixes: Sequence[str], force: bool) -> None:
     """Raise InputError if an output file has an unknown suffix or exists."""
     if out.suffix.lower() not in suffixes:
         raise InputError(Issue("unknown suffix of an output file", str(out), allowed=", ".join(suffixes)))
@@ -174,7 +174,7 @@ def read(
     """
     errors = Console(stderr=True)
     with _explained(errors):
-        _check_out(out, (".yaml", ".yml"), force)
+        check_out(out, (".yaml", ".yml"), force)
         wide, half = _quantity("--pupil", pupil, LENGTH), _quantity("--field", field, ANGLE)
         step, colour = _quantity("--pitch", pitch, LENGTH), _quantity("--wavelength", wavelength, LENGTH)
         lens = read_prescription(file, glasses or (), colour)
@@ -234,7 +234,7 @@ def new(
     errors = Console(stderr=True)
     with _explained(errors):
         if out is not None:
-            _check_out(out, (".yaml", ".yml"), force)
+            check_out(out, (".yaml", ".yml"), force)
         sizes = [_quantity("--aperture", aperture, LENGTH), _quantity("--wavelength", wavelength, LENGTH)]
         half, step = _quantity("--field", field, ANGLE), _quantity("--pitch", pitch, LENGTH)
         back = _quantity("--behind", behind, LENGTH)
@@ -283,7 +283,7 @@ def write(
     """
     errors = Console(stderr=True)
     with _explained(errors):
-        _check_out(out, WRITES, force)
+        check_out(out, WRITES, force)
         if mounted is not None and perturbed is None:
             raise InputError(Issue("--camera is for --perturbed", "", None, (), mounted))
         from optics.numerics.backend import load_backend

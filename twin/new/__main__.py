@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from rich.console import Console
 
+from scenes.lens.__main__ import check_out
 from scenes.lens.__main__ import new as new_camera
 from scenes.yaml.standard_output import to_stdout
 from twin.framework import cli
@@ -200,10 +201,7 @@ def _targets(kind: str, out: Path, force: bool) -> list[Path]:
 
     targets = [out, *([_job_of(out)] if kind == "study" else [])]
     for path in targets:
-        if path.suffix.lower() not in (".yaml", ".yml"):
-            raise InputError(Issue("unknown suffix of an output file", str(path), allowed=".yaml, .yml"))
-        if path.exists() and not force:
-            raise InputError(Issue("the file exists", str(path), allowed="another name, or --force to replace it"))
+        check_out(path, (".yaml", ".yml"), force)
         if not path.parent.is_dir():
             raise InputError(Issue("there is no such folder", str(path.parent)))
     return targets
@@ -220,18 +218,20 @@ def _write_new(kind: str, camera: str | None, out: Path | None, force: bool, giv
         if out is not None:
             _targets(kind, out, force)
         from twin.framework.durable import write_all_safely
-        from twin.new.template_text import checked_text, numbers_of
+        from twin.new.template_text import checked_text, numbers_of, reference_from
 
         if camera is None:
             camera = _ask(
                 "Camera or instrument: name in the library, or file", None, lambda name: numbers_of(name, Path())
             )
-        answers = _answers(kind, given, numbers_of(camera, Path()))
+        numbers = numbers_of(camera, Path())
+        answers = _answers(kind, given, numbers)
         if out is None and _is_terminal():
             asked = _ask(_FILE, "-", lambda name: name == "-" or _targets(kind, Path(name), force))
             out = None if asked == "-" else Path(asked)
         targets = [] if out is None else _targets(kind, out, force)
-        numbers = numbers_of(camera, Path() if out is None else out.parent)
+        if out is not None:
+            numbers = replace(numbers, reference=reference_from(camera, out.parent))
         job = Path("job.yaml") if out is None else _job_of(out)
         texts = [checked_text(kind, numbers, {**answers, "file": str(out or f"{kind}.yaml"), "base": job.name})]
         if kind == "study":

@@ -39,7 +39,7 @@ def numbers_of(reference: str, folder: Path) -> CameraNumbers:
     alone = len(instrument.cameras) == 1
     return CameraNumbers(
         camera,
-        _quoted(os.path.relpath(reference, folder)) if is_path(reference) else reference,
+        reference_from(reference, folder),
         instrument.name,
         mounted,
         "" if alone else f"{mounted}/",
@@ -47,6 +47,11 @@ def numbers_of(reference: str, folder: Path) -> CameraNumbers:
         sharpness(camera, backend).worst,
         bool(derive_camera(camera, backend).first_order.scale[0, 0, 0] < 0.0),
     )
+
+
+def reference_from(reference: str, folder: Path) -> str:
+    """Return a reference to an instrument as a file in a folder has it: a name, or a path relative to the folder."""
+    return _quoted(os.path.relpath(reference, folder)) if is_path(reference) else reference
 
 
 def checked_text(kind: str, numbers: CameraNumbers, values: Mapping[str, str]) -> str:
