@@ -115,11 +115,11 @@ def ghosts(
     >>> f"{1e3 * ghost.focus:.4f} mm, {ghost.energy:.2%}"
     '-8.0000 mm, 0.16%'
     """
-    given = {f"s{k}": share for k, share in (coatings or {}).items()}
+    coated = {f"s{k}": share for k, share in (coatings or {}).items()}
     names = camera._assembly.sequences["image"]
     position, direction = launch_rays(camera, field, PUPIL)
     indices = np.array([1.0, *camera.indices])
-    shares = {**given, names[-1]: detector}
+    shares = {**coated, names[-1]: detector}
     return trace_ghosts(
         default_backend(), camera._assembly, names, indices, position, direction[0], camera.wavelength, shares
     )
@@ -177,14 +177,15 @@ def trace_ghosts(
         return ()
     tracer = _Tracer(backend, assembly, tuple(names), indices, position, direction, reflectances)
     count = len(names)
-    image = tracer.beam([(k, 0, 1) for k in range(count)])
+    ahead = [(k, 0, 1) for k in range(count)]
+    image = tracer.beam(ahead)
     airy = 1.22 * wavelength / image.aperture
     spread = max(image.diameter, airy)
     last = [count - 1] if reflectances.get(names[-1]) else []
     out = []
     for forward, back in combinations([*bends, *last], 2):
-        ahead, inside = [(k, 0, 1) for k in range(count)], [(k, 1, 0) for k in range(forward + 1, back)]
-        beam = tracer.beam([*ahead[:back], (back, 0, 0), *inside[::-1], (forward, 1, 1), *ahead[forward + 1 :]])
+        inside = [(k, 1, 0) for k in range(back - 1, forward, -1)]
+        beam = tracer.beam([*ahead[:back], (back, 0, 0), *inside, (forward, 1, 1), *ahead[forward + 1 :]])
         energy = beam.light / image.light
         if energy > 0.0:
             irradiance = energy * (spread / max(beam.diameter, spread)) ** 2
@@ -218,22 +219,27 @@ class _Tracer:
     direction: np.ndarray
     reflectances: Mapping[str, float]
 
+    @property
+    def media(self) -> np.ndarray:
+        """Refractive indices before the first element, and after each element and the image, (K + 2,)."""
+        return np.append(self.indices, self.indices[-1])
+
     def beam(self, steps: Sequence[tuple[int, int, int]]) -> _Beam:
         """Trace the beam along a path to the image plane."""
-        elements, media = [self.assembly.elements[name] for name in self.names], [*self.indices, self.indices[-1]]
+        elements = [self.assembly.elements[name] for name in self.names]
         chain = []
-        for place, (k, before, after) in enumerate(steps):
+        for number, (k, before, after) in enumerate(steps):
             how = Interaction.REFLECT if before == after else elements[k].interaction
-            index = float(media[k + after])
+            index = float(self.media[k + after])
             chain.append(
-                replace(elements[k], name=str(place), interaction=how, aperture=None, solid=None, index_after=index)
+                replace(elements[k], name=str(number), interaction=how, aperture=None, solid=None, index_after=index)
             )
         path = Assembly(self.assembly.tree, {element.name: element for element in chain}, {})
         system = assemble(path, [tuple(path.elements)])
         rays = make_rays(self.backend, self.position, self.direction)
         traced = trace(self.backend, system, rays, keep=range(len(chain)))
         _, leaving, _, valid = (array[0] for array in traced.numpy())
-        hits = [traced.hit(place)[0] for place in range(len(chain))]
+        hits = [traced.hit(number)[0] for number in range(len(chain))]
         for (k, _, _), hit in zip(steps, hits, strict=True):
             valid = valid & elements[k].clear(hit[:, 0], hit[:, 1])
         light = valid * self._share(chain, steps, hits)
@@ -253,16 +259,15 @@ class _Tracer:
         self, chain: Sequence[Element], steps: Sequence[tuple[int, int, int]], hits: Sequence[np.ndarray]
     ) -> np.ndarray:
         """Return the share of each ray's light that takes the path at its refracting surfaces, (N,)."""
-        acting = [place for place, element in enumerate(chain) if element.interaction is not Interaction.PASS]
-        points = [self.assembly.nominal_pose(chain[p].body).apply(hits[p]) for p in (*acting, len(chain) - 1)]
+        acting = [n for n, element in enumerate(chain) if element.interaction is not Interaction.PASS]
+        points = [self.assembly.nominal_pose(chain[n].body).apply(hits[n]) for n in (*acting, len(chain) - 1)]
         gaps = np.diff(points, axis=0)
         along = [self.direction, *(gaps / np.maximum(np.linalg.norm(gaps, axis=-1, keepdims=True), _TOUCHING))]
-        media = [*self.indices, self.indices[-1]]
-        light = np.ones(len(points[0]))
-        for place, arriving, leaving in zip(acting, along, along[1:], strict=False):
-            k, before, after = steps[place]
+        media, light = self.media, np.ones(len(points[0]))
+        for n, arriving, leaving in zip(acting, along, along[1:], strict=False):
+            k, before, after = steps[n]
             reflects = before == after
-            if not reflects and chain[place].interaction is Interaction.REFLECT:  # a mirror
+            if not reflects and chain[n].interaction is Interaction.REFLECT:  # a mirror
                 continue
             # the vector form of Snell's law, and of reflection, has the normal
             normal = media[k + after] * leaving - media[k + before] * arriving

@@ -223,11 +223,12 @@ def camera_ghosts(model: CameraModel, backend: Backend, field: Field = (0.0, 0.0
 
     Coated faces and the detector have the reflectances of the camera's file.
     """
-    spec, bare = model.spec, model.bare_assembly()
-    coatings = {name: face.reflectance for name, face in spec.mirrors.items() if face.reflectance is not None}
-    detector = DETECTOR if spec.image.reflectance is None else spec.image.reflectance
+    spec = model.spec
     if all(face.light != "refracts" for face in spec.mirrors.values()):
         return ()
+    coatings = {name: face.reflectance for name, face in spec.mirrors.items() if face.reflectance is not None}
+    detector = DETECTOR if spec.image.reflectance is None else spec.image.reflectance
+    bare = model.bare_assembly()
     for name, edges in model.edges.items():
         bare = bare.with_element(replace(bare.elements[name], edges=edges))
     launch = ray_paths(model, backend, [field], PUPIL).points[0, 0]
