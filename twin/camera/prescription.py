@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
+
 import numpy as np
 
 from optics.camera.prescription import MIRROR, Camera, OpticalSurface
@@ -68,11 +70,10 @@ def optics_camera(model: CameraModel, wavelength: float) -> Camera:
 def _material(spec: CameraSpec, name: str, wavelength: float) -> str | float:
     """Return the glass behind a lens face by name where the catalogue has it, else its refractive index."""
     index, glass = spec.index_behind(name, wavelength), spec.mirrors[name].glass
-    try:
-        known = glass is not None and refractive_index(glass.name, wavelength, spec.medium or "vacuum") == index
-    except ValueError:
-        known = False
-    return glass.name if known and glass is not None else index
+    with suppress(ValueError):  # the catalogue does not have the glass, or not at this wavelength
+        if glass is not None and refractive_index(glass.name, wavelength, spec.medium or "vacuum") == index:
+            return glass.name
+    return index
 
 
 def _edges(model: CameraModel, name: str) -> tuple[float, float, tuple[tuple[float, float], ...], tuple[float, float]]:
@@ -106,5 +107,5 @@ def _edges(model: CameraModel, name: str) -> tuple[float, float, tuple[tuple[flo
         centres.append(shape.centre)
     if other or len(rims) > 1 or len(holes) > 1 or len(set(centres)) > 1:
         raise model.spec.error(f"optics.Camera cannot describe the edges of {name}", key, allowed=_EDGES)
-    hole, rim = next(iter(holes), 0.0), next(iter(rims), np.inf)
-    return float(rim), hole, tuple(vanes), next(iter(centres), (0.0, 0.0))
+    rim, hole, centre = (*rims, np.inf)[0], (*holes, 0.0)[0], (*centres, (0.0, 0.0))[0]
+    return float(rim), hole, tuple(vanes), centre
