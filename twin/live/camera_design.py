@@ -182,8 +182,8 @@ def changed_camera(spec: CameraSpec, values: Mapping[str, float]) -> CameraSpec:
     return CameraSpec.model_construct(**{**dict(spec), "mirrors": FrozenMap(mirrors), "image": image})
 
 
-def with_own_focal_length(spec: CameraSpec, backend: Backend) -> CameraSpec:
-    """Return the camera with the effective focal length of its surfaces as the stated one, in focus or not.
+def with_traced_focal_length(spec: CameraSpec, backend: Backend) -> CameraSpec:
+    """Return the camera whose file states the traced focal length of its surfaces, in focus or not.
 
     Raises
     ------
@@ -309,12 +309,12 @@ def point_image(optics: CameraOptics, field: Field, spot: Spot, places: np.ndarr
     if optics.model.edges:
         nodes = quadrature.even_disk(max(EVEN, 2 * nodes.count))
     rays = optics.rays([field], INSIDE * np.concatenate([[[0.0, 0.0]], np.stack([nodes.x, nodes.y], axis=-1)]))
-    number = 2.0 * np.pi / optics.wavelength
+    wave_number = 2.0 * np.pi / optics.wavelength
     share = nodes.weight * rays.valid[0, 1:]
-    turn = rays.direction[0, 1:, 1::-1] - rays.direction[0, 0, 1::-1]
+    tilt = rays.direction[0, 1:, 1::-1] - rays.direction[0, 0, 1::-1]
     wave, along, across = (
-        np.exp(1j * (number * phase).astype(np.float32))
-        for phase in (optics.path_error(rays)[0, 1:], *(np.outer(places, turn[:, k]) for k in (0, 1)))
+        np.exp(1j * (wave_number * path).astype(np.float32))
+        for path in (optics.path_error(rays)[0, 1:], *(np.outer(places, tilt[:, k]) for k in (0, 1)))
     )
     amplitude = (across * (wave * share)) @ along.T / np.sum(share)
     return np.asarray(np.abs(amplitude) ** 2, float)

@@ -28,7 +28,7 @@ from scenes.yaml.errors import InputError
 from twin.camera.camera_optics import CameraOptics
 from twin.camera.camera_results import Field
 from twin.framework.random_streams import stream
-from twin.live.camera_design import BLURRED, DESIGN, CameraDesign, changed_camera, optics_data, with_own_focal_length
+from twin.live.camera_design import BLURRED, DESIGN, CameraDesign, changed_camera, optics_data, with_traced_focal_length
 from twin.live.knobs import Knob, checked_knob, knobs_of, perturbation
 from twin.live.messages import LARGEST_SEED, MOST_FRAMES, AskedState, BlindState
 from twin.main_job.monitor_reading import stated
@@ -251,9 +251,9 @@ class LiveBench:
         try:
             return self.twin.with_cameras({reference: camera})
         except InputError as error:
-            if "stated focal length" not in str(error):
+            if error.issues[0].key != ("focal_length",):
                 raise
-        return self.twin.with_cameras({reference: with_own_focal_length(camera, self.twin.experiment.backend)})
+        return self.twin.with_cameras({reference: with_traced_focal_length(camera, self.twin.experiment.backend)})
 
     def field(self, asked: AskedState) -> Field | None:
         """Return the field point that the knobs set, as fractions of the half angles; None without such knobs."""
