@@ -277,11 +277,12 @@ def still_png(instrument: Instrument, paths: LightPaths, size: tuple[int, int] =
         corners.append(triangles[:, [0, 1, 2, 2]])
         colours.append(colour)
     share = np.linspace(0.0, 1.0, _PIECES + 1)[:, None, None, None]
+    half_width = 0.6 * view.pixel_at(whole[:, order])
     for beam, ray in zip(paths.beams, rays, strict=True):
         points = ray[:, :-1, order] + share * (ray[:, 1:, order] - ray[:, :-1, order])
         start, end = points[:-1].reshape(-1, 3), points[1:].reshape(-1, 3)
         wide = np.cross(end - start, view.forward)
-        wide *= 0.6 * view.pixel_at(whole[:, order]) / np.maximum(np.linalg.norm(wide, axis=-1, keepdims=True), 1e-300)
+        wide *= half_width / np.maximum(np.linalg.norm(wide, axis=-1, keepdims=True), 1e-300)
         corners.append(np.stack([start - wide, start + wide, end + wide, end - wide], axis=1))
         colours.append(np.tile(beam_colour(instrument, beam), (len(start), 1)))
     facets, colour = np.concatenate(corners), np.concatenate(colours)
