@@ -199,7 +199,8 @@ def read(
 @app.command()
 def new(
     kind: Annotated[
-        str, typer.Argument(help=f"{'; '.join(f'{name}: {one.title}' for name, one in TELESCOPES.items())}.")
+        str,
+        typer.Argument(help=f"{'; '.join(f'{name}: {telescope.title}' for name, telescope in TELESCOPES.items())}."),
     ],
     out: Annotated[
         Path | None, typer.Option(readable=False, help="The camera's file to write, .yaml. Default: standard output.")

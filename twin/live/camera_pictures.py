@@ -90,7 +90,10 @@ class CameraPictures:
             if view == "target":
                 self._target(figure, camera, both, frames, seed)
             else:
-                views = [CameraView.within(one.instrument, camera, one.backend, moved) for one, moved in both]
+                views = [
+                    CameraView.within(experiment.instrument, camera, experiment.backend, moved)
+                    for experiment, moved in both
+                ]
                 {"wavefront": _wavefront, "spot": _spot, "mtf": _mtf, "focus": _focus}[view](figure, views, field)
             return to_svg(figure)
 
@@ -165,7 +168,7 @@ def _with_targets(resolved: ResolvedJob) -> ResolvedJob:
 
 def _wavefront(figure: Figure, views: list[CameraView], field: Field) -> None:
     """Draw the wavefront of the nominal and of the perturbed camera."""
-    waves = [one.wavefront(field, points=65) for one in views]
+    waves = [view.wavefront(field, points=65) for view in views]
     most = max(float(np.nanmax(np.abs(wave.map))) for wave in waves)
     meshes = []
     for axes, wave, name in zip(figure.subplots(1, 2), waves, ("as designed", "now"), strict=True):
@@ -177,7 +180,7 @@ def _wavefront(figure: Figure, views: list[CameraView], field: Field) -> None:
 
 def _spot(figure: Figure, views: list[CameraView], field: Field) -> None:
     """Draw the spot diagram of the nominal and of the perturbed camera."""
-    spots = [one.spot(field) for one in views]
+    spots = [view.spot(field) for view in views]
     half = max(max(1.15 * spot.airy, 1.1 * spot.farthest) for spot in spots)
     for axes, spot, name in zip(figure.subplots(1, 2), spots, ("as designed", "now"), strict=True):
         draw_spot(axes, spot, half)
@@ -188,8 +191,8 @@ def _spot(figure: Figure, views: list[CameraView], field: Field) -> None:
 
 def _mtf(figure: Figure, views: list[CameraView], field: Field) -> None:
     """Draw the MTF of the nominal and of the perturbed camera."""
-    for axes, one, name in zip(figure.subplots(1, 2, sharey=True), views, ("as designed", "now"), strict=True):
-        mtf = one.mtf(field)
+    for axes, view, name in zip(figure.subplots(1, 2, sharey=True), views, ("as designed", "now"), strict=True):
+        mtf = view.mtf(field)
         draw_mtf(axes, mtf)
         along, across = mtf.at(mtf.nyquist)
         axes.set_title(f"optics {name}: {along:.3f} along, {across:.3f} across at Nyquist")
@@ -200,10 +203,10 @@ def _focus(figure: Figure, views: list[CameraView], field: Field) -> None:
     """Draw the MTF at the Nyquist frequency through focus, of the nominal and of the perturbed camera."""
     axes = figure.subplots()
     shift = np.linspace(-FOCUS, FOCUS, STEPS)
-    for one, name, style in zip(views, ("as designed", "now"), ((0, (3, 2)), "-"), strict=True):
-        pupil = one.pupils([field])[0]
-        colour = np.array([one.model.spec.wavelength])
-        frequency = one.nyquist * np.eye(2)
+    for view, name, style in zip(views, ("as designed", "now"), ((0, (3, 2)), "-"), strict=True):
+        pupil = view.pupils([field])[0]
+        colour = np.array([view.model.spec.wavelength])
+        frequency = view.nyquist * np.eye(2)
         values = np.abs(polychromatic_transfer(pupil, frequency, colour, np.ones(1), shift))
         for column, ink, way in ((0, BLUE, "along the line"), (1, VERMILION, "along the track")):
             axes.plot(1e6 * shift, values[:, column], color=ink, ls=style, label=f"{name}, {way}")

@@ -23,7 +23,9 @@ HEAD = "# Recorded with python -m twin.live; repeat it: python -m twin.render TH
 def _head() -> str:
     """Return the comment that states where a file was recorded."""
     made, by = Provenance.here(), versions()
-    kernels = ", ".join(dict.fromkeys(f"{one.name} {one.version} for {one.kernels}" for one in made.blas))
+    kernels = ", ".join(
+        dict.fromkeys(f"{library.name} {library.version} for {library.kernels}" for library in made.blas)
+    )
     return (
         f"{HEAD}# made by space-camera-twin {by['space-camera-twin']}, source {made.source}, Python {by['python']}, "
         f"numpy {by['numpy']}, Dr.Jit {by['drjit']}, on {made.processor}; {kernels}\n"

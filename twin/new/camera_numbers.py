@@ -97,25 +97,25 @@ class CameraNumbers:
     @cached_property
     def _powered(self) -> dict[str, MirrorSpec]:
         """Mirrors and lens faces; planes that light passes are left out."""
-        return {name: one for name, one in self.camera.mirrors.items() if one.light != "passes"}
+        return {name: face for name, face in self.camera.mirrors.items() if face.light != "passes"}
 
     @cached_property
     def faces(self) -> tuple[OpticalElement, ...]:
         """Mirrors and faces of lenses, each by itself."""
         powered = self._powered.items()
-        return tuple(OpticalElement(self.prefix + name, name, curved=isfinite(one.radius)) for name, one in powered)
+        return tuple(OpticalElement(self.prefix + name, name, curved=isfinite(face.radius)) for name, face in powered)
 
     @cached_property
     def elements(self) -> tuple[OpticalElement, ...]:
         """Mirrors and lenses; a lens is two faces that move as one body."""
         out: list[OpticalElement] = []
-        for face, one in zip(self.faces, self._powered.values(), strict=True):
-            if one.light == "refracts" and not one.enters_glass:
+        for face, spec in zip(self.faces, self._powered.values(), strict=True):
+            if spec.light == "refracts" and not spec.enters_glass:
                 alike = takewhile(lambda pair: pair[0] == pair[1], zip(out[-1].label, face.label, strict=False))
                 label = "".join(letter for letter, _ in alike).rstrip("_-")
                 out[-1] = replace(out[-1], others=(face.name,), label=label or out[-1].label)
             else:
-                out.append(replace(face, lens=one.enters_glass))
+                out.append(replace(face, lens=spec.enters_glass))
         return tuple(out)
 
     @property
@@ -216,10 +216,10 @@ class CameraNumbers:
         """Return the sum of the focus shifts of all despaces, radii and indices at their limits, metres."""
         shift, focus = parse_quantity(decentre, LENGTH), self._image({})
         radii = (self._image({}, {name: RADIUS}) for name in self._powered)
-        glasses = (name for name, one in self._powered.items() if one.enters_glass)
+        glasses = (name for name, face in self._powered.items() if face.enters_glass)
         indices = (self._image({}, {}, {name: INDEX}) for name in glasses)
         changed = sum(abs(image - focus) for image in (*radii, *indices))
-        return changed + sum(self._defocus(one, shift) for one in self.moved)
+        return changed + sum(self._defocus(element, shift) for element in self.moved)
 
     def seat(self, decentre: str) -> str:
         """Return the focus shift of all limits together, by which a focal plane may be off before it is adjusted."""
@@ -233,18 +233,19 @@ class CameraNumbers:
         return self._defocus(self._named(compensator), small) / small
 
     def _named(self, compensator: str) -> OpticalElement:
-        for one in self.elements:
-            if compensator in (one.label, one.name):
-                return one
-        allowed = ", ".join(["focal_plane", *(one.label for one in self.elements)])
+        """Return the element of a label or body; raise `InputError` if there is no such element."""
+        for element in self.elements:
+            if compensator in (element.label, element.name):
+                return element
+        allowed = ", ".join(["focal_plane", *(element.label for element in self.elements)])
         raise InputError(Issue("there is no such body", "", None, (), compensator, allowed))
 
     def compensator(self, name: str) -> str:
         """Return the motion of a compensator along the axis, with what it carries."""
         if name == "focal_plane":
             return f"{self.prefix}focal_plane shift z"
-        one = self._named(name)
-        return f"{one.name} shift z, {one.carry}".removesuffix(", ")
+        element = self._named(name)
+        return f"{element.name} shift z, {element.carry}".removesuffix(", ")
 
     def focus_range(self, compensator: str, decentre: str) -> str:
         """Return the range of a compensator: twice the focus shift of all limits together."""
@@ -291,7 +292,7 @@ class CameraNumbers:
     @property
     def front(self) -> float:
         """Distance from M1 to the foremost vertex or the image, metres."""
-        return -min(0.0, self.camera.image.z, *(one.z for one in self.camera.mirrors.values()))
+        return -min(0.0, self.camera.image.z, *(surface.z for surface in self.camera.mirrors.values()))
 
     def mm(self, pupils: float, plus: float = 0.0) -> str:
         """Return a length in units of the entrance pupil, plus a number of metres."""
@@ -309,19 +310,19 @@ class CameraNumbers:
         if self.name != self.mounted or self.monitored:
             problem = "a new monitor is for a camera, and this is an instrument"
             raise InputError(Issue(problem, self.reference, allowed=f"its camera {self.camera.name}"))
-        lens = next((name for name, one in self.camera.mirrors.items() if one.light == "refracts"), None)
+        lens = next((name for name, surface in self.camera.mirrors.items() if surface.light == "refracts"), None)
         stop = self.camera.mirrors[self.camera.stop].light == "passes"
         if lens or stop:
             problem = "a monitor needs a camera of mirrors, one of which is its stop"
             raise InputError(Issue(problem, self.reference, found=lens or f"stop: {self.camera.stop}"))
-        plain = all(one.light is None and one.edges is None for one in self.camera.mirrors.values())
+        plain = all(surface.light is None and surface.edges is None for surface in self.camera.mirrors.values())
         return plain and list(self.camera.mirrors) == [f"M{k + 1}" for k in range(len(self.camera.mirrors))]
 
     @property
     def bare_camera(self) -> str:
         """Camera that a monitor can have, as YAML: its mirrors alone, without edges, named M1, M2, ..."""
         new = {name: f"M{k + 1}" for k, name in enumerate(self._powered)}
-        mirrors = {new[name]: one.model_copy(update={"edges": None}) for name, one in self._powered.items()}
+        mirrors = {new[name]: face.model_copy(update={"edges": None}) for name, face in self._powered.items()}
         update = {"mirrors": FrozenMap(mirrors), "stop": new[self.camera.stop]}
         plain = self.camera.model_copy(update=update).plain()
         return dump_yaml({key: value for key, value in plain.items() if value not in ("", {})}).rstrip()

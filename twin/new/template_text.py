@@ -84,7 +84,7 @@ def checked_text(kind: str, numbers: CameraNumbers, values: Mapping[str, str]) -
         text = template.render(n=numbers, nested=kind == "operation", **values)
     except Problem as problem:  # an option that is no quantity
         raise InputError(Issue(problem.problem, found=problem.found, allowed=problem.allowed)) from None
-    model = next(one for one in file_kinds() if one.name == kind).model
+    model = next(file_kind for file_kind in file_kinds() if file_kind.name == kind).model
     validate(model, parse_yaml(text))
     return text
 
