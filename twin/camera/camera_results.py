@@ -219,6 +219,11 @@ class Spot:
     airy: float
     position: tuple[float, float]
 
+    @property
+    def half_width(self) -> float:
+        """Half width of a picture about the centroid that contains all rays and the Airy disk, metres."""
+        return max(1.15 * self.airy, 1.1 * self.farthest)
+
     def to_xarray(self) -> xr.Dataset:
         """Return a data set of the rays' positions on the line CCD relative to the chief ray, metres."""
         import xarray as xr

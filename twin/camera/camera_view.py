@@ -73,7 +73,7 @@ def draw_spot(axes: Axes, spot: Spot, half: float | None = None) -> None:
         Half the width of the box, metres; by default it contains all rays and the Airy disk.
     """
     rays = 1e6 * (spot.rays - spot.centroid)
-    reach = 1e6 * (max(1.15 * spot.airy, 1.1 * spot.farthest) if half is None else half)
+    reach = 1e6 * (spot.half_width if half is None else half)
     axes.plot(rays[:, 0], rays[:, 1], ".", ms=2.2, color=BLUE, mew=0.0)
     axes.add_patch(Circle((0.0, 0.0), 1e6 * spot.airy, fill=False, lw=0.8, color=INK))
     axes.axhline(0.0, lw=0.4, color=LIGHT, zorder=0)

@@ -237,7 +237,7 @@ def optics_data(optics: CameraOptics, field: Field) -> tuple[dict[str, Any], dic
         "spot": {
             "rms_um": 1e6 * spot.rms,
             "airy_um": 1e6 * spot.airy,
-            "half_um": 1e6 * max(1.15 * spot.airy, 1.1 * spot.farthest),
+            "half_um": 1e6 * spot.half_width,
             "rays_um": _rounded(1e6 * (spot.rays - spot.centroid), 4),
         },
         "layout": {

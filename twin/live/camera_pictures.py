@@ -181,7 +181,7 @@ def _wavefront(figure: Figure, views: list[CameraView], field: Field) -> None:
 def _spot(figure: Figure, views: list[CameraView], field: Field) -> None:
     """Draw the spot diagram of the nominal and of the perturbed camera."""
     spots = [view.spot(field) for view in views]
-    half = max(max(1.15 * spot.airy, 1.1 * spot.farthest) for spot in spots)
+    half = max(spot.half_width for spot in spots)
     for axes, spot, name in zip(figure.subplots(1, 2), spots, ("as designed", "now"), strict=True):
         draw_spot(axes, spot, half)
         axes.set_title(f"{name}: rms radius {1e6 * spot.rms:.3g} {UM}")
