@@ -11,7 +11,7 @@ from scenes.models.camera_sharpness import BLURRED, FIELDS
 from twin.camera.camera_results import Field
 from twin.camera.camera_run import GRID, SHARP, CameraRun
 from twin.camera.camera_view import LINE, TRACK, draw_mtf, draw_spot, draw_wavefront
-from twin.framework.artefact import plain
+from twin.framework.artefact import plain, rounded_down
 from twin.framework.svg import (
     BLUE,
     GREEN,
@@ -383,7 +383,7 @@ def distortion_figure(run: CameraRun) -> Figure:
     left, right = figure.subplots(1, 2, gridspec_kw={"width_ratios": [1.35, 1.0]})
     away = d.places - d.ideal
     spacing = 0.5 * float(np.min(np.ptp(d.ideal, axis=(0, 1)) / (np.array(d.fields.shape[:2]) - 1)))
-    factor = _round_factor(spacing / max(d.largest, 1e-12))
+    factor = rounded_down(spacing / max(d.largest, 1e-12))
     for places, colour, width in ((d.ideal, GREY, 0.6), (d.ideal + factor * away, BLUE, 1.0)):
         for line in (*places, *np.swapaxes(places, 0, 1)):
             left.plot(1e3 * line[:, 0], 1e3 * line[:, 1], color=colour, lw=width)
@@ -410,12 +410,6 @@ def _lines(axes: Axes, run: CameraRun) -> None:
     axes.set_ylabel(f"distortion, {MICRO}")
     axes.legend(fontsize=7.5)
     plain_axes(axes)
-
-
-def _round_factor(value: float) -> float:
-    """Return the largest 1, 2 or 5 times a power of ten that does not exceed a value, to magnify distortion by it."""
-    size = 10.0 ** np.floor(np.log10(value))
-    return float(size * max(step for step in (1.0, 2.0, 5.0) if step * size <= value * (1.0 + 1e-9)))
 
 
 def refocus_figure(run: CameraRun) -> Figure:

@@ -138,6 +138,12 @@ def significant(value: float, digits: int = 3, floor: float = SAME, sign: bool =
     return _with_minus(text)
 
 
+def rounded_down(value: float) -> float:
+    """Return the largest 1, 2 or 5 times a power of ten that does not exceed a positive number."""
+    power = 10.0 ** math.floor(math.log10(value))
+    return power * max(k for k in (1.0, 2.0, 5.0) if k * power <= value * (1.0 + 1e-9))
+
+
 def plain(value: float, digits: int = 5) -> str:
     """Format an input number without trailing zeros.
 

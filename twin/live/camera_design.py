@@ -26,6 +26,7 @@ from scenes.yaml.errors import InputError, Issue
 from twin.camera.camera_optics import INSIDE, CameraOptics
 from twin.camera.camera_results import Field, Spot
 from twin.camera.layout_plot import BEFORE, begun, section_lines, section_rays
+from twin.framework.artefact import rounded_down
 from twin.live.knobs import Knob
 from twin.monitor.image_quality import MOST_BLUR
 
@@ -118,7 +119,8 @@ class CameraDesign:
                     continue
                 knob = f"{DESIGN}/{surface} {key}"
                 change = np.sqrt(np.nanmean((_wavefront(changed_camera(spec, {knob: step}), backend) - nominal) ** 2))
-                extent = _round_down(min(RANGE_WAVES * step / max(float(change), 1e-12), widest))
+                half_range = min(RANGE_WAVES * step / max(float(change), 1e-12), widest)
+                extent = float(f"{rounded_down(half_range):.12g}") if math.isfinite(half_range) else 1.0
                 knobs[knob] = Knob(knob, f"{DESIGN}/{surface}", DESIGN, key, unit, 0.0, extent, limit)
         return cls(name, reference, spec, FrozenMap(knobs))
 
@@ -139,14 +141,6 @@ def _wavefront(spec: CameraSpec, backend: Backend) -> np.ndarray:
         return CameraOptics.alone(spec, backend).wavefronts([(0.0, 0.0)], 33, 4, by_rays=True)[0].map
     except (InputError, PhysicalError, ValueError):
         return np.array(np.nan)
-
-
-def _round_down(value: float) -> float:
-    """Return the next smaller number of the series 1, 2, 5, 10."""
-    if not math.isfinite(value):
-        return 1.0
-    power = 10.0 ** math.floor(math.log10(value))
-    return float(f"{max(m for m in (1.0, 2.0, 5.0) if m * power <= value * (1.0 + 1e-9)) * power:.12g}")
 
 
 def changed_camera(spec: CameraSpec, values: Mapping[str, float]) -> CameraSpec:

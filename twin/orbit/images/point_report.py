@@ -13,7 +13,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patheffects import Normal, Stroke
 
 from scenes.specs.orbit.scene import ImagePointsSpec
-from twin.framework.artefact import Artefact, Cell, Data, PngFigure, Table
+from twin.framework.artefact import Artefact, Cell, Data, PngFigure, Table, rounded_down
 from twin.framework.data_files import csv_table
 from twin.framework.report import Section
 from twin.framework.svg import SKY, VERMILION, YELLOW, look, new_figure, to_png
@@ -212,7 +212,7 @@ def _panel(axes: Axes, name: str, image: LineFrame, points: MatchedPoints) -> No
     rest = to - at - middle
     good, against = line.accepted, line.status == CONSENSUS
     longest = float(np.quantile(np.linalg.norm(rest[good], axis=1), 0.95))
-    enlarged = _round(0.06 * min(rows, columns) / max(longest, 1e-3))
+    enlarged = rounded_down(0.06 * min(rows, columns) / max(longest, 1e-3))
     arrow: dict[str, Any] = {"angles": "xy", "scale_units": "xy", "scale": 1.0 / enlarged, "width": 0.004}
     effects = [Stroke(linewidth=1.2, foreground="black"), Normal()]
     axes.quiver(to[good, 1], to[good, 0], rest[good, 1], rest[good, 0], color=YELLOW, path_effects=effects, **arrow)
@@ -226,9 +226,3 @@ def _panel(axes: Axes, name: str, image: LineFrame, points: MatchedPoints) -> No
         ylim=ends[2:],
     )
     pixel_axes(axes)
-
-
-def _round(value: float) -> float:
-    """Round a value down to 1, 2 or 5 times a power of ten."""
-    power = 10.0 ** np.floor(np.log10(value))
-    return float(power * max(k for k in (1.0, 2.0, 5.0) if k * power <= value * (1.0 + 1e-9)))
