@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
-
-import numpy as np
 
 KORSCH = ((-2.5 / 6, -0.9375 / 6), (-2.5 / 18, 2.39583333333333 / 6), (-1.25 / 6, -1.375 / 6))
 """Radius and distance to the next vertex, in focal lengths, of three mirrors: flat Petzval surface, F/2.5 at F/12."""
 OFF_AXIS = ((-2.14706, -0.416667), (-0.706952, 0.416667), (-1.050288, -0.945003))
 """As KORSCH: stop at the secondary, flat field, exit pupil far away; the first and the third vertex coincide."""
-OFF_AXIS_BIAS = np.radians(55.2)
+OFF_AXIS_BIAS = math.radians(55.2)
 """Field angle of the off-axis layout times its F-number, radians: beams and mirrors pass beside each other."""
 
 
@@ -47,8 +46,8 @@ TELESCOPES = {
     "cassegrain": TelescopeType("Classical Cassegrain telescope", (-1.0, None)),
     "dall-kirkham": TelescopeType("Dall-Kirkham telescope", (None, 0.0)),
     "ritchey-chretien": TelescopeType("Ritchey-Chretien telescope", (None, None)),
-    "korsch": TelescopeType("Three-mirror anastigmat after Korsch", (None, None, None), KORSCH, np.radians(6.0)),
-    "off-axis": TelescopeType("Off-axis three-mirror anastigmat", (None,) * 3, OFF_AXIS, float(OFF_AXIS_BIAS), 1),
+    "korsch": TelescopeType("Three-mirror anastigmat after Korsch", (None, None, None), KORSCH, math.radians(6.0)),
+    "off-axis": TelescopeType("Off-axis three-mirror anastigmat", (None,) * 3, OFF_AXIS, OFF_AXIS_BIAS, 1),
     "triplet": TelescopeType("Cooke triplet of lenses", (), stop=3, lenses=True),
 }
 """Kinds of telescopes by name."""
