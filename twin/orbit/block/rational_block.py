@@ -18,6 +18,7 @@ from analysis.arrays import Array
 from analysis.block import block as model
 from analysis.block.block_adjustment import BlockAdjustment, intersected
 from analysis.block.error_processes import BlockError
+from analysis.orbit.image_correction import coefficient_rows
 from analysis.orbit.rational_polynomial import RationalPolynomial
 from optics.numerics.number_tree import FrozenMap
 from scenes.specs.orbit.rational import RationalAdjustSpec, RationalImageSpec
@@ -258,7 +259,6 @@ def _corrected(scene: model.ModelScene, value: Array, covariance: Array) -> Rati
     except ValueError as error:
         raise BlockError(f"block: {scene.name}: {error}") from error
     position, to_ground = level_slopes(image)
-    basis = scene.basis(position)
-    rows = np.concatenate([np.kron(np.eye(2)[k], basis[:, None, :]) for k in (0, 1)], axis=1)
+    rows = coefficient_rows(scene.basis(position))
     spread = to_ground @ rows @ covariance @ np.swapaxes(rows, 1, 2) @ np.swapaxes(to_ground, 1, 2)
     return replace(fitted, bias_m=axis_sigma(spread), random_m=image.polynomial.random_m)
