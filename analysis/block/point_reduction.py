@@ -209,14 +209,9 @@ class ModelImage:
         position, slope = self.scene.model.seen(ground)
         basis, white = self.scene.basis(position), self.white[which]
         coefficients = (self.unit * x[self.change]).reshape(2, -1)
-        growth = np.zeros((2, 2))
-        for k, term in enumerate(self.scene.sigma):
-            if term != "shift":
-                axis = ("drift", "affine").index(term)
-                growth[:, axis] = coefficients[:, k] / self.scene.model.size[axis]
         miss = position + basis @ coefficients.T - self.scene.rays.image[which]
         by_x = coefficient_rows(basis) * self.unit
-        by_ground = (np.eye(2) + growth) @ slope
+        by_ground = (np.eye(2) + self.scene.growth(coefficients)) @ slope
         return np.einsum("nij,nj->ni", white, miss), white @ by_x, white @ by_ground
 
     def taken(self, which: Indices, point: Indices) -> ModelImage:
