@@ -216,16 +216,16 @@ def adjusted_images(adjustment: BlockAdjustment) -> FrozenMap[str, AdjustedImage
     without = intersected(block)
     images = {}
     for scene in block.model_scenes:
-        value, covariance = adjustment.change(scene.name)
-        shape = (2, len(scene.sigma))
+        change, covariance = adjustment.change(scene.name)
+        value, sigma = (row.reshape(2, -1) for row in (change, np.sqrt(np.diag(covariance))))
         images[scene.name] = AdjustedImage(
             tuple(scene.sigma),
-            value.reshape(shape),
-            np.sqrt(np.diag(covariance)).reshape(shape),
+            value,
+            sigma,
             np.array(list(scene.sigma.values())).T,
             len(scene.rays.point),
-            *_residuals(adjustment, scene, value.reshape(shape), without),
-            _corrected(scene, value.reshape(shape), covariance),
+            *_residuals(adjustment, scene, value, without),
+            _corrected(scene, value, covariance),
         )
     return FrozenMap(images)
 
@@ -235,10 +235,7 @@ def _residuals(
 ) -> tuple[Array, Array]:
     """Return rms residuals (2,) of an image's accepted points, without corrections and after the adjustment."""
     where = adjustment.assembly.images.get(scene.name)
-    if where is None:
-        return np.full(2, np.nan), np.full(2, np.nan)
-    use = adjustment.weight[where] > 0.0
-    rays = scene.rays.taken(use)
+    rays = scene.rays if where is None else scene.rays.taken(adjustment.weight[where] > 0.0)
     if not len(rays.point):
         return np.full(2, np.nan), np.full(2, np.nan)
     before = scene.model.seen(without[rays.point])[0] - rays.image
