@@ -24,7 +24,7 @@ from twin.framework.report import Report, Section, answer
 from twin.orbit.block.rational_block import read_image
 from twin.orbit.export.rational_polynomial import PolynomialImage
 from twin.orbit.flight.earth import Earth
-from twin.orbit.images.image_points import CONSENSUS, SOURCE, MatchedLine, MatchedPoints
+from twin.orbit.images.image_points import CONSENSUS, MatchedLine, MatchedPoints
 from twin.orbit.images.simulate_run import MATCHED, POINTS
 from twin.orbit.matching.pixels import read_pixels
 from twin.orbit.measured.measurement_tables import csv_text
@@ -138,11 +138,7 @@ def _points_of(
         raise BenchError(problem, ("points",), "a larger image, or a smaller reach or template")
     place = distinct_points(frame.values, spec.tie, spacing=max(0.5 * spec.template, 1.0), border=border)
     count = len(place)
-    none = np.zeros(count)
-    chosen = MatchedLine(
-        place, place, np.zeros((count, 2, 2)), none + 1.0, np.full(count, SOURCE), (0, 0), 0.0, f"{count} points chosen"
-    )
-    lines, levels = {source: chosen}, np.full((len(frames), count), np.nan)
+    lines, levels = {source: MatchedLine.chosen(place)}, np.full((len(frames), count), np.nan)
     for k, (name, other) in enumerate(frames.items()):
         if name != source and count:
             lines[name], levels[k] = _searched(frame, other, place, heights, spec)
@@ -150,6 +146,7 @@ def _points_of(
     height = np.full(count, 0.5 * sum(heights))
     height[known] = np.nanmean(levels[:, known], axis=0)
     ground = frame.image.ground(place, height)
+    none = np.zeros(count)
     return MatchedPoints("tie", none, none, height, ground, none.astype(bool), FrozenMap(lines))
 
 
