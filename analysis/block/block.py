@@ -155,6 +155,17 @@ class ModelScene:
         columns = {"shift": np.ones(len(position)), "drift": scaled[:, 0], "affine": scaled[:, 1]}
         return np.stack([columns[term] for term in self.sigma], axis=1)
 
+    def growth(self, coefficients: Array) -> Array:
+        """Return the derivatives (2, 2) of the correction (2,) of line and sample with respect to line and sample.
+
+        Parameters
+        ----------
+        coefficients : (2, K) ndarray
+            Coefficients of the K terms for line and sample, in pixels.
+        """
+        directions = {"shift": (0.0, 0.0), "drift": (1.0, 0.0), "affine": (0.0, 1.0)}
+        return np.asarray(coefficients @ np.array([directions[term] for term in self.sigma]) / self.model.size)
+
 
 @dataclass(frozen=True, eq=False)
 class CameraPrior:

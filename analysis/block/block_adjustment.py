@@ -257,14 +257,15 @@ class BlockAdjustment:
             variance[numbers] += np.einsum("nv,vw,nw->n", slope, known, slope) - 2.0 * slope @ of_mean[columns]
         return np.maximum(variance, 0.0)
 
-    def change(self, scene: str) -> tuple[Array, Array]:
-        """Return the change of a scene's camera and its covariance (4, 4), in radians and metres.
+    def change(self, *scenes: str) -> tuple[Array, Array]:
+        """Return the changes of the cameras of scenes, one after the other, and their joint covariance.
 
-        The change is d_alpha, d_beta, d_gamma (rotations about the camera's Y, X and Z axes) and d_f (principal
-        distance). For a scene that is a function of the ground it is the correction of the image: its coefficients for
-        the line, then for the sample, in pixels.
+        The change in a scene is d_alpha, d_beta, d_gamma (rotations about the camera's Y, X and Z axes) and d_f
+        (principal distance), in radians and metres. For a scene that is a function of the ground it is the correction
+        of the image: its coefficients for the line, then for the sample, in pixels.
         """
-        columns, unit = self.assembly.changes[scene], self.assembly.units[scene]
+        columns = np.concatenate([self.assembly.changes[scene] for scene in scenes])
+        unit = np.concatenate([self.assembly.units[scene] for scene in scenes])
         return unit * self.x[columns], unit[:, None] * self.covariance[np.ix_(columns, columns)] * unit
 
     def datum(self) -> tuple[Array, Array] | None:

@@ -32,6 +32,7 @@ from analysis.arrays import Array, Indices
 from analysis.block.block import ModelScene
 from analysis.block.error_processes import Corrections, cross, rotated, rotated_back, rotation_vector_derivatives
 from analysis.block.reweighting import standardised_packets
+from analysis.orbit.image_correction import coefficient_rows
 from analysis.orbit.three_line_model import LineModel, Rays
 
 
@@ -208,17 +209,9 @@ class ModelImage:
         position, slope = self.scene.model.seen(ground)
         basis, white = self.scene.basis(position), self.white[which]
         coefficients = (self.unit * x[self.change]).reshape(2, -1)
-        growth = np.zeros((2, 2))
-        for k, term in enumerate(self.scene.sigma):
-            if term != "shift":
-                axis = ("drift", "affine").index(term)
-                growth[:, axis] = coefficients[:, k] / self.scene.model.size[axis]
         miss = position + basis @ coefficients.T - self.scene.rays.image[which]
-        by_x = np.zeros((len(which), 2, len(self.change)))
-        count = basis.shape[1]
-        by_x[:, 0, :count] = basis * self.unit[:count]
-        by_x[:, 1, count:] = basis * self.unit[count:]
-        by_ground = (np.eye(2) + growth) @ slope
+        by_x = coefficient_rows(basis) * self.unit
+        by_ground = (np.eye(2) + self.scene.growth(coefficients)) @ slope
         return np.einsum("nij,nj->ni", white, miss), white @ by_x, white @ by_ground
 
     def taken(self, which: Indices, point: Indices) -> ModelImage:

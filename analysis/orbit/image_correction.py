@@ -72,7 +72,7 @@ class ImageCorrection:
 
     def covariance_at(self, line: ArrayLike, sample: ArrayLike) -> Array:
         """Return the covariance of the correction at N predicted positions, (N, 2, 2), in pixels^2."""
-        rows = _rows(self._basis(line, sample))
+        rows = coefficient_rows(self._basis(line, sample))
         return np.asarray(rows @ self.covariance @ np.swapaxes(rows, 1, 2))
 
     @property
@@ -100,7 +100,7 @@ def _basis(kind: Kind, middle: Array, size: Array, position: Array) -> Array:
     return constant if kind == "shift" else np.concatenate([constant, (position - middle) / size], axis=1)
 
 
-def _rows(basis: Array) -> Array:
+def coefficient_rows(basis: Array) -> Array:
     """Return the derivatives of line and sample at N points with respect to the 2 K coefficients, (N, 2, 2 K)."""
     nothing = np.zeros_like(basis)
     return np.stack([np.concatenate([basis, nothing], 1), np.concatenate([nothing, basis], 1)], axis=1)
@@ -143,7 +143,7 @@ def image_correction(
         raise ValueError("a covariance is not positive definite")
     middle = np.mean(position, axis=0)
     size = np.maximum(np.max(np.abs(position - middle), axis=0), 1.0)
-    rows = _rows(_basis(kind, middle, size, position))
+    rows = coefficient_rows(_basis(kind, middle, size, position))
     difference = image - position
     used = np.ones(count, dtype=bool)
     while True:

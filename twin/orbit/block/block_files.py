@@ -77,10 +77,9 @@ def corrections(run: BlockRun) -> dict[str, Any]:
     The position of a ground point in an image is p + c(p), with p the position by the polynomials before the
     adjustment; for line and for sample, c = shift + drift (line - middle) / size + affine (sample - middle) / size.
     """
-    adjustment, images, columns = run.adjustment, {}, []
+    adjustment, images = run.adjustment, {}
     for scene in adjustment.assembly.block.model_scenes:
         value, covariance = adjustment.change(scene.name)
-        columns.append(adjustment.assembly.changes[scene.name])
         images[scene.name] = {
             "middle_px": scene.model.middle.tolist(),
             "size_px": scene.model.size.tolist(),
@@ -88,16 +87,14 @@ def corrections(run: BlockRun) -> dict[str, Any]:
             "value_px": value.tolist(),
             "covariance_px2": covariance.tolist(),
         }
-    order = np.concatenate(columns)
-    unit = np.concatenate([adjustment.assembly.units[name] for name in images])
-    joint = unit[:, None] * adjustment.covariance[np.ix_(order, order)] * unit
+    _, joint = adjustment.change(*images)
     return {
         "meaning": "position = p + shift + drift (line - middle) / size + affine (sample - middle) / size, for line and"
         " for sample, with p, line and sample by the polynomials before the adjustment; the centre of the first pixel"
         " is 0, 0",
         "images": images,
         "joint_unknowns": [f"{name} {unknown}" for name, image in images.items() for unknown in image["unknowns"]],
-        "joint_covariance_px2": joint.tolist() if len(order) <= _MOST_JOINT else None,
+        "joint_covariance_px2": joint.tolist() if len(joint) <= _MOST_JOINT else None,
     }
 
 

@@ -12,6 +12,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
+from analysis.block.block import CORRECTIONS
 from analysis.block.block_adjustment import BlockAdjustment
 from analysis.orbit.forward_intersection import level_axes
 from scenes.specs.orbit.setup import RationalAdjustSetup
@@ -120,7 +121,7 @@ def _summary(run: BlockRun) -> Table:
         "Contribution of each sensor",
         caption,
         {name: CONTRIBUTION(contribution) for name, contribution in run.contributions.items()},
-        [quantity.key for quantity in record if not quantity.key.startswith(omitted or "-")],
+        [quantity.key for quantity in record if not quantity.key.startswith(omitted)],
         label="sensors",
     )
 
@@ -172,12 +173,12 @@ def _sections(run: BlockRun) -> tuple[Section, ...]:
 def _images(run: BlockRun) -> Table:
     """Return the table of the corrections of images with rational polynomials."""
     shown = {name: IMAGE(image) for name, image in run.images.items()}
-    terms = dict.fromkeys(term for image in run.images.values() for term in image.terms)
-    absent = tuple(term for term in ("shift", "drift", "affine") if term not in terms)
+    terms = {term for image in run.images.values() for term in image.terms}
+    absent = tuple(term for term in CORRECTIONS if term not in terms)
     keys = [
         q.key
         for q in IMAGE
-        if not q.key.endswith(("_before", "random_m", "fit_error_px")) and not q.key.startswith(absent or "-")
+        if not q.key.endswith(("_before", "random_m", "fit_error_px")) and not q.key.startswith(absent)
     ]
     caption = (
         "Corrections of line and sample, in pixels, with rms residuals before and after. ERR_BIAS: error of the"

@@ -18,6 +18,7 @@ from analysis.arrays import Array
 from analysis.block import block as model
 from analysis.block.block_adjustment import BlockAdjustment, intersected
 from analysis.block.error_processes import BlockError
+from analysis.orbit.image_correction import coefficient_rows
 from analysis.orbit.rational_polynomial import RationalPolynomial
 from optics.numerics.number_tree import FrozenMap
 from scenes.specs.orbit.rational import RationalAdjustSpec, RationalImageSpec
@@ -215,16 +216,16 @@ def adjusted_images(adjustment: BlockAdjustment) -> FrozenMap[str, AdjustedImage
     without = intersected(block)
     images = {}
     for scene in block.model_scenes:
-        value, covariance = adjustment.change(scene.name)
-        shape = (2, len(scene.sigma))
+        change, covariance = adjustment.change(scene.name)
+        value, sigma = (row.reshape(2, -1) for row in (change, np.sqrt(np.diag(covariance))))
         images[scene.name] = AdjustedImage(
             tuple(scene.sigma),
-            value.reshape(shape),
-            np.sqrt(np.diag(covariance)).reshape(shape),
+            value,
+            sigma,
             np.array(list(scene.sigma.values())).T,
             len(scene.rays.point),
-            *_residuals(adjustment, scene, value.reshape(shape), without),
-            _corrected(scene, value.reshape(shape), covariance),
+            *_residuals(adjustment, scene, value, without),
+            _corrected(scene, value, covariance),
         )
     return FrozenMap(images)
 
@@ -234,10 +235,7 @@ def _residuals(
 ) -> tuple[Array, Array]:
     """Return rms residuals (2,) of an image's accepted points, without corrections and after the adjustment."""
     where = adjustment.assembly.images.get(scene.name)
-    if where is None:
-        return np.full(2, np.nan), np.full(2, np.nan)
-    use = adjustment.weight[where] > 0.0
-    rays = scene.rays.taken(use)
+    rays = scene.rays if where is None else scene.rays.taken(adjustment.weight[where] > 0.0)
     if not len(rays.point):
         return np.full(2, np.nan), np.full(2, np.nan)
     before = scene.model.seen(without[rays.point])[0] - rays.image
@@ -258,7 +256,6 @@ def _corrected(scene: model.ModelScene, value: Array, covariance: Array) -> Rati
     except ValueError as error:
         raise BlockError(f"block: {scene.name}: {error}") from error
     position, to_ground = level_slopes(image)
-    basis = scene.basis(position)
-    rows = np.concatenate([np.kron(np.eye(2)[k], basis[:, None, :]) for k in (0, 1)], axis=1)
+    rows = coefficient_rows(scene.basis(position))
     spread = to_ground @ rows @ covariance @ np.swapaxes(rows, 1, 2) @ np.swapaxes(to_ground, 1, 2)
     return replace(fitted, bias_m=axis_sigma(spread), random_m=image.polynomial.random_m)

@@ -5,9 +5,9 @@ reads. Coordinates are scaled to -1 .. 1 over the ground that the fit covers; be
 Image coordinates count from the centre of the first pixel, heights are above the ellipsoid (WGS84).
 
 Files that are read: RPC00B as text beside an image (NAME_RPC.TXT, NAME.RPB) or inside a GeoTIFF, and the RPC files of
-DIMAP 2 and 3, of which
-the model from the ground to the image is used. DIMAP 2 counts lines and samples from 1, which becomes 0 here; DIMAP 3
-counts them from 0, as a scene of Pléiades Neo shows, whose RPC file has the first pixel at 0.0005, -0.0006.
+DIMAP 2 and 3, of which the model from the ground to the image is used. DIMAP 2 counts lines and samples from 1, which
+becomes 0 here; DIMAP 3 counts them from 0, as a scene of Pléiades Neo shows, whose RPC file has the first pixel at
+0.0005, -0.0006.
 
 Control points determine a correction in the image, with its covariance and residuals, and polynomials of the same form
 that include it.
@@ -210,12 +210,12 @@ def _from_text(path: Path) -> RationalPolynomial:
 def _from_rpb(path: Path) -> RationalPolynomial:
     """Read a file NAME.RPB of DigitalGlobe: `key = value;`, with lists of coefficients in parentheses."""
     file, content = str(path), "\n".join(text_lines(path, _WHAT))
-    found = {name: (text, content.count("\n", 0, at) + 1) for name, text, at in _rpb_rows(content)}
+    rows = {row[1]: (row[2], content.count("\n", 0, row.start()) + 1) for row in _RPB_ROW.finditer(content)}
 
     def values(name: str, count: int) -> list[float]:
-        if name not in found:
-            raise InputError(Issue(f"no {name}", file, None, (name,), None, _WHAT, nearest(name, found)))
-        text, line = found[name]
+        if name not in rows:
+            raise InputError(Issue(f"no {name}", file, None, (name,), None, _WHAT, nearest(name, rows)))
+        text, line = rows[name]
         words = text.strip("() \n\t").replace(",", " ").split()
         if len(words) != count:
             raise InputError(Issue("another number of values", file, line, (name,), f"{len(words)}", f"{count}"))
@@ -223,13 +223,8 @@ def _from_rpb(path: Path) -> RationalPolynomial:
 
     offset, scale = ([values(f"{axis}{what}", 1)[0] for axis in _RPB_AXES] for what in ("Offset", "Scale"))
     names = ("lineNumCoef", "lineDenCoef", "sampNumCoef", "sampDenCoef")
-    errors = [values(name, 1)[0] if name in found else None for name in ("errBias", "errRand")]
+    errors = [values(name, 1)[0] if name in rows else None for name in ("errBias", "errRand")]
     return _polynomial_of(file, offset, scale, [np.array(values(name, TERMS)) for name in names], errors)
-
-
-def _rpb_rows(content: str) -> list[tuple[str, str, int]]:
-    """Return key, value and position of each assignment of a file NAME.RPB."""
-    return [(row.group(1), row.group(2), row.start()) for row in _RPB_ROW.finditer(content)]
 
 
 def _from_dimap(root: Element) -> RationalPolynomial:
@@ -274,7 +269,7 @@ def _from_tiff(path: Path) -> RationalPolynomial:
 _CORRECTED_GRID = (21, 21, 7)
 """Number of lines, samples and heights of the grid to which corrected polynomials are fitted."""
 _RATIONAL_GRID = (11, 11, 5)
-"""The same for a correction that is an affine function, with which the polynomials keep their form."""
+"""Number of lines, samples and heights of the grid for an affine correction, with which polynomials keep their form."""
 _GROUND_GRID = 5
 """Number of lines and of samples at which errors on the ground are computed."""
 _UNLIKELY = 0.05
@@ -327,14 +322,18 @@ def image_slope(polynomial: RationalPolynomial, latitude: Array, longitude: Arra
     They are computed at N positions; latitudes and longitudes are in radians, heights in metres.
     """
     by_geodetic = polynomial.linearised(np.degrees(latitude), np.degrees(longitude), height)[1]
-    return by_geodetic[..., [1, 0, 2]] * _degrees_per_metre(latitude, height)[..., None, :]
+    return _level_slope(by_geodetic, latitude, height)
 
 
-def _degrees_per_metre(latitude: Array, height: Array) -> Array:
-    """Return the changes of longitude and latitude (degrees) and of height for a metre east, north and up, (..., 3)."""
+def _level_slope(by_geodetic: Array, latitude: Array, height: Array) -> Array:
+    """Return derivatives (..., 2, 3) by metres east, north and up from those by latitude, longitude and height.
+
+    The latter are per degree and metre; latitudes are in radians, heights in metres.
+    """
     meridian, normal = curvature_radii(latitude)
     east, north = np.degrees(1.0 / ((normal + height) * np.cos(latitude))), np.degrees(1.0 / (meridian + height))
-    return np.stack([east, north, np.ones_like(east)], axis=-1)
+    degrees_per_metre = np.stack([east, north, np.ones_like(east)], axis=-1)
+    return np.asarray(by_geodetic[..., [1, 0, 2]] * degrees_per_metre[..., None, :])
 
 
 @dataclass(frozen=True, eq=False)
@@ -357,8 +356,7 @@ class PolynomialImage:
         """Return line and sample (n, 2) of n ground points (n, 3), ITRS, in metres, and derivatives (n, 2, 3)."""
         longitude, latitude, height = Earth().geodetic(ground)
         position, slope = self.polynomial.linearised(np.degrees(latitude), np.degrees(longitude), height)
-        level = slope[..., [1, 0, 2]] * _degrees_per_metre(latitude, height)[..., None, :]
-        return position, level @ east_north_up(longitude, latitude)
+        return position, _level_slope(slope, latitude, height) @ east_north_up(longitude, latitude)
 
     @classmethod
     def of(cls, polynomial: RationalPolynomial, shape: tuple[int, int] | None = None) -> PolynomialImage:

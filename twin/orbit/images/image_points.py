@@ -311,6 +311,17 @@ class MatchedLine:
     text: str
     displacement_field: DisplacementField | None = None
 
+    @classmethod
+    def chosen(cls, position: np.ndarray, first: tuple[int, int] = (0, 0)) -> MatchedLine:
+        """Return n points at the positions (n, 2) in the frame in which they were chosen, which are exact.
+
+        The frame's first pixel is at `first`, line and pixel in the whole image.
+        """
+        count = len(position)
+        covariance, correlation = np.zeros((count, 2, 2)), np.ones(count)
+        status = np.full(count, SOURCE)
+        return cls(position, position, covariance, correlation, status, first, 0.0, f"{count} points chosen")
+
     @property
     def accepted(self) -> np.ndarray:
         """Mask (n,) of the n points that are matched and consistent with neighbours, or chosen in this frame."""
@@ -504,19 +515,7 @@ def tie_points(
     if not len(position):
         raise PointsError(f"{source}: no distinct point is seen by every line {border} pixels from the frames' borders")
     east, north, height = patch.frame.local(ground)
-    none = np.zeros(len(position))
-    lines = {
-        source: MatchedLine(
-            position,
-            position,
-            np.zeros((len(position), 2, 2)),
-            none + 1.0,
-            np.full(len(position), SOURCE),
-            (image.window.first_line, image.window.first_pixel),
-            0.0,
-            f"{len(position)} points chosen",
-        )
-    }
+    lines = {source: MatchedLine.chosen(position, (image.window.first_line, image.window.first_pixel))}
     for name, other in patch.images.items():
         if name == source:
             continue
@@ -528,7 +527,7 @@ def tie_points(
             at = at + control.lines[name].displacement(at, height)
         lines[name] = _matched(name, other, patterns, at, rise, height, spec)
     ordered = {name: lines[name] for name in patch.images}
-    return MatchedPoints("tie", east, north, height, ground, none.astype(bool), FrozenMap(ordered))
+    return MatchedPoints("tie", east, north, height, ground, np.zeros(len(position), bool), FrozenMap(ordered))
 
 
 def _require_room(patch: ImagedGround, spec: ImagePointsSpec) -> None:

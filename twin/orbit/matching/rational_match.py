@@ -10,12 +10,13 @@ Along the line the ground is free within the range of heights.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from analysis.matching.correlation import MatchOptions, Reason, distinct_points, search
-from analysis.matching.matches import DisplacementField, consensus, match_windows
+from analysis.matching.matches import DisplacementField, Matches, consensus, match_windows
 from analysis.matching.spline import resampled
 from optics.numerics.number_tree import FrozenMap
 from twin.framework.procedure import Advance, BenchError, silent
@@ -24,7 +25,7 @@ from twin.framework.report import Report, Section, answer
 from twin.orbit.block.rational_block import read_image
 from twin.orbit.export.rational_polynomial import PolynomialImage
 from twin.orbit.flight.earth import Earth
-from twin.orbit.images.image_points import CONSENSUS, SOURCE, MatchedLine, MatchedPoints
+from twin.orbit.images.image_points import CONSENSUS, MatchedLine, MatchedPoints
 from twin.orbit.images.simulate_run import MATCHED, POINTS
 from twin.orbit.matching.pixels import read_pixels
 from twin.orbit.measured.measurement_tables import csv_text
@@ -33,17 +34,17 @@ if TYPE_CHECKING:
     from scenes.specs.orbit.rational import RationalPointsSpec
     from scenes.specs.orbit.setup import RationalMatchSetup
 
-_TURNS = 3
-"""Number of rounds in which the height of a match is brought to the middle of its epipolar line; one suffices for lines
-that are straight over the search radius."""
+_ITERATIONS = 3
+"""Number of iterations in which the height of a match is brought to the middle of its epipolar line; one suffices for
+lines that are straight over the search radius."""
 _APART = 3.0
 """Distance, in pixels along the epipolar line, from which two peaks of the search count as different."""
 _LEAST_RISE = 1e-6
 """Parallax, in pixels per metre of height, below which two images see the ground from one direction."""
 _NO_FIELD = DisplacementField(np.zeros((1, 2)), np.zeros(2), 1.0, 0, None)
 """Displacement of images with too few matches."""
-_LEAST = 6
-"""Smallest number of matches of two images: twice the terms of a linear displacement."""
+_LEAST = 12
+"""Smallest number of matches of two images: four times the three terms of a linear displacement."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,7 +78,7 @@ class RationalMatch:
     setup: RationalMatchSetup
     points: FrozenMap[str, MatchedPoints]
 
-    @property
+    @cached_property
     def table(self) -> dict[str, list[Any]]:
         """Columns of the table of image points: all points that two images or more see."""
         heads = ("point", "image", "line", "sample", "line_sigma", "sample_sigma", "correlation")
@@ -138,11 +139,7 @@ def _points_of(
         raise BenchError(problem, ("points",), "a larger image, or a smaller reach or template")
     place = distinct_points(frame.values, spec.tie, spacing=max(0.5 * spec.template, 1.0), border=border)
     count = len(place)
-    none = np.zeros(count)
-    chosen = MatchedLine(
-        place, place, np.zeros((count, 2, 2)), none + 1.0, np.full(count, SOURCE), (0, 0), 0.0, f"{count} points chosen"
-    )
-    lines, levels = {source: chosen}, np.full((len(frames), count), np.nan)
+    lines, levels = {source: MatchedLine.chosen(place)}, np.full((len(frames), count), np.nan)
     for k, (name, other) in enumerate(frames.items()):
         if name != source and count:
             lines[name], levels[k] = _searched(frame, other, place, heights, spec)
@@ -150,6 +147,7 @@ def _points_of(
     height = np.full(count, 0.5 * sum(heights))
     height[known] = np.nanmean(levels[:, known], axis=0)
     ground = frame.image.ground(place, height)
+    none = np.zeros(count)
     return MatchedPoints("tie", none, none, height, ground, none.astype(bool), FrozenMap(lines))
 
 
@@ -166,7 +164,7 @@ def _searched(
     levels = np.linspace(*heights, steps) if steps > 1 else middle[:1]
     positions, values = np.full((len(levels), len(place), 2), np.nan), np.full((len(levels), len(place)), -1.0)
     for k, level in enumerate(levels.tolist()):
-        expected, _ = _seen(frame, other, place, np.full(len(place), level))
+        expected, _ = other.image.seen(frame.image.ground(place, level))
         peaks = search(other.values, templates, expected, spec.reach)
         found = peaks.reason == Reason.ACCEPTED
         positions[k], values[k] = peaks.position, np.where(found, peaks.value, -1.0)
@@ -177,22 +175,21 @@ def _searched(
     apart = np.linalg.norm(positions - peak, axis=2) > _APART
     rival = np.max(np.where(apart, values, -1.0), axis=0)
     height = levels[best]
-    for _ in range(_TURNS):
+    for _ in range(_ITERATIONS):
         at, rise = _seen(frame, other, place, height)
         square = np.sum(rise**2, axis=1)
         along = np.sum((peak - at) * rise, axis=1) / np.maximum(square, _LEAST_RISE**2)
         height = np.clip(height + np.where(square > _LEAST_RISE**2, along, 0.0), heights[0], heights[1])
-    height = np.where(value > 0.0, height, middle)
+    lost = ~(value > 0.0)
+    height = np.where(lost, middle, height)
     templates = _templates(frame, other, place, height, spec.template)
-    start = np.where(value[:, None] > 0.0, peak, np.nan)
-    templates[~np.isfinite(start[:, 0])] = np.nan
-    match = match_windows(other.values, templates, np.nan_to_num(start), search_radius=2, options=options)
+    templates[lost] = np.nan
+    start = np.where(lost[:, None], 0.0, peak)
+    match = match_windows(other.values, templates, start, search_radius=2, options=options)
     status = match.reason.astype(np.int64)
-    status[~np.isfinite(start[:, 0])] = Reason.OUTSIDE
+    status[lost] = Reason.OUTSIDE
     status[(status == 0) & (rival > options.largest_ratio * value)] = Reason.AMBIGUOUS
-    return _agreed(
-        frame, other, place, height, heights, match.position, match.covariance, match.correlation, status, spec
-    )
+    return _agreed(frame, other, place, height, heights, match, status, spec)
 
 
 def _agreed(
@@ -201,9 +198,7 @@ def _agreed(
     place: np.ndarray,
     height: np.ndarray,
     heights: tuple[float, float],
-    position: np.ndarray,
-    covariance: np.ndarray,
-    correlation: np.ndarray,
+    match: Matches,
     status: np.ndarray,
     spec: RationalPointsSpec,
 ) -> tuple[MatchedLine, np.ndarray]:
@@ -212,11 +207,11 @@ def _agreed(
     at, rise = _seen(frame, other, place, height)
     unit = rise / np.maximum(np.linalg.norm(rise, axis=1, keepdims=True), _LEAST_RISE)
     across = np.stack([-unit[:, 1], unit[:, 0]], axis=1)
-    miss = np.where(good[:, None], position - at, np.nan)
+    miss = np.where(good[:, None], match.position - at, np.nan)
     sideways = np.sum(miss * across, axis=1)
-    variance = np.einsum("ni,nij,nj->n", across, covariance, across) + spec.roughness**2
+    variance = np.einsum("ni,nij,nj->n", across, match.covariance, across) + spec.roughness**2
     field, scatter, text = _NO_FIELD, 0.0, f"{int(good.sum())} matches are too few for a consensus"
-    if good.sum() >= 2 * _LEAST:
+    if good.sum() >= _LEAST:
         agreed = consensus(
             at,
             at + sideways[:, None] * across,
@@ -232,8 +227,8 @@ def _agreed(
     level = np.where(status == 0, height + along, np.nan)
     outside = (level < heights[0]) | (level > heights[1])
     status[outside] = Reason.OUTSIDE
-    matched = MatchedLine(at, position, covariance, correlation, status, (0, 0), scatter, text, field)
-    return matched, np.where(outside, np.nan, level)
+    line = MatchedLine(at, match.position, match.covariance, match.correlation, status, (0, 0), scatter, text, field)
+    return line, np.where(outside, np.nan, level)
 
 
 def _seen(frame: Frame, other: Frame, place: np.ndarray, height: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
