@@ -151,12 +151,31 @@ class WindowSeries:
             Positions minus fitted motion, px.
         """
         basis = np.kron(np.asarray(design, np.float64), np.eye(2))
-        # only what the motion leaves counts: the mean position has no part in it
-        left = linalg.null_space(basis.T)
-        expected = left.T @ (self.covariance if cause is None else self.parts[cause]) @ left
-        contrast = left.T @ self.position.ravel()
-        chi = float(contrast @ np.linalg.solve(expected, contrast))
-        return chi, left.shape[1], (left @ contrast).reshape(-1, 2)
+        covariance = self.covariance if cause is None else self.parts[cause]
+        # the mean position has no part in it: a motion contains a constant
+        chi, degrees, residual = chi_square_about(basis, self.position.ravel(), covariance)
+        return chi, degrees, residual.reshape(-1, 2)
+
+
+def chi_square_about(design: ArrayLike, values: Array, covariance: Array) -> tuple[float, int, Array]:
+    """Return chi-square, degrees of freedom and residuals (n,) of values about a linear model with P free unknowns.
+
+    The unknowns are eliminated by a projection onto the null space of the design; the covariance must be regular only
+    there. The residuals are those of equal weights.
+
+    Parameters
+    ----------
+    design : (n, P) array_like
+        Derivatives of the values with respect to the unknowns.
+    values : (n,) ndarray
+        Measured values.
+    covariance : (n, n) ndarray
+        Their covariance.
+    """
+    left = linalg.null_space(np.asarray(design).T)
+    contrast = left.T @ values
+    chi = float(contrast @ np.linalg.solve(left.T @ covariance @ left, contrast))
+    return chi, left.shape[1], left @ contrast
 
 
 @dataclass(frozen=True, eq=False)
