@@ -641,7 +641,7 @@ class SeriesFilter:
         """
         if current.pending is not None:
             share = probability_good(current.pending.log_odds)
-            bad, good = (self.mixture(body) for body in (replace(current, pending=None), current.pending.ingested))
+            bad, good = (self.mixture(state) for state in (replace(current, pending=None), current.pending.ingested))
             apart = good.mean - bad.mean
             covariance = (1.0 - share) * bad.covariance + share * good.covariance
             covariance = covariance + share * (1.0 - share) * np.outer(apart, apart)

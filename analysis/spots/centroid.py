@@ -152,9 +152,8 @@ def gaussian_fit(
     noise : NoiseModel
         Noise of the detector.
     radius_px : float or None
-        Radius of the window in pixels; default an eighth of the image's smaller side, at least
-        2. About the radius of the first
-        dark ring is best.
+        Radius of the window in pixels; default an eighth of the image's smaller side, at least 2. About the radius of
+        the first dark ring is best.
     elliptical : bool
         Fit a, b and c instead of a alone.
     """

@@ -44,6 +44,7 @@ MOST_PIXELS = 4000
 _SETTLED = 0.01
 """Largest move in the last round, in standard deviations of the best position."""
 _MOST_ROUNDS = 60
+"""Largest number of rounds of the iteration over positions and shape."""
 _DAMPING = 0.7
 """Fraction of a step that is taken: positions and shape answer each other, and full steps overshoot."""
 _RELEARN = (3, 6)
@@ -51,7 +52,9 @@ _RELEARN = (3, 6)
 _LEARNT_FRAMES = 6
 """Number of frames, evenly spaced, from which the priors are learnt: time grows with its cube."""
 _STEP = 1e-4
+"""Relative step of the numerical derivatives of the likelihood by the lengths of the prior."""
 _MOST_STEPS = 40
+"""Largest number of iterations in which the likelihood of the priors is maximised."""
 CAUSES = ("temporal noise", "shape", "response pattern", "dark pattern")
 """Causes of the covariance, keys of `WindowSeries.parts`."""
 
@@ -88,6 +91,7 @@ class SeriesPrior:
 
 
 _LIMITS = SeriesPrior(1e-4, 0.3, 0.7, 1e-4, 1e-2, 1e-4, 1e-2), SeriesPrior(10.0, 10.0, 20.0, 0.2, 1e3, 1e4, 1e4)
+"""Smallest and largest value of each number of a learnt prior."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,7 +107,7 @@ class WindowSeries:
     covariance : (2 N, 2 N) ndarray
         Joint covariance, in the order row, column of frame 0, row, column of frame 1, ..., px^2.
     parts : mapping of str to (2 N, 2 N) ndarray
-        The same by cause: temporal noise, shape, response pattern, dark pattern.
+        Joint covariance by cause: temporal noise, shape, response pattern, dark pattern.
     flux, background : (N,) ndarray
         Light of the spot and level below it, DN.
     residual : (N, H, W) ndarray
@@ -151,35 +155,54 @@ class WindowSeries:
             Positions minus fitted motion, px.
         """
         basis = np.kron(np.asarray(design, np.float64), np.eye(2))
-        # only what the motion leaves counts: the mean position has no part in it
-        left = linalg.null_space(basis.T)
-        expected = left.T @ (self.covariance if cause is None else self.parts[cause]) @ left
-        contrast = left.T @ self.position.ravel()
-        chi = float(contrast @ np.linalg.solve(expected, contrast))
-        return chi, left.shape[1], (left @ contrast).reshape(-1, 2)
+        covariance = self.covariance if cause is None else self.parts[cause]
+        # the mean position has no part in it: a motion contains a constant
+        chi, degrees, residual = chi_square_about(basis, self.position.ravel(), covariance)
+        return chi, degrees, residual.reshape(-1, 2)
+
+
+def chi_square_about(design: ArrayLike, values: Array, covariance: Array) -> tuple[float, int, Array]:
+    """Return chi-square, degrees of freedom and residuals (n,) of values about a linear model with P free unknowns.
+
+    The unknowns are eliminated by a projection onto the null space of the design; the covariance must be regular only
+    there. The residuals are those of equal weights.
+
+    Parameters
+    ----------
+    design : (n, P) array_like
+        Derivatives of the values with respect to the unknowns.
+    values : (n,) ndarray
+        Measured values.
+    covariance : (n, n) ndarray
+        Their covariance.
+    """
+    null = linalg.null_space(np.asarray(design).T)
+    contrast = null.T @ values
+    chi = float(contrast @ np.linalg.solve(null.T @ covariance @ null, contrast))
+    return chi, null.shape[1], null @ contrast
 
 
 @dataclass(frozen=True, eq=False)
 class _Pixels:
-    """Used pixels of all frames in one list.
+    """Used pixels of all frames in one list, with the black level ``offset``.
 
-    They are the values, the model's levels, the frames, the places on the detector, the mask of equal places, and the
-    black level.
+    ``value`` and ``level`` (P,) are measured and modelled grey values, ``frame`` (P,) is the index of the frame,
+    ``coordinates`` (P, 2) are row and column on the detector, and ``same`` (P, P) is 1 for the same detector pixel.
     """
 
     value: Array
     level: Array
     frame: NDArray[np.intp]
-    place: Array
+    coordinates: Array
     same: Array
     offset: float
 
     @classmethod
     def of(cls, images: Array, used: NDArray[np.bool_], corners: NDArray[np.intp], offset: float) -> _Pixels:
         frame, row, column = np.nonzero(used)
-        place = np.stack([row, column], axis=1) + corners[frame]
-        same = np.all(place[:, None] == place[None], axis=2).astype(np.float64)
-        return cls(images[used], images[used], frame, place.astype(np.float64), same, offset)
+        coordinates = np.stack([row, column], axis=1) + corners[frame]
+        same = np.all(coordinates[:, None] == coordinates[None], axis=2).astype(np.float64)
+        return cls(images[used], images[used], frame, coordinates.astype(np.float64), same, offset)
 
 
 @dataclass(frozen=True, eq=False)
@@ -192,7 +215,7 @@ class _State:
     width: float
 
     def away(self, pixels: _Pixels) -> Array:
-        return pixels.place - self.position[pixels.frame]
+        return pixels.coordinates - self.position[pixels.frame]
 
     def gaussian(self, pixels: _Pixels) -> tuple[Array, Array]:
         """Return the Gaussian averaged over each pixel (P,) and its derivatives by the position of the spot (P, 2)."""
@@ -283,8 +306,8 @@ def fit_window_series(
     >>> import numpy as np
     >>> import analysis
     >>> from scipy.special import erf
-    >>> rng, place, series = np.random.default_rng(1), np.arange(8)[:, None] - np.arange(10) * 0.04 - 3.4, []
-    >>> share = 0.5 * (erf((place + 0.5) / 0.6 / 2**0.5) - erf((place - 0.5) / 0.6 / 2**0.5)).T
+    >>> rng, row = np.random.default_rng(1), np.arange(8)[:, None] - np.arange(10) * 0.04 - 3.4
+    >>> share = 0.5 * (erf((row + 0.5) / 0.6 / 2**0.5) - erf((row - 0.5) / 0.6 / 2**0.5)).T
     >>> images = rng.poisson(50.0 + 1e5 * share[:, :, None] * share[:, None, :])
     >>> fit = analysis.fit_window_series(images, analysis.NoiseModel())
     >>> drift = np.polyfit(np.arange(10), fit.position, 1)[0]
@@ -295,22 +318,23 @@ def fit_window_series(
     starts = _starts(pixels, state, noise)
     learnt = prior if prior is not None else starts[0]
     g, slopes = np.zeros(len(pixels.value)), np.zeros((2, len(pixels.value)))
-    for turn in range(_MOST_ROUNDS):
-        design, rest = _linearised(state, pixels, g, slopes)
-        if prior is None and turn in _RELEARN:
-            part, some, use = _some_frames(state, pixels)
-            learnt = _learn(part, some, *_linearised(part, some, g[use], slopes[:, use]), starts, noise is None)
+    for iteration in range(_MOST_ROUNDS):
+        design, residuals = _linearised(state, pixels, g, slopes)
+        if prior is None and iteration in _RELEARN:
+            few, few_pixels, use = _learning_frames(state, pixels)
+            linearised = _linearised(few, few_pixels, g[use], slopes[:, use])
+            learnt = _learn(few, few_pixels, *linearised, starts, noise is None)
             starts = (learnt,)
         terms = _terms(state, pixels, learnt)
         solver = _Solver(np.sum(list(terms.values()), axis=0), design)
-        step = solver.estimator @ rest
-        left = solver.projector @ rest
-        g, slopes = _shape_of(state, pixels, learnt, left)
+        step = solver.estimator @ residuals
+        weighted_residuals = solver.projector @ residuals
+        g, slopes = _shape_of(state, pixels, learnt, weighted_residuals)
         state, moved = _moved(state, _contrasts(len(state.flux)) @ step)
         sigma = np.sqrt(np.diagonal(solver.covariance)[: 2 * len(state.flux) - 2].min())
-        if moved < _SETTLED * sigma and (prior is not None or turn > max(_RELEARN)):
-            return _result(np.asarray(images, np.float64), pixels, state, learnt, terms, solver, left)
-        pixels = replace(pixels, level=pixels.value - np.diagonal(terms[CAUSES[0]]) * left)
+        if moved < _SETTLED * sigma and (prior is not None or iteration > max(_RELEARN)):
+            return _result(np.asarray(images, np.float64), pixels, state, learnt, terms, solver, weighted_residuals)
+        pixels = replace(pixels, level=pixels.value - np.diagonal(terms[CAUSES[0]]) * weighted_residuals)
     raise SpotError(
         {0: "positions and shape do not converge; is there one spot in all windows, away from their edges?"}
     )
@@ -365,7 +389,7 @@ def _start(
         raise SpotError({0: "no spot: nothing exceeds five standard deviations of the noise in every frame"})
     rows, columns = np.arange(height), np.arange(width)
     position = np.stack([light.sum(axis=2) @ rows, light.sum(axis=1) @ columns], axis=1) / flux[:, None] + corner
-    away = pixels.place - position[pixels.frame]
+    away = pixels.coordinates - position[pixels.frame]
     weight = light[mask]
     extent = float(np.sqrt(np.sum(weight * np.sum(away**2, axis=1)) / (2.0 * np.sum(weight))))
     first = _gaussian_start(pixels, _State(position, flux, background, max(extent, 0.3)))
@@ -388,8 +412,8 @@ def _gaussian_start(pixels: _Pixels, state: _State) -> _State:
 
     start = np.array([0.0, 0.0, np.log(state.width)])
     bounds = start - np.array([1.5, 1.5, 2.0]), start + np.array([1.5, 1.5, 1.0])
-    found = optimize.least_squares(lambda common: tried(common)[1], start, bounds=bounds)
-    best = tried(found.x)[0]
+    fit = optimize.least_squares(lambda common: tried(common)[1], start, bounds=bounds)
+    best = tried(fit.x)[0]
     if np.any(best.flux <= 0.0):
         raise SpotError({0: "no spot: a frame has no light above its background"})
     return best
@@ -412,10 +436,10 @@ def _noise_of_differences(pixels: _Pixels) -> tuple[float, float]:
     """
     level, square = [], []
     for frame in range(1, int(pixels.frame.max())):
-        near = [dict(zip(map(tuple, pixels.place[at]), pixels.value[at], strict=True))
+        near = [dict(zip(map(tuple, pixels.coordinates[at]), pixels.value[at], strict=True))
                 for at in (pixels.frame == frame + k for k in (-1, 0, 1))]  # fmt: skip
-        for place in near[0].keys() & near[1].keys() & near[2].keys():
-            a, b, c = (one[place] for one in near)
+        for pixel in near[0].keys() & near[1].keys() & near[2].keys():
+            a, b, c = (values[pixel] for values in near)
             level.append((a + b + c) / 3.0)
             square.append((a - 2.0 * b + c) ** 2 / 6.0)
     x, y = np.maximum(np.array(level) - pixels.offset, 0.0), np.array(square)
@@ -465,21 +489,26 @@ def _moved(state: _State, step: Array) -> tuple[_State, float]:
     return _State(state.position + short * shift, flux, background, state.width), moved
 
 
-def _some_frames(state: _State, pixels: _Pixels) -> tuple[_State, _Pixels, NDArray[np.bool_]]:
-    """Return a state and the pixels of some frames, and which of all pixels these are."""
+def _learning_frames(state: _State, pixels: _Pixels) -> tuple[_State, _Pixels, NDArray[np.bool_]]:
+    """Return state and pixels of the frames from which the priors are learnt, and a mask of these among all pixels."""
     count = len(state.flux)
     chosen = np.unique(np.linspace(0, count - 1, min(count, _LEARNT_FRAMES)).round().astype(np.intp))
     use = np.isin(pixels.frame, chosen)
     frame, same = np.searchsorted(chosen, pixels.frame[use]), pixels.same[np.ix_(use, use)]
     part = replace(
-        pixels, value=pixels.value[use], level=pixels.level[use], frame=frame, place=pixels.place[use], same=same
+        pixels,
+        value=pixels.value[use],
+        level=pixels.level[use],
+        frame=frame,
+        coordinates=pixels.coordinates[use],
+        same=same,
     )
     few = _State(state.position[chosen], state.flux[chosen], state.background[chosen], state.width)
     return few, part, use
 
 
 def _learn(
-    state: _State, pixels: _Pixels, design: Array, rest: Array, starts: Sequence[SeriesPrior], noisy: bool
+    state: _State, pixels: _Pixels, design: Array, residuals: Array, starts: Sequence[SeriesPrior], noisy: bool
 ) -> SeriesPrior:
     """Return the prior that maximises the restricted likelihood of the pixels about a state."""
 
@@ -490,16 +519,22 @@ def _learn(
         now = priors(logs)
         terms = _terms(state, pixels, now)
         solver = _Solver(np.sum(list(terms.values()), axis=0), design)
-        left = solver.projector @ rest
-        value = solver.log_determinant + float(np.linalg.slogdet(solver.information)[1]) + float(rest @ left)
+        weighted_residuals = solver.projector @ residuals
+        value = (
+            solver.log_determinant
+            + float(np.linalg.slogdet(solver.information)[1])
+            + float(residuals @ weighted_residuals)
+        )
         changes = [2.0 * terms["shape"]]
         for name in ("length", "extent"):
             other = replace(now, **{name: getattr(now, name) * (1.0 + _STEP)})
             changes.append((_terms(state, pixels, other)["shape"] - terms["shape"]) / _STEP)
         changes += [2.0 * terms[cause] for cause in ("response pattern", "dark pattern")]
-        read = 2.0 * now.read_dn**2 * np.eye(len(rest))
+        read = 2.0 * now.read_dn**2 * np.eye(len(residuals))
         changes += [terms["temporal noise"] - 0.5 * read, read]
-        gradient = [np.sum(solver.projector * change) - left @ change @ left for change in changes]
+        gradient = [
+            np.sum(solver.projector * change) - weighted_residuals @ change @ weighted_residuals for change in changes
+        ]
         return 0.5 * value, 0.5 * np.array(gradient)
 
     low, high = (np.log(list(vars(limit).values())) for limit in _LIMITS)
@@ -507,10 +542,8 @@ def _learn(
     for start in starts:
         at = np.clip(np.log(list(vars(start).values())), low, high)
         ends = bounds if noisy else [*bounds[:5], *((v, v) for v in at[5:])]
-        found = optimize.minimize(
-            target, at, jac=True, method="L-BFGS-B", bounds=ends, options={"maxiter": _MOST_STEPS}
-        )
-        best = found if best is None or found.fun < best.fun else best
+        fit = optimize.minimize(target, at, jac=True, method="L-BFGS-B", bounds=ends, options={"maxiter": _MOST_STEPS})
+        best = fit if best is None or fit.fun < best.fun else best
     assert best is not None
     return priors(best.x)
 
@@ -522,20 +555,20 @@ def _result(
     prior: SeriesPrior,
     terms: dict[str, Array],
     solver: _Solver,
-    left: Array,
+    weighted_residuals: Array,
 ) -> WindowSeries:
     count = len(state.flux)
     influence = (_contrasts(count) @ solver.estimator)[: 2 * count]
     parts = {cause: influence @ term @ influence.T for cause, term in terms.items()}
     residual = np.full(images.shape, np.nan)
     noise = np.diagonal(terms["temporal noise"])
-    inside = tuple(pixels.place.astype(np.intp).T)
-    corner = np.array([pixels.place[pixels.frame == k].min(axis=0) for k in range(count)]).astype(np.intp)
+    inside = tuple(pixels.coordinates.astype(np.intp).T)
+    corner = np.array([pixels.coordinates[pixels.frame == k].min(axis=0) for k in range(count)]).astype(np.intp)
     residual[pixels.frame, inside[0] - corner[pixels.frame, 0], inside[1] - corner[pixels.frame, 1]] = (
-        np.sqrt(noise) * left
+        np.sqrt(noise) * weighted_residuals
     )
     # E[r' P D P r] = trace(P D): what the pattern and the shape take from the noise does not count
-    chi = float(np.sum(noise * left**2) / np.sum(noise * np.diagonal(solver.projector)))
+    chi = float(np.sum(noise * weighted_residuals**2) / np.sum(noise * np.diagonal(solver.projector)))
     return WindowSeries(
         state.position, sum(parts.values()), FrozenMap(parts), state.flux, state.background, residual, chi, prior,
         state.width,

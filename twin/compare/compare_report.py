@@ -26,14 +26,18 @@ MOST_BARS = 30
 _MOST_IMAGES = 8
 """Largest number of differing images that the report shows."""
 
-_HEADLINES: tuple[tuple[str, str, Callable[[list[float]], float], str], ...] = (
-    ("optics.json", r"wfe_worst_waves", max, "worst wavefront error [waves]"),
-    ("optics.json", r"mtf_at_nyquist\[.*\]\.along_\w+", min, "lowest MTF of the optics at Nyquist"),
-    ("optics.json", r"first_order\.focal_length_m", max, "focal length [m]"),
-    ("quality.json", r"cameras\.[^.]+\.wfe_worst_waves", max, "worst wavefront error [waves]"),
-    ("quality.json", r"cameras\.[^.]+\.mtf_along_\w+\..*", min, "lowest MTF with the pixel at Nyquist"),
-)
-"""Results with which a verdict begins: file, pattern of their keys, which of several is meant, and name."""
+_HEADLINES: Mapping[str, tuple[tuple[str, Callable[[list[float]], float], str], ...]] = {
+    "optics.json": (
+        (r"wfe_worst_waves", max, "worst wavefront error [waves]"),
+        (r"mtf_at_nyquist\[.*\]\.along_\w+", min, "lowest MTF of the optics at Nyquist"),
+        (r"first_order\.focal_length_m", max, "focal length [m]"),
+    ),
+    "quality.json": (
+        (r"cameras\.[^.]+\.wfe_worst_waves", max, "worst wavefront error [waves]"),
+        (r"cameras\.[^.]+\.mtf_along_\w+\..*", min, "lowest MTF with the pixel at Nyquist"),
+    ),
+}
+"""File -> results with which a verdict begins: pattern of their keys, which of several is meant, and name."""
 
 
 def compare_report(comparison: Comparison) -> Report:
@@ -442,21 +446,24 @@ def _plain(entry: NumberDifference | ArrayDifference, without: str, *derived: st
 def _headline(reference: Run, run: Run, diff: Differences) -> str:
     """Return the few results that a reader of cameras looks for first, before and after, where they differ."""
     out = []
-    for file, pattern, worst, name in _HEADLINES:
-        if not any(n.file == file and re.fullmatch(pattern, n.key) for n in diff.numbers):
-            continue
-        before, after = (_found(side.file(file), pattern) for side in (reference, run))
-        if before and after:
-            ends = worst(before), worst(after)
-            digits = next((k for k in range(3, 10) if plain(ends[0], k) != plain(ends[1], k)), 0)
-            out += [f"{name} {plain(ends[0], digits)}, then {plain(ends[1], digits)}"] if digits else []
+    for file, headlines in _HEADLINES.items():
+        changed = [number.key for number in diff.numbers if number.file == file]
+        sides = [_results(side.file(file)) for side in (reference, run)] if changed else []
+        for pattern, worst, name in headlines:
+            if not any(re.fullmatch(pattern, key) for key in changed):
+                continue
+            before, after = ([value for key, value in side.items() if re.fullmatch(pattern, key)] for side in sides)
+            if before and after:
+                ends = worst(before), worst(after)
+                digits = next((k for k in range(3, 10) if plain(ends[0], k) != plain(ends[1], k)), 0)
+                out += [f"{name} {plain(ends[0], digits)}, then {plain(ends[1], digits)}"] if digits else []
     return "; ".join(out)
 
 
-def _found(path: Path | None, pattern: str) -> list[float]:
-    """Return the numbers of a result file whose keys match a pattern."""
-    numbers = {} if path is None else difference.content_of(path, path.name).numbers
-    return [value for key, value in numbers.items() if re.fullmatch(pattern, key) and isinstance(value, int | float)]
+def _results(path: Path | None) -> dict[str, float]:
+    """Return key -> number of a result file; empty without the file."""
+    values = {} if path is None else difference.content_of(path, path.name).numbers
+    return {key: value for key, value in values.items() if isinstance(value, int | float)}
 
 
 def verdict(comparison: Comparison) -> list[str]:

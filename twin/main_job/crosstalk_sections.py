@@ -136,10 +136,10 @@ def _crosstalk(run: RenderRun, camera: int) -> Table:
     heads = [
         "Motion",
         "per",
-        *(head for rows_of_camera in columns for head in ("true", *(label for label, _ in rows_of_camera))),
+        *(head for of_parameter in columns for head in ("true", *(label for label, _ in of_parameter))),
     ]
     spans = zip(parameters.CAMERA_PARAMETERS.values(), columns, strict=True)
-    over = [("", 2), *((p.label, 1 + len(rows_of_camera)) for p, rows_of_camera in spans)]
+    over = [("", 2), *((p.label, 1 + len(of_parameter)) for p, of_parameter in spans)]
     title = f"Camera {name}"
     return Table(f"crosstalk-{camera}", title, caption, heads, rows, over=over, bands=bands, within=IN_PAGE)
 

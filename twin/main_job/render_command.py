@@ -26,7 +26,7 @@ from twin.main_job.systematics import assumed
 from twin.main_job.verdict import judge, recovered_numbers
 from twin.monitor.image_quality import AT_FIELDS, POSITIONS, QUALITY
 from twin.targets.target_images import DIRECTIONS
-from twin.targets.target_images import POSITIONS as TARGET_PLACES
+from twin.targets.target_images import POSITIONS as TARGET_POSITIONS
 from twin.targets.target_measurement import TargetRun
 
 _DASH = "\N{EM DASH}"
@@ -114,7 +114,7 @@ def _mtf_table(targets: TargetRun) -> Table | None:
     title = f"MTF with the pixel at Nyquist from the knife edge ({targets.frames} frames)"
     title += "\nbefore -> after, true values below"
     table = result_table(title)
-    for head in ("", *TARGET_PLACES):
+    for head in ("", *TARGET_POSITIONS):
         table.add_column(head, no_wrap=True)
     for name, camera in targets.cameras.items():
         for direction in DIRECTIONS:

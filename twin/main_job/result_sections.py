@@ -434,10 +434,9 @@ def residual_section(run: RenderRun, drawn: Mapping[str, str]) -> Section:
             outside_text += f" Perturbed but in no row of the table, so that the effect is unexplained: {uncovered}."
         notes.append(f"{name}: {outside_text.strip()}")
     heads = ["camera", "parameter", "unit", f"{title} - true", "sigma", "sigma noise", "expected from the crosstalk"]
-    prior_note = run.experiment.stated is not None
     far = (
         "Far outside: larger motions than the prior expects, or other ones."
-        if prior_note
+        if run.experiment.stated is not None
         else "Inside the band: noise. Far outside: the formula has a wrong factor, or a body moved that the "
         "estimators do not model."
     )

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from analysis.monitor.kalman_filter import DetectionPower
     from twin.framework.report import Report
     from twin.operate.estimate.operation_filter import Operation
-    from twin.operate.estimate.reported_estimate import Course, FilterResult, RequirementStatus
+    from twin.operate.estimate.reported_estimate import Course, FilterResult
     from twin.operate.record.history import History
 
 STEPS = 4
@@ -65,7 +65,7 @@ def forecast(
     if end <= start:
         raise InputErrorText(f"--until: {until} is not after the newest reading, {result.now.utc[0]}")
     course = operation.forecast([start + round((end - start) * k / steps) for k in range(steps + 1)])
-    chances = {status.quantity: _chances(course, status) for status in result.requirements}
+    chances = {s.quantity: course.exceedance(s.quantity, s.limit).tolist() for s in result.requirements}
     requirements = [{**status.to_dict(), "chances": chances[status.quantity]} for status in result.requirements]
     name, warnings = call.history.name, result.warnings
     data = {"record": call.history.url, "instrument": name, **course.to_dict(), "requirements": requirements}
@@ -81,15 +81,6 @@ def forecast(
             print_line(console, f"warning: {text}")
 
     call.print_result({**data, "warnings": warnings}, show)
-
-
-def _chances(course: Course, status: RequirementStatus) -> list[float]:
-    """Return the probabilities that a requirement's limit is exceeded at the times of an estimate."""
-    from twin.operate.estimate.reported_estimate import beyond
-
-    k = [quantity.name for quantity in course.quantities].index(status.quantity)
-    chances: list[float] = beyond(course.values[:, k], course.sigmas[:, k], status.limit).tolist()
-    return chances
 
 
 @on_record

@@ -443,8 +443,8 @@ def _verdict_sentences(life: JudgedLife, numbers: dict[str, Any], shown: Sequenc
     if explained is not None:
         symbol = life.quantities[life.number(group, key)].parameter.symbol
         out.append(f"temperatures explain {100 * explained:.0f} % of the scatter of {group} {symbol}")
-    bad = [quantity for quantity in numbers["sensors"] if quantity["state"] != "ok"]
-    out += [f"the sensor of {quantity['body']} is {quantity['state']}: {quantity['reason']}" for quantity in bad]
+    bad = [sensor for sensor in numbers["sensors"] if sensor["state"] != "ok"]
+    out += [f"the sensor of {sensor['body']} is {sensor['state']}: {sensor['reason']}" for sensor in bad]
     return out
 
 

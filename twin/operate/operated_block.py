@@ -151,18 +151,16 @@ def run_operated_block(
     BenchError
         The orbit does not exist, or the block cannot be adjusted.
     """
-    spec = None if isinstance(setup, RationalAdjustSetup) else setup.test.monitor_record
-    if spec is None or isinstance(setup, RationalAdjustSetup):
+    if isinstance(setup, RationalAdjustSetup) or (spec := setup.test.monitor_record) is None:
         return run_adjustment(setup, backend, seed, advance, pool)
-    named = spec
 
     def monitor(epochs: Mapping[str, str], lines: Sequence[str]) -> JointCameraPrior:
         try:
-            return _prior_of_record(setup, named, epochs, lines, advance)
+            return _prior_of_record(setup, spec, epochs, lines, advance)
         except Problem as problem:
             raise setup.test.error(problem, ("monitor_record",)) from None
         except (RecordFailed, NotARecord) as error:
-            wrong = Problem(str(error), named.record, "a record that python -m twin.operate init made")
+            wrong = Problem(str(error), spec.record, "a record that python -m twin.operate init made")
             raise setup.test.error(wrong, ("monitor_record", "record")) from None
 
     return run_adjustment(setup, backend, seed, advance, pool, monitor)

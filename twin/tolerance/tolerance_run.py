@@ -614,8 +614,8 @@ TOLERANCE: Record[ToleranceRun] = Record(
     Quantity(
         "merits",
         lambda run: {
-            merit.merit.name: _merit_plain(merit, run.interpolation_errors.get(merit.merit.name))
-            for merit in run.merits
+            result.merit.name: _merit_plain(result, run.interpolation_errors.get(result.merit.name))
+            for result in run.merits
         },
         "each in its unit; p90 is the value that 90 % of the cameras keep",
     ),

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from analysis.arrays import ARCMIN, ARCSEC
+from analysis.statistics import rms
 from optics.numerics.number_tree import FrozenMap
 from scenes.yaml.errors import Problem, shown
 from scenes.yaml.spec import Number, Spec, Text
@@ -175,11 +176,6 @@ def mean_of(values: NDArray[Any]) -> tuple[float, float]:
 def median_of(values: NDArray[Any]) -> tuple[float, float]:
     """Return the median of (n,) independent measurements, n > 1, and its standard deviation for a normal scatter."""
     return float(np.median(values)), float(np.sqrt(0.5 * np.pi / len(values)) * np.std(values, ddof=1))
-
-
-def rms(values: Any) -> float:
-    """Return the root mean square of all values of an array."""
-    return float(np.sqrt(np.mean(np.square(values))))
 
 
 _UNITS = {

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -50,12 +50,8 @@ def _head(validation: Validation) -> Iterator[str]:
     took = duration_text(validation.seconds)
     yield f"Made by `{command(validation)}` in {took}; its validation.html has every row in full."
     yield ""
-    yield "| verdict | checks | meaning |"
-    yield "|---|---:|---|"
-    for verdict, meaning in VERDICTS.items():
-        if validation.counts[verdict]:
-            yield f"| {verdict} | {validation.counts[verdict]} | {meaning} |"
-    yield ""
+    counted = ((v, str(validation.counts[v]), meaning) for v, meaning in VERDICTS.items() if validation.counts[v])
+    yield from _table_lines(("verdict", "checks", "meaning"), counted, right=(1,))
     if real:
         return
     yield (
@@ -79,22 +75,20 @@ def _tables(validation: Validation) -> Iterator[str]:
             continue
         yield f"## Paper {number}: {title}"
         yield ""
-        yield "| check | what is compared | claim | sides | measured | tolerance | finds | alternative | verdict |"
-        yield "|---|---|---:|---|---:|---|---|---|---|"
+        cells = []
         for r in rows:
             names, about = " = ".join(f"`{name}`" for name in (r.id, *r.also)), f"{r.equation}: {r.statement}"
             about += f". Theory: {r.theory}" if r.theory else ""
-            cells = (names, about, claim_text(r), comparison_text(r), _measured(r), *_limits(r), r.verdict)
-            yield "| " + " | ".join(_cell(cell) for cell in cells) + " |"
-        yield ""
+            cells.append((names, about, claim_text(r), comparison_text(r), _measured(r), *_limits(r), r.verdict))
+        heads = "check, what is compared, claim, sides, measured, tolerance, finds, alternative, verdict".split(", ")
+        yield from _table_lines(heads, cells, right=(2, 4))
 
 
 def _real_table(title: str, rows: Sequence[CheckResult]) -> Iterator[str]:
     """Yield the lines of the table of rows on measured data."""
     yield f"## {title}"
     yield ""
-    yield "| row | statement | printed by others | measured here | sigma | verdict | what would have refuted it |"
-    yield "|---|---|---:|---:|---:|---|---|"
+    cells = []
     for r in rows:
         unit = "" if r.unit == "1" or r.measured is None else f" {r.unit}"
         refuted = ""
@@ -107,15 +101,17 @@ def _real_table(title: str, rows: Sequence[CheckResult]) -> Iterator[str]:
             refuted = f"{side[r.comparison]} {plain(r.power, 2)}{unit} ({r.because}); the alternative, {r.against}, is "
             refuted += f"{plain(r.tells or 0.0, 2)}{unit} away"
         about = f"{r.equation}: {r.statement}"
-        cells = (f"`{r.id}`", about, claim_text(r), f"{measured_text(r)}{unit}", sigma_text(r), r.verdict, refuted)
-        yield "| " + " | ".join(_cell(cell) for cell in cells) + " |"
-    yield ""
+        measured = f"{measured_text(r)}{unit}"
+        cells.append((f"`{r.id}`", about, claim_text(r), measured, sigma_text(r), r.verdict, refuted))
+    heads = "row, statement, printed by others, measured here, sigma, verdict, what would have refuted it".split(", ")
+    yield from _table_lines(heads, cells, right=(2, 3, 4))
     yield "## Numbers of each row"
     yield ""
     for r in rows:
         # the last line is the comparison, which the table has
         lines = r.how.splitlines() if r.power is None else r.how.splitlines()[:-1]
-        yield from (f"- `{r.id}`: {_cell(' '.join(lines))}" for _ in lines[:1])
+        if lines:
+            yield f"- `{r.id}`: {_cell(' '.join(lines))}"
     yield ""
 
 
@@ -174,22 +170,28 @@ def _measured_data(validation: Validation) -> Iterator[str]:
         if not isinstance(table, Table):
             continue
         yield from (f"## {table.title}", "", table.caption, "")
-        yield "| " + " | ".join(table.heads) + " |"
-        yield "|" + "---|" * len(table.heads)
         digits = table.decimals or (None,) * len(table.heads)
-        for row in table.rows:
-            cells = (
-                c if d is None or not isinstance(c, float) else fixed(c, d) for c, d in zip(row, digits, strict=True)
-            )
-            yield "| " + " | ".join(_cell(str(cell)) for cell in cells) + " |"
-        yield ""
+        yield from _table_lines(table.heads, ([*map(_decimal, row, digits)] for row in table.rows))
     yield from ("## Where the data are published", "")
     yield "None of these files is part of the project; `--real DIR` names a folder that contains them."
-    yield from ("", "| file | published in | SHA-256 |", "|---|---|---|")
-    for name, (checksum, place) in published().items():
-        yield f"| `{name}` | {place} | `{checksum}` |"
-    yield from ("", "## Choices that were made on these files", "")
+    yield ""
+    files = ((f"`{name}`", place, f"`{checksum}`") for name, (checksum, place) in published().items())
+    yield from _table_lines(("file", "published in", "SHA-256"), files)
+    yield from ("## Choices that were made on these files", "")
     yield from (f"- {choice}" for choice in load_printed(REAL).content.data["choices"])
+    yield ""
+
+
+def _decimal(cell: Any, decimals: int | None) -> str:
+    """Return a cell as text, a float with the given number of decimals if there is one."""
+    return str(cell) if decimals is None or not isinstance(cell, float) else fixed(cell, decimals)
+
+
+def _table_lines(heads: Sequence[str], rows: Iterable[Sequence[str]], right: Sequence[int] = ()) -> Iterator[str]:
+    """Yield the lines of a Markdown table and an empty one; columns with the indices ``right`` are right-aligned."""
+    yield "| " + " | ".join(heads) + " |"
+    yield "|" + "".join("---:|" if k in right else "---|" for k in range(len(heads)))
+    yield from ("| " + " | ".join(map(_cell, row)) + " |" for row in rows)
     yield ""
 
 

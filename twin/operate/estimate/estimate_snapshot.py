@@ -406,7 +406,7 @@ class EstimatorState:
         Each is (body, time_us of the first equal reading).
         """
         stuck = ((sensor.body, sensor.since_us) for sensor in self.sensors.values() if sensor.stuck)
-        return tuple(body for body in stuck if body not in self.stuck_sensors)
+        return tuple(sensor for sensor in stuck if sensor not in self.stuck_sensors)
 
     @property
     def jointly_disagreeing(self) -> tuple[str, ...]:

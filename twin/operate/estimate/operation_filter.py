@@ -45,7 +45,6 @@ from twin.operate.estimate.reported_estimate import (
     Motions,
     RequirementStatus,
     SensorState,
-    beyond,
     inflation_factors,
 )
 from twin.operate.record.entries import DECISION, MICRO, digest_of_data, utc_text
@@ -232,18 +231,16 @@ class Operation:
         """Return the estimator's state with every requirement judged at its newest reading of the monitor."""
         if not self.plan.operation.requirements:
             return state
-        then = copy.copy(self)
-        for name in ("_now", "_sigma_inflation", "too_many_jumps"):  # they depend on the state
-            vars(then).pop(name, None)
+        then = copy.copy(self)  # has nothing yet that depends on the state, which is being computed
         vars(then)["estimator_state"] = state
-        now, names, violations = then.forecast([state.time]), [each.name for each in self.quantities], state.violations
+        now, violations = then.forecast([state.time]), state.violations
         for requirement in self.plan.operation.requirements:
-            k, limit = names.index(requirement.name), requirement.largest
-            value, sigma = float(now.values[0, k]), float(now.sigmas[0, k])
-            chance = float(beyond(now.values[0, k], now.sigmas[0, k], limit))
-            if chance > 1.0 - requirement.probability:
-                times = state.time, state.time, 1, state.time
-                violations = Violation(requirement.name, limit, *times, value, sigma, chance).appended_to(violations)
+            k, limit = now.number(requirement.name), requirement.largest
+            exceedance = float(now.exceedance(requirement.name, limit)[0])
+            if exceedance > 1.0 - requirement.probability:
+                times, value, sigma = (state.time, state.time, 1, state.time), now.values[0, k], now.sigmas[0, k]
+                span = Violation(requirement.name, limit, *times, float(value), float(sigma), exceedance)
+                violations = span.appended_to(violations)
         return replace(state, violations=violations)
 
     def _rewind(self, state: EstimatorState) -> EstimatorState | None:
@@ -368,11 +365,10 @@ class Operation:
         ahead = self.forecast([start + round(k * operation.horizon * MICRO / days) for k in range(days + 1)])
         out = []
         for requirement in operation.requirements:
-            k = [each.name for each in ahead.quantities].index(requirement.name)
-            exceedance = beyond(ahead.values[:, k], ahead.sigmas[:, k], requirement.largest)
+            exceedance = ahead.exceedance(requirement.name, requirement.largest)
             broken = np.flatnonzero(exceedance > 1.0 - requirement.probability)
             breaks_us = int(ahead.times[broken[0]]) if len(broken) else None
-            unit = self.quantities[k].parameter.unit
+            unit = self.quantities[ahead.number(requirement.name)].parameter.unit
             holds = not (len(broken) and broken[0] == 0)
             out.append(
                 RequirementStatus(

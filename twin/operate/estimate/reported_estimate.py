@@ -67,6 +67,15 @@ class Course:
         """Times of the estimate in UTC, ISO 8601 texts."""
         return tuple(utc_text(int(time)) for time in self.times)
 
+    def number(self, name: str) -> int:
+        """Return the index of the quantity with a name, "group key"."""
+        return [quantity.name for quantity in self.quantities].index(name)
+
+    def exceedance(self, name: str, limit: float) -> Array:
+        """Return the probability that the absolute change of a quantity exceeds a limit in its unit, (T,)."""
+        k = self.number(name)
+        return beyond(self.values[:, k], self.sigmas[:, k], limit)
+
     def to_dict(self) -> dict[str, Any]:
         """Return plain data: group -> key -> values at all times, with the sigmas beside them."""
         out: dict[str, Any] = {"times_utc": list(self.utc)}

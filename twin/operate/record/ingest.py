@@ -112,7 +112,7 @@ class Ingest:
         fresh = self._new_refusals(content, refused, before)
         if new_entries or fresh or not before:
             self.write(content, source_digest, None if source is None else int(source[0]), new_entries, fresh)
-        refusals_made = tuple((new_entry.line, new_entry.reason) for new_entry, _ in refused)
+        refusals_made = tuple((refusal.line, refusal.reason) for refusal, _ in refused)
         return IngestResult(content.file, len(new_entries), again, refusals_made, before, len(refused) - len(fresh))
 
     def _new_refusals(
@@ -238,20 +238,20 @@ class Ingest:
         rows = [
             {
                 "sha256": digest,
-                "kind": refusal.kind,
-                "subject": refusal.subject,
-                "time_us": refusal.time,
-                "time_utc": utc_text(refusal.time),
-                "content": canonical(refusal.content),
+                "kind": entry.kind,
+                "subject": entry.subject,
+                "time_us": entry.time,
+                "time_utc": utc_text(entry.time),
+                "content": canonical(entry.content),
                 "source_id": source,
-                "line": refusal.line,
-                "origin": refusal.origin or None,
+                "line": entry.line,
+                "origin": entry.origin or None,
             }
-            for refusal, digest in new_entries
+            for entry, digest in new_entries
         ]
         self._insert(ENTRY, rows)
         if rows:  # checkpoints after the earliest new entry do not contain it
-            earliest = min(refusal.time for refusal, _ in new_entries)
+            earliest = min(entry.time for entry, _ in new_entries)
             self.connection.execute(delete(CHECKPOINT).where(CHECKPOINT.c.time_us >= earliest))
         refusals_made = [
             {

@@ -22,6 +22,7 @@ from matplotlib.figure import Figure
 from analysis.arrays import ARCSEC
 from analysis.monitor import autocollimator, recovery
 from analysis.monitor.monitor_formulas import MonitorGeometry
+from analysis.statistics import rms
 from optics.geometry.surface import plane
 from optics.geometry.tree import Body, Motion, RigidTree, State
 from optics.numerics.backend import Backend
@@ -34,7 +35,7 @@ from twin.framework.svg import BLUE, GREY, INK, LIGHT
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.monitor.observation import ObservationOptions, observe, shared_detector
 from twin.monitor.truth import Truth
-from twin.validation.check import CheckResult, rms
+from twin.validation.check import CheckResult
 from twin.validation.group import Context, drawing, group_of
 
 Value = TypeVar("Value", float, np.ndarray)

@@ -19,6 +19,7 @@ from analysis.arrays import ARCSEC
 from analysis.orbit.forward_intersection import third_difference
 from analysis.orbit.planes import height_error
 from analysis.orbit.three_line_model import BIAS, INTERIOR
+from analysis.statistics import rms
 from optics.numerics.backend import one_blas_thread
 from scenes.specs.orbit.angle import LINES
 from scenes.specs.orbit.setup import CalibrationSetup
@@ -29,7 +30,7 @@ from twin.orbit.calibration.calibration_run import source_of
 from twin.orbit.calibration.campaign import Campaign, FieldPass
 from twin.orbit.calibration.campaign_adjustment import LatitudeFit, calibrated_alone, fit_latitude
 from twin.orbit.calibration.schemes import check_point_errors, laboratory_errors, scheme_errors, values_of
-from twin.validation.check import SIGMAS, CheckResult, Chosen, Supposed, mean_of, median_of, rms
+from twin.validation.check import SIGMAS, CheckResult, Chosen, Supposed, mean_of, median_of
 from twin.validation.group import Context, drawing, group_of
 from twin.validation.paper_003.model import FIELDS, all_errors, changed, setup_of, without_light
 

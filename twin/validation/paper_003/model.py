@@ -20,6 +20,7 @@ from analysis.calibration.strip_adjustment import Stepwise, stepwise
 from analysis.orbit.calibration_parameters import Combination, Gauge
 from analysis.orbit.forward_intersection import CheckErrors
 from analysis.orbit.three_line_model import BIAS, INTERIOR, Rays, misclosure, partials
+from analysis.statistics import rms
 from optics.numerics.backend import one_blas_thread
 from optics.numerics.number_tree import FrozenMap
 from scenes.specs.load import ORBIT, SCENES
@@ -41,7 +42,7 @@ from twin.orbit.ground.grid import GroundFrame, Terrain
 from twin.orbit.images.line_optics import optics_of
 from twin.orbit.images.patch import window_of
 from twin.orbit.images.pushbroom import MARGIN, PushbroomScene, render_patch
-from twin.validation.check import CheckResult, Chosen, rms
+from twin.validation.check import CheckResult, Chosen
 from twin.validation.group import Context, drawing, group_of
 
 FIELDS, IMAGES = "calibrate.yaml", "calibrate_images.yaml"

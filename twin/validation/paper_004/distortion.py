@@ -22,6 +22,7 @@ from analysis.arrays import ARCSEC, Array
 from analysis.arrays import MM_PER_M as MM
 from analysis.arrays import UM_PER_M as UM
 from analysis.orientation.interior import distortion, principal_distance, principal_distance_and_point, principal_point
+from analysis.statistics import rms
 from optics.geometry.pose import rotation_matrix
 from optics.numerics.backend import Backend, one_blas_thread
 from scenes.models.camera_model import ROOT, build_camera_under_test
@@ -31,7 +32,7 @@ from twin.framework.svg import BLUE, GREY, INK, VERMILION
 from twin.laboratory.distortion_bench import DistortionBench
 from twin.laboratory.distortion_run import SimulatedDistortion, measure
 from twin.targets.target_path import TargetPath
-from twin.validation.check import CheckResult, Chosen, mean_of, median_of, rms
+from twin.validation.check import CheckResult, Chosen, mean_of, median_of
 from twin.validation.group import Context, drawing, group_of, load_printed
 from twin.validation.paper_004.turntable_checks import FIT_RMS_ARCSEC, dividing
 

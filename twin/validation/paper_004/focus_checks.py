@@ -16,6 +16,7 @@ from analysis.arrays import ARCMIN, ARCSEC, MM_PER_M, UM_PER_M, Array
 from analysis.focal_plane.plane_fit import RigidMotion, ShimPlan, fit_focal_plane, shim_plan
 from analysis.focal_plane.through_focus import focus_vertex
 from analysis.mtf.slanted_edge import EdgeMtf, slanted_edge_mtf
+from analysis.statistics import rms
 from optics.geometry.pose import Pose, rotation_matrix
 from optics.numerics.backend import one_blas_thread
 from scenes.specs.resolved import FocusSetup
@@ -24,7 +25,7 @@ from twin.framework.svg import AFTER, BEFORE, INK, LIGHT
 from twin.laboratory.focus_bench import NYQUIST, FocusBench
 from twin.laboratory.focus_run import FocusState, SimulatedFocus, align, line_rotation, mount_of
 from twin.targets.target_images import TRACK
-from twin.validation.check import CheckResult, Chosen, mean_of, rms
+from twin.validation.check import CheckResult, Chosen, mean_of
 from twin.validation.group import Context, drawing, group_of, load_printed
 
 MTF_NYQUIST = load_printed("004").numbers("table1.mtf_nyquist")

@@ -16,6 +16,7 @@ from twin.framework.svg import AFTER, BEFORE, INK
 from twin.validation.check import CheckResult
 from twin.validation.group import Context, drawing, group_of, load_printed
 from twin.validation.measured_data import on_files
+from twin.validation.row_names import REAL
 
 IMAGES = {"colour": "Test_edge1.tif", "mono": "Test_edge1_mono.tif"}
 ORDERS = (1, 5)
@@ -32,7 +33,7 @@ def measured_edge(path: Path) -> EdgeMtf:
 @drawing("real-edges", 3.6)
 def edges_svg(figure: Figure, edges: dict[str, EdgeMtf]) -> None:
     """Draw the curves measured here and the points of the other program, along its rows."""
-    printed = load_printed("real")
+    printed = load_printed(REAL)
     frequency = np.array(printed.column("sfrmat5.frequency"))
     for axes, (name, edge) in zip(np.atleast_1d(figure.subplots(1, len(edges))), edges.items(), strict=True):
         fine = np.linspace(0.0, 0.5, 101)[1:]
@@ -45,7 +46,7 @@ def edges_svg(figure: Figure, edges: dict[str, EdgeMtf]) -> None:
 
 
 def _rows(context: Context, paths: list[Path], name: str, edges: dict[str, EdgeMtf]) -> Iterator[CheckResult]:
-    printed = load_printed("real")
+    printed = load_printed(REAL)
     frequency = np.array(printed.column("sfrmat5.frequency"))
     edge = edges[name] = measured_edge(paths[0])
     cosine = float(np.cos(edge.angle))

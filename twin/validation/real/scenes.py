@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import re
-import xml.etree.ElementTree as ET
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -15,6 +13,7 @@ from matplotlib.figure import Figure
 
 from analysis.arrays import Array
 from analysis.orbit.rational_polynomial import RationalPolynomial
+from analysis.statistics import rms
 from twin.framework.svg import AFTER, BEFORE, INK
 from twin.orbit.export.quality_run import compare_product
 from twin.orbit.export.rational_polynomial import sensor_polynomial
@@ -22,9 +21,11 @@ from twin.orbit.flight.light_effects import NO_EFFECTS, LightEffects
 from twin.orbit.flight.platform_table import PlatformTable, TabulatedTrajectory
 from twin.orbit.measured.orbit_files import read_oem
 from twin.orbit.measured.platform_files import read_scene
+from twin.orbit.measured.xml_file import Element, read_xml
 from twin.validation.check import CheckResult
 from twin.validation.group import Context, drawing, group_of, load_printed
 from twin.validation.measured_data import on_files
+from twin.validation.row_names import REAL
 
 EFFECTS: Mapping[str, LightEffects] = {
     "rpc": NO_EFFECTS,
@@ -36,63 +37,53 @@ EFFECTS: Mapping[str, LightEffects] = {
 _EPOCH = "2000-01-01T00:00:00Z"
 
 
-def ground_segment_polynomials(root: ET.Element) -> RationalPolynomial:
+def ground_segment_polynomials(root: Element) -> RationalPolynomial:
     """Return the polynomials that a Pleiades ground segment computed of its own model; its pixels count from 1."""
-    model = _found(root, "Geoposition/Rational_Sensor_Model/Global_RFM")
-    row, column = (
-        np.array(_text(model, f"Inverse_Model/F_{name}").split(), float).reshape(2, 20) for name in ("ROW", "COL")
-    )
-    axes = [_found(model, f"RFM_Validity/{name}") for name in ("Row", "Col", "Lat", "Lon", "Alt")]
-    scale, offset = (np.array([float(_text(one, key)) for one in axes]) for key in "AB")
+    model = root.single("Geoposition", "Rational_Sensor_Model", "Global_RFM")
+    row, column = (model.single("Inverse_Model", f"F_{name}").floats(40).reshape(2, 20) for name in ("ROW", "COL"))
+    axes = [model.single("RFM_Validity", name) for name in ("Row", "Col", "Lat", "Lon", "Alt")]
+    scale, offset = (np.array([axis.number(key) for axis in axes]) for key in "AB")
     return RationalPolynomial(offset - [1.0, 1.0, 0.0, 0.0, 0.0], scale, *row, *column)
 
 
-def delivered_form(root: ET.Element) -> str:
+def delivered_form(root: Element) -> str:
     """Return the ground segment's model of a Pleiades scene in the elements of a delivered DIMAP 2 file."""
-    model = _found(root, "Geometric_Data/Sensor_Model_Characteristics")
-    size, span = _found(root, "Raster_Dimensions"), _found(model, "UTC_Sensor_Model_Range")
+    model = root.single("Geometric_Data", "Sensor_Model_Characteristics")
+    size, span = root.single("Raster_Dimensions"), model.single("UTC_Sensor_Model_Range")
     points = "".join(
-        f"<Point><LOCATION_XYZ>{_text(p, 'LOCATION_VALUES')}</LOCATION_XYZ>"
-        f"<VELOCITY_XYZ>{_text(p, 'VELOCITY_VALUES')}</VELOCITY_XYZ><TIME>{_text(p, 'UTC_TIME')}</TIME></Point>"
-        for p in model.iterfind("Sensor_Ephemeris/Point_List/Point")
+        f"<Point><LOCATION_XYZ>{point.words('LOCATION_VALUES')}</LOCATION_XYZ>"
+        f"<VELOCITY_XYZ>{point.words('VELOCITY_VALUES')}</VELOCITY_XYZ><TIME>{point.words('UTC_TIME')}</TIME></Point>"
+        for point in model.all("Sensor_Ephemeris", "Point_List", "Point")
     )
-    attitude, viewing = _found(model, "Sensor_Attitudes"), _found(model, "Sensor_Viewing_Model")
-    turns = "".join(ET.tostring(_found(attitude, f"Polynomial_Models/Q{k}"), "unicode") for k in range(4))
+    attitude, viewing = model.single("Sensor_Attitudes"), model.single("Sensor_Viewing_Model")
+    quaternions = "".join(
+        f"<Q{k}><DEGREE>{part.words('DEGREE')}</DEGREE><COEFFICIENTS>{part.words('COEFFICIENTS')}</COEFFICIENTS></Q{k}>"
+        for k, part in enumerate(attitude.single("Polynomial_Models", f"Q{k}") for k in range(4))
+    )
     looks = "".join(
         f"<{new}_{k}>{value}</{new}_{k}>"
         for old, new in (("PsiX", "XLOS"), ("PsiY", "YLOS"))
-        for k, value in enumerate(_text(viewing, f"Viewing_Directions/{old}_Model/COEFFICIENTS").split())
+        for k, value in enumerate(viewing.words("Viewing_Directions", f"{old}_Model", "COEFFICIENTS").split())
     )
     return f"""<Dimap_Document>
       <Metadata_Identification><METADATA_FORMAT version="2.15">DIMAP</METADATA_FORMAT>
         <METADATA_PROFILE>PHR_SENSOR</METADATA_PROFILE></Metadata_Identification>
-      <Raster_Data><Raster_Dimensions><NROWS>{_text(size, "NROWS")}</NROWS><NCOLS>{_text(size, "NCOLS")}</NCOLS>
+      <Raster_Data><Raster_Dimensions><NROWS>{size.words("NROWS")}</NROWS><NCOLS>{size.words("NCOLS")}</NCOLS>
       </Raster_Dimensions></Raster_Data>
-      <Geometric_Data><Refined_Model><Time><Time_Range><START>{_text(span, "START")}</START>
-        <END>{_text(span, "END")}</END></Time_Range>
-        <Time_Stamp><LINE_PERIOD unit="ms">{_text(model, "SENSOR_LINE_PERIOD")}</LINE_PERIOD></Time_Stamp></Time>
+      <Geometric_Data><Refined_Model><Time><Time_Range><START>{span.words("START")}</START>
+        <END>{span.words("END")}</END></Time_Range>
+        <Time_Stamp><LINE_PERIOD unit="ms">{model.words("SENSOR_LINE_PERIOD")}</LINE_PERIOD></Time_Stamp></Time>
       <Ephemeris><Point_List>{points}</Point_List></Ephemeris>
-      <Attitudes><Polynomial_Quaternions><OFFSET>{_text(attitude, "OFFSET")}</OFFSET>
-        <SCALE>{_text(attitude, "SCALE")}</SCALE>{turns}</Polynomial_Quaternions></Attitudes>
+      <Attitudes><Polynomial_Quaternions><OFFSET>{attitude.words("OFFSET")}</OFFSET>
+        <SCALE>{attitude.words("SCALE")}</SCALE>{quaternions}</Polynomial_Quaternions></Attitudes>
       <Geometric_Calibration><Instrument_Calibration><Swath_Range>
-        <FIRST_COL>{_text(viewing, "Position_In_Retina/FIRST_COL")}</FIRST_COL></Swath_Range>
+        <FIRST_COL>{viewing.words("Position_In_Retina", "FIRST_COL")}</FIRST_COL></Swath_Range>
         <Polynomial_Look_Angles>{looks}</Polynomial_Look_Angles></Instrument_Calibration></Geometric_Calibration>
       </Refined_Model></Geometric_Data></Dimap_Document>"""
 
 
-def _found(element: ET.Element, path: str) -> ET.Element:
-    found = element.find(path)
-    if found is None:
-        raise ValueError(f"the file has no element {path} below {element.tag}")
-    return found
-
-
-def _text(element: ET.Element, path: str) -> str:
-    return _found(element, path).text or ""
-
-
 def _pleiades(context: Context, paths: list[Path]) -> Iterator[CheckResult]:
-    root = ET.parse(paths[0]).getroot()
+    root = read_xml(paths[0], "the metadata of a Pleiades scene")
     polynomials = ground_segment_polynomials(root)
     alone = 0.0
     with TemporaryDirectory() as folder:
@@ -100,23 +91,23 @@ def _pleiades(context: Context, paths: list[Path]) -> Iterator[CheckResult]:
         path.write_text(delivered_form(root), "utf-8")
         for name, effects in EFFECTS.items():
             scene = read_scene(path, None, effects)
-            found = compare_product(scene.sensor, polynomials, str(path))
-            alone = found.largest if name == "rpc" else alone
+            difference = compare_product(scene.sensor, polynomials, str(path))
+            alone = difference.largest if name == "rpc" else alone
             implied = {"rpc": 0.0, "refraction": alone}.get(name)
-            facts: dict[str, Any] = {"rms": found.rms, "mean": found.mean, "heights": found.heights}
-            yield context.row(f"real.pleiades.{name}", found.largest, None, implied, **facts)
+            facts: dict[str, Any] = {"rms": difference.rms, "mean": difference.mean, "heights": difference.heights}
+            yield context.row(f"real.pleiades.{name}", difference.largest, None, implied, **facts)
 
 
 def _spot_6(context: Context, paths: list[Path]) -> Iterator[CheckResult]:
     scene = read_scene(paths[0])
-    text = paths[0].read_text("latin-1")
-    extent = re.search(r"<Dataset_Extent>.*?</Dataset_Extent>", text, re.DOTALL)
-    height = load_printed("real").number("spot6.height_m")
-    pattern = r"<LON>(.*?)</LON>\s*<LAT>(.*?)</LAT>\s*<COL>(.*?)</COL>\s*<ROW>(.*?)</ROW>"
-    longitude, latitude, column, row = np.array(re.findall(pattern, extent.group() if extent else ""), float).T
+    height = load_printed(REAL).number("spot6.height_m")
+    (extent,) = read_xml(paths[0], "the metadata of a SPOT 6 scene").iter("Dataset_Extent")
+    points = (*extent.all("Vertex"), extent.single("Center"))
+    keys = ("LON", "LAT", "COL", "ROW")
+    longitude, latitude, column, row = np.array([[point.number(key) for key in keys] for point in points]).T
     ground = scene.sensor.ground(row - 1.0, column - 1.0, height)
-    stated = scene.sensor.earth.ecef(np.radians(longitude), np.radians(latitude), height)
-    distance = np.linalg.norm(ground - stated, axis=1)
+    corners = scene.sensor.earth.ecef(np.radians(longitude), np.radians(latitude), height)
+    distance = np.linalg.norm(ground - corners, axis=1)
     yield context.row("real.spot6.corners", float(distance.max()), None, 0.0, distance=distance)
     model = sensor_polynomial(scene.sensor, 0, scene.read.pixels, (height - 350.0, height + 350.0))
     yield context.row("real.spot6.model", float(max(model.error_px)), None, 0.0)
@@ -139,12 +130,12 @@ def orbit_svg(figure: Figure, errors: Mapping[str, tuple[Array, Array]]) -> None
 def _orbit(context: Context, paths: list[Path]) -> Iterator[CheckResult]:
     orbit = read_oem(paths[0])
     time = np.asarray(orbit.clock.second - orbit.clock.second[0], np.float64)
-    turn, index = np.tile([0.0, 0.0, 0.0, 1.0], (2, 1)), np.arange(len(time))
+    attitude, index = np.tile([0.0, 0.0, 0.0, 1.0], (2, 1)), np.arange(len(time))
     errors: dict[str, tuple[Array, Array]] = {}
     for stride in STRIDES:
         kept, ends = slice(None, None, stride), time[[0, -1]]
         # interpolation does not ask for the frame
-        table = PlatformTable.of(_EPOCH, time[kept], orbit.position[kept], None, ends, turn)
+        table = PlatformTable.of(_EPOCH, time[kept], orbit.position[kept], None, ends, attitude)
         trajectory = TabulatedTrajectory(table)
         halfway = (index % stride == stride // 2) & (time <= time[kept][-1])
         error = np.linalg.norm(trajectory.position(time[halfway]) - orbit.position[halfway], axis=1)
@@ -153,7 +144,7 @@ def _orbit(context: Context, paths: list[Path]) -> Iterator[CheckResult]:
             facts: dict[str, Any] = {"states": len(error), "method": trajectory.interpolation}
             yield context.row("real.oem.left_out", 1e3 * float(error.max()), None, 0.0, **facts)
     # one interval from the ends, where the prediction holds
-    measured = 1e3 * float(np.sqrt(np.mean(error[1:-1] ** 2)))
+    measured = 1e3 * rms(error[1:-1])
     yield context.row("real.oem.predicted", measured, None, 1e3 * trajectory.interpolation_error)
     context.figure("orbit", orbit_svg(errors))
 

@@ -17,15 +17,22 @@ from scipy import linalg
 from analysis.arrays import Array
 from analysis.spots.noise import NoiseModel
 from analysis.spots.spot_fit import fit_spot
-from analysis.spots.window_series import CAUSES, WindowSeries, fit_window_series
+from analysis.spots.window_series import CAUSES, WindowSeries, chi_square_about, fit_window_series
+from analysis.statistics import rms
 from twin.framework.svg import AFTER, BEFORE, INK
 from twin.validation.check import CheckResult, mean_of
 from twin.validation.group import Context, drawing, group_of, load_printed
 from twin.validation.measured_data import on_files
+from twin.validation.row_names import REAL
 
 PIXEL_ARCSEC = 5.0
 """Size of a pixel of the camera on the sky, arcseconds."""
 FIDUCIAL, STAR = "fiducial lights", "stars"
+_ROWS_OF_KIND = {
+    "fiducials": ("fiducials", "fiducials_noise_alone", "successive", "distances", "gaussian"),
+    "stars": ("stars", "stars_noise_alone"),
+}
+"""First part of the rows' names for each kind of light -> the rows that need two lights of it."""
 _RADIANS_PX = 500.0
 """Scale of the rotation of the field in the design matrix, px, so that its column has the size of the others."""
 
@@ -70,7 +77,8 @@ def read_windows(path: Path) -> Windows:
     return Windows(name, pixels.reshape(-1, side, side), used, corners, time, temperature)
 
 
-def _uniform(time: Array, degree: int = 1) -> Array:
+def _polynomial(time: Array, degree: int = 1) -> Array:
+    """Return a motion as powers of the time from the highest, (N, degree + 1); degree 1 is a uniform motion."""
     return np.vander((time - time.mean()) / np.ptp(time), degree + 1)
 
 
@@ -92,12 +100,12 @@ def common_motion(lights: Sequence[Light], cause: str | None = None) -> tuple[fl
     for light in lights:
         row, column = light.fit.position.mean(axis=0) / _RADIANS_PX
         common.append(np.kron(np.eye(count), [[1.0, 0.0, -column], [0.0, 1.0, row]]))
-    drifts = linalg.block_diag(*[np.kron(_uniform(time), np.eye(2))] * len(lights))
-    left = linalg.null_space(np.concatenate([np.concatenate(common), drifts], axis=1).T)
+    drifts = linalg.block_diag(*[np.kron(_polynomial(time), np.eye(2))] * len(lights))
     parts = [light.fit.covariance if cause is None else light.fit.parts[cause] for light in lights]
-    contrast = left.T @ np.concatenate([light.fit.position.ravel() for light in lights])
-    chi = float(contrast @ np.linalg.solve(left.T @ linalg.block_diag(*parts) @ left, contrast))
-    return chi, left.shape[1], (left @ contrast).reshape(len(lights), count, 2)
+    positions = np.concatenate([light.fit.position.ravel() for light in lights])
+    design = np.concatenate([np.concatenate(common), drifts], axis=1)
+    chi, degrees, residual = chi_square_about(design, positions, linalg.block_diag(*parts))
+    return chi, degrees, residual.reshape(len(lights), count, 2)
 
 
 def _distances(lights: Sequence[Light]) -> tuple[float, int, float]:
@@ -108,11 +116,9 @@ def _distances(lights: Sequence[Light]) -> tuple[float, int, float]:
         length = np.linalg.norm(apart, axis=1)
         along = linalg.block_diag(*(apart / length[:, None])[:, None, :])
         covariance = along @ (a.fit.covariance + b.fit.covariance) @ along.T
-        left = linalg.null_space(np.ones((1, len(length))))
-        contrast = left.T @ length
-        chi += float(contrast @ np.linalg.solve(left.T @ covariance @ left, contrast))
-        degrees += left.shape[1]
-        square.append(float(contrast @ contrast) / left.shape[1])
+        of_pair, free, residual = chi_square_about(np.ones((len(length), 1)), length, covariance)
+        chi, degrees = chi + of_pair, degrees + free
+        square.append(float(residual @ residual) / free)
     return chi, degrees, float(np.sqrt(np.mean(square)))
 
 
@@ -143,11 +149,10 @@ def _gaussian(lights: Sequence[Light], noise: NoiseModel) -> tuple[float, int]:
     chi, degrees = 0.0, 0
     for light in lights:
         fit = fit_spot(light.windows.images, noise, radius=2.5)
-        position, design = np.stack([fit.row, fit.column], axis=1), _uniform(light.windows.time)
-        left = linalg.null_space(np.kron(design, np.eye(2)).T)
-        contrast = left.T @ position.ravel()
-        chi += float(contrast @ np.linalg.solve(left.T @ linalg.block_diag(*fit.covariance) @ left, contrast))
-        degrees += left.shape[1]
+        position, design = np.stack([fit.row, fit.column], axis=1), _polynomial(light.windows.time)
+        covariance = linalg.block_diag(*fit.covariance)
+        of_light, free, _ = chi_square_about(np.kron(design, np.eye(2)), position.ravel(), covariance)
+        chi, degrees = chi + of_light, degrees + free
     return chi, degrees
 
 
@@ -179,16 +184,16 @@ def _rows(context: Context, paths: list[Path]) -> Iterator[CheckResult]:
         if not group:
             yield from (
                 context.check(f"real.spots.{row}").skipped(f"there are no two {kind} of the same times")
-                for row in _OF_A_KIND[name]
+                for row in _ROWS_OF_KIND[name]
             )
             continue
         chi, degrees, residual = common_motion(group)
         chi_all, degrees_all = chi_all + chi, degrees_all + degrees
-        left.update({light.windows.name: one for light, one in zip(group, residual, strict=True)})
+        left.update({light.windows.name: of_light for light, of_light in zip(group, residual, strict=True)})
         noise_only, _, _ = common_motion(group, CAUSES[0])
         sigmas = {cause: np.mean([_rms_sigma(light.fit, cause) for light in group]) for cause in CAUSES}
         facts: dict[str, Any] = {
-            "lights": len(group), "degrees": degrees, "sigmas": sigmas, "rms": [_rms(one) for one in residual],
+            "lights": len(group), "degrees": degrees, "sigmas": sigmas, "rms": [rms(of_light) for of_light in residual],
             "prnu": [light.fit.prior.prnu for light in group],
         }  # fmt: skip
         yield context.row(f"real.spots.{name}", chi / degrees, float(np.sqrt(2.0 / degrees)), 1.0, **facts)
@@ -196,7 +201,7 @@ def _rows(context: Context, paths: list[Path]) -> Iterator[CheckResult]:
             f"real.spots.{name}_noise_alone", noise_only / degrees, float(np.sqrt(2.0 / degrees)), 1.0, **facts
         )
         if kind == FIDUCIAL:
-            steps = [_rms(np.diff(light.fit.position, axis=0)) for light in group]
+            steps = [rms(np.diff(light.fit.position, axis=0)) for light in group]
             yield context.row("real.spots.successive", *mean_of(np.array(steps)), steps=steps)
             apart, free, scatter = _distances(group)
             yield context.row("real.spots.distances", apart / free, float(np.sqrt(2.0 / free)), 1.0,
@@ -217,25 +222,15 @@ def _rows(context: Context, paths: list[Path]) -> Iterator[CheckResult]:
     context.figure("spots", spots_svg(lights, left))
 
 
-_OF_A_KIND = {
-    "fiducials": ("fiducials", "fiducials_noise_alone", "successive", "distances", "gaussian"),
-    "stars": ("stars", "stars_noise_alone"),
-}
-
-
-def _rms(values: Array) -> float:
-    return float(np.sqrt(np.mean(np.square(values))))
-
-
 def _rms_sigma(fit: WindowSeries, cause: str) -> float:
     return float(np.sqrt(np.mean(np.diagonal(fit.parts[cause]))))
 
 
 def _set_row(light: Light, left: Array) -> list[Any]:
-    chi, degrees, _ = light.fit.scatter(_uniform(light.windows.time, 2))
+    chi, degrees, _ = light.fit.scatter(_polynomial(light.windows.time, 2))
     prior, fit = light.fit.prior, light.fit
     return [
-        light.windows.name, light.windows.kind, len(left), 1e3 * _rms(left), 1e3 * _rms(fit.sigma),
+        light.windows.name, light.windows.kind, len(left), 1e3 * rms(left), 1e3 * rms(fit.sigma),
         *(1e3 * _rms_sigma(fit, cause) for cause in CAUSES), chi / degrees, fit.reduced_chi_square, fit.width,
         prior.shape, prior.length, 100.0 * prior.prnu, prior.dark_dn, prior.gain_dn_per_e, prior.read_dn,
         float(light.windows.temperature.mean()) - 273.15,
@@ -244,7 +239,7 @@ def _set_row(light: Light, left: Array) -> list[Any]:
 
 def run(context: Context) -> Iterator[CheckResult]:
     """Yield the results of the rows on spots in flight."""
-    yield from on_files(context, "real.spots", load_printed("real").content.data["chandra"]["files"], _rows)
+    yield from on_files(context, "real.spots", load_printed(REAL).content.data["chandra"]["files"], _rows)
 
 
 GROUP = group_of("real.spots", run)
