@@ -1,4 +1,7 @@
-"""Commands that are started in a folder with a numpy.py, an optics.py, a random.py run none of them."""
+"""Commands that are started in a folder with a numpy.py, an optics.py, a random.py run none of them.
+
+Neither do their second process and their workers: tests/test_wheel.py, in such a folder.
+"""
 
 from __future__ import annotations
 
@@ -131,17 +134,3 @@ def test_shells_are_offered_programs_subcommands_and_options(tmp_path, monkeypat
     # Typer looks for a shell among the ancestors, which a test in the background has none of
     monkeypatch.setenv("_TYPER_COMPLETE_TEST_DISABLE_SHELL_DETECTION", "1")
     assert COMPLETE in started(tmp_path, console(tmp_path), "--show-completion", "bash").stdout
-
-
-@pytest.mark.second
-def test_processes_of_a_command_run_nothing_of_it_either(tmp_path):
-    """The second process of the main job, workers of a study, and what they start."""
-    place = folder_of_traps(tmp_path)
-    for words, made in (
-        (("render", "scenes/examples/perturb.yaml", "--frames", "1"), "truth.json"),
-        (("study", "scenes/examples/study_smoke.yaml", "--workers", "2", "--yes"), "study.nc"),
-    ):
-        out = place / words[0]
-        done = started(place, console(place), words[0], str(ROOT / words[1]), *words[2:], "--out", str(out), "--quiet")
-        assert (done.returncode, hits(place)) == (0, ""), done.stderr
-        assert (out / made).exists()

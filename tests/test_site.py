@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 import twin
-from docs.site.__main__ import HERE, NEEDED, BuildError, Progress, build, run_sphinx, with_policy
+from docs.site.__main__ import HERE, NEEDED, BuildError, Progress, app, build, run_sphinx, with_policy
 from docs.site.command_pages import command_page, commands, programs
 from docs.site.file_pages import ACTIONS, file_pages, key_page, node_table
 from docs.site.markdown import slug
@@ -16,6 +16,7 @@ from docs.site.run_pages import described, golden_runs
 from docs.site.spec_keys import accepted, example, flow, keys, kinds_of, sections, shipped
 from scenes.schema import MODELS, json_schema
 from scenes.yaml.yaml_file import parse_yaml
+from tests.twin.commands import invoke
 from twin.framework.page import checksum
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -55,7 +56,6 @@ def test_every_key_stands_in_the_reference(pages: dict[str, str]) -> None:
             assert all(cells), row
 
 
-@pytest.mark.second
 @pytest.mark.second
 def test_the_page_of_all_keys_is_that_of_the_models() -> None:
     """``python -m docs.site --keys docs/keys.md`` writes it."""
@@ -214,10 +214,12 @@ def test_a_folder_with_other_things_is_not_replaced(tmp_path: Path) -> None:
 
 @pytest.mark.second
 def test_the_site_is_built_without_a_warning_and_without_a_broken_link(tmp_path: Path) -> None:
-    """`build` fails on any warning of Sphinx and on any fault of a link; tests/test_notebooks.py runs the notebooks."""
+    """The command fails on any warning of Sphinx and on a broken link; tests/test_notebooks.py runs the notebooks."""
     for name in NEEDED:
         pytest.importorskip(name)
-    assert build(tmp_path / "site", notebooks=False) > 40
+    done = invoke(app, "--out", tmp_path / "site", "--no-notebooks")
+    assert done.exit_code == 0, done.stderr
+    assert int(re.match(r"(\d+) pages: ", done.stdout)[1]) > 40
     assert (tmp_path / "site/searchindex.js").exists()
 
 

@@ -16,6 +16,7 @@ from pathlib import Path
 
 import pytest
 
+from tests.test_safe_path import folder_of_traps, hits
 from twin.framework.provenance import program_digest
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -54,7 +55,7 @@ def test_no_module_of_a_wheel_asks_for_one_outside_of_it() -> None:
     for path in FILES:
         source = path.read_text("utf-8")
         made = backend.rewritten(source)
-        asked += len(names_of_ours(source))
+        asked += made.count(f"{backend.PREFIX}.")
         assert names_of_ours(made) == [], path
         # what the digest of the program relies on
         assert made.replace(f"{backend.PREFIX}.", "") == source, path
@@ -121,7 +122,9 @@ def run(site: Path, folder: Path, *words: object) -> subprocess.CompletedProcess
 
 @pytest.mark.second
 def test_commands_of_the_wheel_run_beside_foreign_packages_of_their_names(installed: Path, tmp_path: Path) -> None:
-    """With every file of the library, every template, and the examples that their help names."""
+    """With every file of the library, every template, and the examples that their help names; of the folder where they
+    are started neither they nor their second process and workers run anything.
+    """
     assert run(installed, tmp_path, "python", "-c", "import optics").returncode == 1
     script = "from space_camera_twin import twin; print(twin.load('gf7_pair').jacobian(['base/forward/M2 shift z']))"
     done = run(installed, tmp_path, "python", "-c", script)
@@ -132,6 +135,7 @@ def test_commands_of_the_wheel_run_beside_foreign_packages_of_their_names(instal
     files = [path for path in files if path.suffix[1:] in kept]
     assert len(files) > 400
     assert [path for path in files if not (own / path).is_file()] == []
+    folder_of_traps(tmp_path)
     job = own / "scenes/examples/perturb.yaml"
     done = run(installed, tmp_path, "camtwin", "render", job, "--out", "a", "--frames", "1")
     assert done.returncode == 0, done.stdout + done.stderr
@@ -140,12 +144,11 @@ def test_commands_of_the_wheel_run_beside_foreign_packages_of_their_names(instal
     assert (manifest["program"], manifest["versions"]["space-camera-twin"]) == ("twin.render", version())
     assert manifest["provenance"]["source"] == program_digest()
     # with processes of its own
-    study = ("study", own / "scenes/examples/study_smoke.yaml", "--workers", "2", "--yes", "--quiet", "--out", "s")
+    study = ("study", own / "scenes/examples/study_smoke.yaml", "--workers", "1", "--yes", "--quiet", "--out", "s")
     done = run(installed, tmp_path, "camtwin", *study)
     assert done.returncode == 0, done.stdout + done.stderr
-    # nothing of the folder where a module is started, as in a source tree
-    (tmp_path / "typer.py").write_text("raise ImportError('found here')\n", "utf-8")
     assert run(installed, tmp_path, "python", "-m", f"{backend.PREFIX}.scenes.lens", "--help").returncode == 0
+    assert hits(tmp_path) == ""
     told = run(installed, tmp_path, "camtwin", "--version").stdout
     assert told == f"camtwin {version()} from {own}\n"
 
