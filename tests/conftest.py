@@ -8,6 +8,7 @@ import sys
 import tempfile
 from collections import Counter
 from collections.abc import Iterator
+from contextlib import nullcontext
 from functools import cache, partial
 
 import pytest
@@ -21,6 +22,7 @@ from scenes.models.instrument_model import Instrument
 from scenes.specs.job import JobSpec
 from scenes.specs.load import load_camera, load_instrument
 from scenes.specs.resolved import resolve_job
+from tests.figures import undrawn
 from tests.tiers import longest_first, shuffled
 from twin.monitor.calibration_cache import VARIABLE, recomputed
 from twin.monitor.monitor_experiment import MonitorExperiment
@@ -86,6 +88,16 @@ def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
     reasons = Counter(report.longrepr[2].removeprefix("Skipped: ") for report in skipped)
     for reason, count in reasons.most_common():
         terminalreporter.write_line(f"{count} skipped: {reason}")
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_protocol(item: pytest.Item) -> Iterator[object]:
+    """Put figures together without drawing them as SVG, which takes a tenth of all time, but for tests marked `drawn`.
+
+    What is drawn is held by the golden runs of all commands, which are processes of their own.
+    """
+    with nullcontext() if item.get_closest_marker("drawn") else undrawn():
+        return (yield)
 
 
 @pytest.hookimpl(trylast=True)

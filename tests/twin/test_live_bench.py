@@ -25,6 +25,8 @@ from twin.main_job.monitor_reading import stated
 from twin.main_job.render_job import render_job
 from twin.monitor.time_series import series_states
 
+pytestmark = pytest.mark.drawn
+
 M2, PLANE = "base/forward/M2", "base/backward/focal_plane"
 
 

@@ -21,6 +21,8 @@ from twin.live.saved_files import camera_file, course_text
 from twin.live.source import read_source
 from twin.scripting.instrument_twin import InstrumentTwin
 
+pytestmark = pytest.mark.drawn
+
 KNOBS = {"design/M1 radius": 0.01, "design/M2 conic": 0.02, "design/M2 thickness": 0.1, "field x": 0.05}
 
 

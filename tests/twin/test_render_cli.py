@@ -40,6 +40,8 @@ from twin.main_job.render_folder import (
 )
 from twin.main_job.render_job import render_job
 
+pytestmark = pytest.mark.drawn
+
 run = partial(invoke, command.app)
 """The command inside this process."""
 

@@ -42,6 +42,8 @@ from twin.main_job.systematics import systematics
 from twin.pictures.light_paths import trace_light_paths
 from twin.pictures.scene_file import scene_bytes, viewer_programs, viewer_scripts
 
+pytestmark = pytest.mark.drawn
+
 
 @pytest.fixture(scope="module")
 def run(backend) -> RenderRun:

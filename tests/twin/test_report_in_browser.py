@@ -15,7 +15,11 @@ from twin.pictures.light_paths import trace_light_paths
 from twin.pictures.scene_file import scene_bytes, viewer_page
 
 CHROMIUM = shutil.which("chromium")
-pytestmark = [pytest.mark.second, pytest.mark.skipif(CHROMIUM is None, reason="chromium is not installed")]
+pytestmark = [
+    pytest.mark.second,
+    pytest.mark.skipif(CHROMIUM is None, reason="chromium is not installed"),
+    pytest.mark.drawn,
+]
 
 # software rendering, so that it needs no GPU
 SOFTWARE = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]

@@ -14,6 +14,8 @@ from twin.study.report import study_plots
 from twin.study.report.study_report import report_files
 from twin.study.report.study_statistics import StudyRuns
 
+pytestmark = pytest.mark.drawn
+
 TWO = "{y: {key: [t, y_um]}, z: {key: [t, z]}}"
 
 

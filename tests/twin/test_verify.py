@@ -46,6 +46,8 @@ from twin.study.runs.setup import resolve_study
 from twin.study.study_files import write_data
 from twin.verify import app
 
+pytestmark = pytest.mark.drawn
+
 
 @pytest.fixture
 def folder(tmp_path) -> Path:

@@ -1,34 +1,16 @@
-"""Formulas broken on purpose, and checks without their figures, where a test wants only the verdicts."""
+"""Formulas broken on purpose."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
-from unittest.mock import patch
 
 import numpy as np
 import pytest
-from matplotlib.figure import Figure
 
 Broken = Callable[[Any], Any]
 """The right function -> the wrong one."""
-
-
-@contextmanager
-def undrawn() -> Iterator[None]:
-    """Context in which SVG figures are put together but come out empty; rendering them takes most of a fast check."""
-    draw = Figure.savefig
-
-    def savefig(figure: Figure, out, **options) -> None:
-        if options.get("format") == "svg":
-            out.write("<svg></svg>")
-        else:
-            draw(figure, out, **options)
-
-    with patch.object(Figure, "savefig", savefig):
-        yield
 
 
 def break_it(monkeypatch: pytest.MonkeyPatch, places: Any, name: str, broken: Broken) -> None:

@@ -22,7 +22,7 @@ from analysis.orbit.planes import PlaneFit, Station, sensitivity
 from optics.numerics.backend import load_backend
 from scenes.specs.orbit.angle import LINES, usual_angles
 from tests.analysis.test_planes import DEG, SCENE, Pass, descending_pass
-from tests.validation.mutated import break_it, undrawn, with_fields
+from tests.validation.mutated import break_it, with_fields
 from twin.orbit.angle import angle_flight as flight_module
 from twin.validation.check import CORRECTED, REFUTED, VERDICTS
 from twin.validation.group import Context
@@ -41,8 +41,7 @@ FOUND = yaml.safe_load(Path(__file__).with_name("paper_000.yaml").read_text("utf
 
 
 def checked(only, seed=3):
-    with undrawn():
-        return run_checks(select(GROUPS, only), load_backend("llvm"), seed, fast=True)
+    return run_checks(select(GROUPS, only), load_backend("llvm"), seed, fast=True)
 
 
 def test_every_check_is_listed():

@@ -23,7 +23,7 @@ from analysis.calibration import normal_equations
 from analysis.orbit import calibration_parameters, forward_intersection
 from analysis.orbit.forward_intersection import CheckErrors
 from optics.numerics.backend import load_backend
-from tests.validation.mutated import break_it, undrawn, with_fields
+from tests.validation.mutated import break_it, with_fields
 from twin.framework.random_streams import stream
 from twin.orbit.calibration import schemes as calibration_schemes
 from twin.orbit.calibration.campaign_adjustment import calibrated_alone
@@ -42,8 +42,7 @@ LOST = {"003.table1", "003.table6", "003.table7", "003.fig1", "003.fig2", "003.f
 
 def found(ids, seed=1):
     chosen = [Selection(group, frozenset(ids) & frozenset(group.ids)) for group in GROUPS]
-    with undrawn():
-        return run_checks([c for c in chosen if c.ids], load_backend("llvm"), seed, fast=True)
+    return run_checks([c for c in chosen if c.ids], load_backend("llvm"), seed, fast=True)
 
 
 def test_lost_tables_need_no_work(monkeypatch):

@@ -9,7 +9,6 @@ from analysis.monitor import monitor_formulas
 from analysis.spots.spot_positions import SpotError
 from scenes.specs.job import JobSpec
 from scenes.specs.resolved import resolve_job
-from tests.validation.mutated import undrawn
 from twin.validation import group
 from twin.validation.check import CORRECTED, REFUTED
 from twin.validation.group import Context
@@ -171,8 +170,7 @@ def test_the_range_of_a_formula_turns_with_a_wrong_factor(bench, wide, backend, 
 
 @pytest.mark.second
 def test_only_a_plane_face_returns_what_the_formulas_take(backend):
-    with undrawn():
-        results = run_checks(select([GROUP], "001.returns"), backend, 1, fast=True).results
+    results = run_checks(select([GROUP], "001.returns"), backend, 1, fast=True).results
     found = {r.id.rpartition(".")[2]: r for r in results}
     assert {r.id: r.verdict for r in results} == {i: v for i, v in EXPECTED.items() if "returns" in i}
     # pinhole images on a mirror's far side of its normal, and on itself by a retroreflector
