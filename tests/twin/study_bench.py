@@ -27,6 +27,12 @@ def refusals(group: str) -> list[Any]:
     return [pytest.param(*row, id=str(row[-1])) for row in REFUSED[group]]
 
 
+def without_mtf_and_many_rays(monkeypatch: pytest.MonkeyPatch) -> None:
+    """They take most of the time; few rays sample all states of a beam that edges vignette alike, too."""
+    monkeypatch.setattr("twin.camera.camera_run.MAX_WAVES_FOR_MTF", 0.0)
+    monkeypatch.setattr("scenes.models.camera_sharpness.EVEN", 1000)
+
+
 def budget(folder: Path, name: str = "gf7", **changes: Any) -> ToleranceSetup:
     """Read a tolerance budget of study_texts.yaml with other keys at its top from a file."""
     file = folder / "budget.yaml"

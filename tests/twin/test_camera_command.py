@@ -27,7 +27,7 @@ from scenes.yaml.spec import validate
 from scenes.yaml.yaml_file import read_yaml
 from tests.scenes.refusals.tables import good
 from tests.twin.commands import edited_copy, invoke, refused
-from tests.twin.study_bench import REFUSED, TEXTS, refusals
+from tests.twin.study_bench import REFUSED, TEXTS, refusals, without_mtf_and_many_rays
 from tests.twin.test_blurred_cameras import GF7, gf7_with
 from twin.camera import camera_plots
 from twin.camera.__main__ import app
@@ -209,7 +209,7 @@ def test_what_it_refuses(tmp_path) -> None:
 @pytest.mark.second
 def test_an_area_detector_has_its_size_and_may_be_larger_than_the_field(tmp_path, backend, monkeypatch) -> None:
     """0.3 deg by 0.04 deg at 5 m are 26 by 3.5 mm, and 2048 pixels of 7 um 14.3 mm."""
-    monkeypatch.setattr("twin.camera.camera_run.MAX_WAVES_FOR_MTF", 0.0)  # no MTF, which takes most of the time
+    without_mtf_and_many_rays(monkeypatch)
     spec = load_camera("ritchey_chretien")
     data = first_order_data(CameraOptics.alone(spec, backend))
     assert "detector_mm" not in FIRST_ORDER(data)
@@ -255,7 +255,7 @@ def test_the_printed_motion_refocuses(backend, monkeypatch, camera: str, words: 
 
     The text has five digits of a shift of some 50 um, 0.5 nm: far below 1e-5 waves.
     """
-    monkeypatch.setattr("twin.camera.camera_run.MAX_WAVES_FOR_MTF", 0.0)  # no MTF, which takes most of the time
+    without_mtf_and_many_rays(monkeypatch)
     setup = resolve_camera(camera, "forward" if camera == "gf7_pair" else None)
     found = run_camera(setup.perturbed(words), backend, refocus=True, tilt=tilt)
     moved = found.refocus.words
@@ -274,7 +274,7 @@ def test_the_printed_motion_refocuses(backend, monkeypatch, camera: str, words: 
 @pytest.mark.second
 def test_the_sign_of_the_printed_motion(backend, monkeypatch) -> None:
     """A focal plane 40 um too far toward the scene goes back, whether the light there comes from the scene or not."""
-    monkeypatch.setattr("twin.camera.camera_run.MAX_WAVES_FOR_MTF", 0.0)
+    without_mtf_and_many_rays(monkeypatch)
     for name, along in (("gf7", "along"), ("cassegrain", "against")):
         found = run_camera(resolve_camera(name).perturbed(["focal_plane shift z 40 um"]), backend, refocus=True)
         own = find_focus(CameraOptics.alone(load_camera(name), backend), tilt=False)

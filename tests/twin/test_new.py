@@ -87,7 +87,7 @@ def test_a_new_file_is_read_without_a_warning(telescope: str, kind: str, cameras
 
 @pytest.mark.second
 @pytest.mark.parametrize("telescope", ["korsch", "triplet"])
-def test_a_new_study_and_a_new_budget_run(telescope: str, cameras: Path, tmp_path: Path) -> None:
+def test_a_new_budget_runs(telescope: str, cameras: Path, tmp_path: Path) -> None:
     """The requirement of a budget leaves room for the design, and the range of the compensator for its limits."""
     camera = cameras / f"{telescope}.yaml"
     budget = tmp_path / "budget.yaml"
@@ -97,8 +97,12 @@ def test_a_new_study_and_a_new_budget_run(telescope: str, cameras: Path, tmp_pat
     found = json.loads(done.stdout)
     # at an optimum slopes vanish; the process of the tests may be large
     assert not [text for text in found["warnings"] if "linear model" not in text and "processes need" not in text]
+
+
+@pytest.mark.second
+def test_a_new_study_runs(cameras: Path, tmp_path: Path) -> None:
     study = tmp_path / "study.yaml"
-    assert new("study", camera, study, "--runs", "4").exit_code == 0
+    assert new("study", cameras / "triplet.yaml", study, "--runs", "4").exit_code == 0
     done = invoke(study_app, study, "--out", tmp_path / "study", "--workers", "1", "--json")
     assert done.exit_code == 0, done.stderr
     assert "failed" in done.stdout

@@ -7,6 +7,7 @@ import subprocess
 import sys
 import time
 from contextlib import nullcontext
+from importlib import import_module
 from pathlib import Path
 
 import numpy as np
@@ -20,8 +21,8 @@ from scenes.specs.load import LIBRARY
 from scenes.specs.perturbation import perturbation_text
 from scenes.specs.procedures import PROCEDURES
 from scenes.yaml.errors import InputError, Problem
-from tests.twin.commands import files
-from tests.twin.study_bench import TEXTS, refusals
+from tests.twin.commands import files, invoke
+from tests.twin.study_bench import TEXTS, refusals, without_mtf_and_many_rays
 from twin.main_job.monitor_reading import stated
 from twin.monitor.truth import trace_truth
 from twin.study import scripted
@@ -44,6 +45,7 @@ def shot(pair: twin.InstrumentTwin) -> twin.Shot:
 
 
 @pytest.mark.second
+@pytest.mark.drawn
 def test_it_is_what_the_command_gives(pair: twin.InstrumentTwin, shot: twin.Shot, tmp_path: Path) -> None:
     """The library's example is scenes/examples/perturb.yaml: frames to the byte, readings to what files state."""
     out = tmp_path / "run"
@@ -142,8 +144,9 @@ def test_tables_of_nodes_are_kept_but_not_added() -> None:
 
 
 @pytest.mark.second
-def test_a_camera_is_refocused_and_described_in_one_line(tmp_path: Path) -> None:
+def test_a_camera_is_refocused_and_described_in_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """As `python -m twin.camera FILE --refocus` does, of a file that is 50 um out of focus."""
+    without_mtf_and_many_rays(monkeypatch)
     text = (LIBRARY / "cameras/gf7_conic.yaml").read_text("utf-8")
     file = tmp_path / "blurred.yaml"
     file.write_text(text.replace("z: -5216.4137 mm", "z: -5216.3637 mm"), "utf-8")
@@ -263,14 +266,17 @@ def test_a_wrong_motion_is_explained(pair: twin.InstrumentTwin, motion: str, fou
         ("uncertainty", "gf7_pair"),
     ],
 )
-def test_a_script_gets_a_commands_run_folder(name: str, file: Path | str, shot: twin.Shot, tmp_path: Path) -> None:
+def test_a_script_gets_a_commands_run_folder(
+    name: str, file: Path | str, shot: twin.Shot, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    without_mtf_and_many_rays(monkeypatch)
+    module, *subcommand = name.split()
     if name == "recover":
         file = tmp_path / file
         shot.save(tmp_path / "run")
         file.write_text("instrument: gf7_pair\ndisturbances: launch\nframes: run/images\n", "utf-8")
     folders = tmp_path / "command", tmp_path / "script"
-    command = [sys.executable, "-m", *f"twin.{name}".split(), str(file), "--out", str(folders[0]), "--quiet"]
-    subprocess.run(command, check=False)
+    invoke(import_module(f"twin.{module}.__main__").app, *subcommand, file, "--out", folders[0], "--quiet")
     twin.perform(name, file).save(folders[1])
     assert files(folders[0]) == files(folders[1])
     for kept in ("config.yaml", f"{PROCEDURES[name].kind}.json"):
@@ -283,7 +289,7 @@ def test_a_script_gets_a_commands_run_folder(name: str, file: Path | str, shot: 
 @pytest.mark.second
 def test_a_script_refocuses_a_perturbed_camera(monkeypatch: pytest.MonkeyPatch) -> None:
     """A move of the image plane alone, 0.2 waves rms, is undone up to the nominal camera's own best focus."""
-    monkeypatch.setattr("twin.camera.camera_run.MAX_WAVES_FOR_MTF", 0.0)  # no MTF, which takes most of the time
+    without_mtf_and_many_rays(monkeypatch)
     perturb = ["focal_plane shift z 400 um"]
     focused = twin.perform("camera", "ritchey_chretien", perturb=perturb, refocus=True)
     assert focused.run.refocus.errors_before.max() > 0.2

@@ -27,7 +27,7 @@ from twin.study.runs.blocks import Engine, journal_of
 from twin.study.runs.plan import Plan
 from twin.study.runs.setup import resolve_study
 
-pytestmark = pytest.mark.second
+pytestmark = [pytest.mark.second, pytest.mark.drawn]
 
 run = partial(invoke, command.app)
 
@@ -245,15 +245,15 @@ def test_a_real_scheduler_with_two_workers(done, tmp_path) -> None:
 
 def test_killed_workers_and_commands_lose_nothing(tmp_path) -> None:
     """A worker is killed and replaced, then the command itself; gone on with, every byte is as if nobody had killed."""
-    path = write_study(tmp_path, ("runs: 100", "runs: 300"))
+    path = write_study(tmp_path, ("runs: 100", "runs: 200"))
     folder, whole = tmp_path / "run", tmp_path / "whole"
     process = start(path, "--out", folder, "--workers", 2)
     try:
-        wait_for(lambda: blocks(folder) >= 2)
+        wait_for(lambda: blocks(folder) >= 1)
         below = children(process.pid)
         assert len(below) == 2
         os.kill(below[0], signal.SIGKILL)
-        wait_for(lambda: blocks(folder) >= 4)
+        wait_for(lambda: blocks(folder) >= 3)
         below = children(process.pid)
         assert process.poll() is None
         process.kill()
@@ -265,8 +265,7 @@ def test_killed_workers_and_commands_lose_nothing(tmp_path) -> None:
         process.communicate()
     assert not folder.exists()
     for out, options in ((folder, ["--resume"]), (whole, [])):
-        done = start(path, "--out", out, "--workers", 2, "--quiet", *options)
-        errors = done.communicate(timeout=180)[1]  # a warning of memory, where others use it
-        assert done.returncode == 0, errors
+        done = run(path, "--out", out, "--workers", 1, "--quiet", *options)
+        assert done.exit_code == 0, done.stderr  # a warning of memory, where others use it
     assert same_bytes(folder) == same_bytes(whole)
     assert not [place.name for place in tmp_path.iterdir() if place.name.startswith((".run", "run."))]
