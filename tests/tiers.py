@@ -40,15 +40,8 @@ LONGEST = (
     "test_extension_points.py",
     "twin/test_new.py",
     "twin/test_live_browser.py",
-    "limits/test_extremes.py",
-    "twin/test_render_cli.py",
-    "validation/test_formulas_001.py",
-    "twin/test_processors.py",
-    "twin/test_orbit_calibration.py",
-    "test_docs.py",
-    "twin/test_orbit_block.py",
 )
-"""Files whose tests take about twenty seconds and more, longest first. Few tests they may be:
+"""Files whose tests take about thirty seconds and more, longest first. Few tests they may be:
 by their number they would come last, and one process would wait for the other.
 """
 
