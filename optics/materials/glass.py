@@ -9,8 +9,6 @@ Manufacturers give indices relative to air of 20 C and 1013 hPa (``Glass.index``
 ``Glass.vacuum_index``.
 """
 
-from __future__ import annotations
-
 import csv
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass

@@ -4,8 +4,6 @@ First-order data are parabasal about a chief ray, or paraxial about the axis. Th
 of sight, roll and principal distance.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

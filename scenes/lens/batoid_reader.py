@@ -3,8 +3,6 @@
 In batoid light comes down from +z; here it enters toward +z. Everything is rotated about x by 180 deg.
 """
 
-from __future__ import annotations
-
 import math
 import warnings
 from collections.abc import Mapping

@@ -7,8 +7,6 @@ The pupil is defined by the size of the stop, with real ray aiming.
 batoid: there light comes down from +z; here it enters toward +z. Everything is rotated about x by 180 deg.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from dataclasses import replace

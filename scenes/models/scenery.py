@@ -7,8 +7,6 @@ do not matter for stray light. So are motions of single footprints on a glass fa
 each other.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -20,17 +18,7 @@ from optics.geometry.pose import Pose
 from optics.geometry.solid import Coating, Face, Solid, solid_mesh
 from optics.geometry.surface import Surface, plane
 from optics.geometry.tree import AT_REST, Motion, PlacedBodies, State
-from optics.materials.fresnel_scatter import (
-    ABSORBER,
-    BARE,
-    BLACK,
-    COATED,
-    GROUND,
-    MIRROR,
-    SILICON,
-    CoatingTable,
-    Finish,
-)
+from optics.materials import fresnel_scatter
 from optics.raytrace.assembly import Assembly, Element, Interaction
 from scenes.models.camera_model import line_body
 from scenes.models.instrument_model import Instrument
@@ -72,17 +60,17 @@ class Finishes:
         Mirror faces of glass bodies; None for the finish of the mirrors.
     """
 
-    mirror: Finish = MIRROR
-    mirror_back: Finish = BLACK
-    coated: Finish = COATED
-    bare: Finish = BARE
-    ground: Finish = GROUND
-    detector: Finish = SILICON
-    board: Finish = BLACK
-    baffle: Finish | None = None
-    metallised: Finish | None = None
+    mirror: fresnel_scatter.Finish = fresnel_scatter.MIRROR
+    mirror_back: fresnel_scatter.Finish = fresnel_scatter.BLACK
+    coated: fresnel_scatter.Finish = fresnel_scatter.COATED
+    bare: fresnel_scatter.Finish = fresnel_scatter.BARE
+    ground: fresnel_scatter.Finish = fresnel_scatter.GROUND
+    detector: fresnel_scatter.Finish = fresnel_scatter.SILICON
+    board: fresnel_scatter.Finish = fresnel_scatter.BLACK
+    baffle: fresnel_scatter.Finish | None = None
+    metallised: fresnel_scatter.Finish | None = None
 
-    def of(self, coating: Coating) -> Finish:
+    def of(self, coating: Coating) -> fresnel_scatter.Finish:
         """Return the finish of a face of a glass body that has this coating."""
         return {
             Coating.MIRROR: self.mirror if self.metallised is None else self.metallised,
@@ -160,9 +148,9 @@ class SceneSurface:
     surface: Surface
     vertices: np.ndarray
     triangles: np.ndarray
-    front: Finish
-    back: Finish
-    outside: Finish = ABSORBER
+    front: fresnel_scatter.Finish
+    back: fresnel_scatter.Finish
+    outside: fresnel_scatter.Finish = fresnel_scatter.ABSORBER
     apertures: tuple[Aperture, ...] = ()
     ends: bool = True
     solid: str | None = None
@@ -296,7 +284,9 @@ def _elements_on(
     return out
 
 
-def plate_surfaces(plates: Iterable[Plate], placed: PlacedBodies, baffle: Finish | None = None) -> list[SceneSurface]:
+def plate_surfaces(
+    plates: Iterable[Plate], placed: PlacedBodies, baffle: fresnel_scatter.Finish | None = None
+) -> list[SceneSurface]:
     """Return the surfaces of baffle plates, named ``<name>/<number>``.
 
     Parameters
@@ -370,7 +360,7 @@ class MeasuredFinishes:
 
     finishes: Finishes
     scatter: Mapping[str, MeasuredScatter]
-    coatings: Mapping[str, CoatingTable]
+    coatings: Mapping[str, fresnel_scatter.CoatingTable]
 
     def to_dict(self) -> dict[str, Any]:
         """Return a summary of the tables for stray.json: kind of surface -> numbers."""
@@ -418,9 +408,9 @@ def measured_finishes(resolved: ResolvedJob) -> MeasuredFinishes | None:
     if stray is None or stray.finishes is None:
         return None
     built_in = Finishes()
-    changed: dict[str, Finish] = {}
+    changed: dict[str, fresnel_scatter.Finish] = {}
     scatter: dict[str, MeasuredScatter] = {}
-    coatings: dict[str, CoatingTable] = {}
+    coatings: dict[str, fresnel_scatter.CoatingTable] = {}
     for kind, spec in stray.finishes.by_kind.items():
         key = ("render", "stray", "finishes", kind)
         base = built_in.board if kind == "black" else getattr(built_in, kind)
@@ -451,12 +441,16 @@ def measured_finishes(resolved: ResolvedJob) -> MeasuredFinishes | None:
 
 
 def _finish(
-    base: Finish, spec: FinishSpec, kind: str, scatter: MeasuredScatter | None, coating: CoatingTable | None
-) -> Finish:
+    base: fresnel_scatter.Finish,
+    spec: FinishSpec,
+    kind: str,
+    scatter: MeasuredScatter | None,
+    coating: fresnel_scatter.CoatingTable | None,
+) -> fresnel_scatter.Finish:
     """Return a built-in finish in which measured values replace its own."""
     if kind == "black":
         assert scatter is not None
-        return Finish(table=scatter.table, scattered_only=True)
+        return fresnel_scatter.Finish(table=scatter.table, scattered_only=True)
     if spec.reflectance is not None:
         base = replace(base, reflectance=spec.reflectance)
     if coating is not None:

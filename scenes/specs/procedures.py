@@ -5,8 +5,6 @@ test is imported on first use: help and messages about files do not wait for num
 wait for plotting modules.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path

@@ -11,13 +11,20 @@ from pydantic import Field
 from optics.numerics.number_tree import FrozenMap
 from scenes.specs import load
 from scenes.specs.camera import PANCHROMATIC, CameraSpec
-from scenes.specs.camera_tests import DistortionTestSpec, FocusTestSpec, MeasuredDistortionSpec, MeasuredFocusSpec
+from scenes.specs.camera_tests import (
+    DistortionTestSpec,
+    FocusTestSpec,
+    MeasuredDistortionSpec,
+    MeasuredFocusSpec,
+    MeasuredTurntableSpec,
+    TurntableFiles,
+    TurntableTestSpec,
+)
 from scenes.specs.detector import DetectorSpec, require_detector
 from scenes.specs.disturbances import DisturbancesSpec, ErrorBudgetSpec
 from scenes.specs.instrument import InstrumentSpec
 from scenes.specs.job import JobSpec, PerturbationSpec, TargetsSpec, with_tables
 from scenes.specs.perturbation import IN_WORDS
-from scenes.specs.turntable import MeasuredTurntableSpec, TurntableFiles, TurntableTestSpec
 from scenes.yaml.errors import InputError, Issue, unknown
 from scenes.yaml.input_file import is_file
 from scenes.yaml.spec import Name, Paths, Spec, validate

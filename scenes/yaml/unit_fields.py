@@ -8,8 +8,6 @@
 its kind, such as 20 um for a length, would be misleading for an entrance pupil.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass

@@ -31,14 +31,15 @@ from twin.path_tracing.clear_ways import ClearSegments
 from twin.path_tracing.importance_sampling import LEAST_SURVIVAL, LearnedRoulette, PathHistory, learn_survival
 from twin.path_tracing.path_families import Event, code, nominal_codes
 from twin.path_tracing.path_result import NOMINAL, PathResult
-from twin.path_tracing.source import DiskSource, RaySource
 from twin.path_tracing.stray_light import monitor_families, pinhole, trace_stray
 from twin.path_tracing.tracer import (
     BALANCED,
     FAINT,
     LEAST_NOMINAL,
     VARIANTS,
+    DiskSource,
     PathTracer,
+    RaySource,
     Sampling,
     VariantUnavailable,
     load_mitsuba,

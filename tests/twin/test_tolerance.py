@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from scenes.lens.first_design import first_camera
+from scenes.lens.prescription import first_camera
 from scenes.specs.job import checked_nodes
 from scenes.specs.load import LIBRARY
 from scenes.specs.resolved import resolve
@@ -20,7 +20,7 @@ from scenes.yaml.yaml_file import YamlFile, dump_yaml, read_yaml
 from tests.twin.study_bench import TEXTS, budget, refusals
 from twin.camera.camera_optics import CameraOptics
 from twin.monitor.monitor_experiment import MonitorExperiment
-from twin.tolerance import allocation, instrument_warnings, merit_models, samples, tolerance_report, tolerance_run
+from twin.tolerance import allocation, merit_models, samples, tolerance_report, tolerance_run
 from twin.tolerance.allocation import CostCurve
 from twin.tolerance.merit_models import MeritModel, VarianceShares, inverse_limits, sensitivities
 from twin.tolerance.monitor_merit import Merit
@@ -518,11 +518,9 @@ def test_cameras_have_errors_of_their_own(backend, tmp_path, monkeypatch) -> Non
 
 def test_warnings_of_instrument_and_engine_reach_the_report(backend, tmp_path, monkeypatch) -> None:
     told: list[str] = []
-    monkeypatch.setattr(instrument_warnings, "blur_warnings", lambda setup, backend: ("the camera is blurred",))
-    monkeypatch.setattr(instrument_warnings, "unmodelled_obscuration", lambda model, way: "M2 stands in its beam")
-    monkeypatch.setattr(
-        instrument_warnings, "moved_into_beams", lambda *state: ("left: M2 has moved and would take 3 rays",)
-    )
+    monkeypatch.setattr(tolerance_run, "blur_warnings", lambda setup, backend: ("the camera is blurred",))
+    monkeypatch.setattr(tolerance_run, "unmodelled_obscuration", lambda model, way: "M2 stands in its beam")
+    monkeypatch.setattr(tolerance_run, "moved_into_beams", lambda *state: ("left: M2 has moved and would take 3 rays",))
 
     def drawn(*given: Any) -> Any:
         force: Workforce = given[5]
@@ -553,7 +551,7 @@ def test_a_camera_whose_own_parts_stand_in_its_beam_is_told(backend, tmp_path) -
     setup = budget(
         tmp_path, "few", instrument=str(file), tolerances=tolerances, compensators={}, merits={"w": wavefront}
     )
-    found = instrument_warnings.instrument_warnings(setup, ToleranceBench(setup, backend))
+    found = tolerance_run.instrument_warnings(setup, ToleranceBench(setup, backend))
     assert any("the file does not model this obscuration" in text for text in found)
 
 

@@ -20,7 +20,7 @@ from scenes.models.disturbances import HEAT, Component, DisturbancePrior
 from scenes.models.instrument_model import Instrument
 from scenes.models.thermal_model import ThermalModel
 from scenes.specs.asbuilt import AsBuiltSpec
-from scenes.specs.motion_text import short_name
+from scenes.specs.perturbation import short_name
 from scenes.specs.tolerance import amount_si
 from twin.tolerance.variations import BodyMove, VariedParameter, actuator_parameter, heat_moves, states_of
 

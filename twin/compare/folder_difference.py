@@ -5,8 +5,6 @@ excluded. `file_difference` lists every number, text and array that is not equal
 ``twin.verify`` decide which of these count.
 """
 
-from __future__ import annotations
-
 import csv
 import io
 import json

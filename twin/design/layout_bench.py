@@ -7,8 +7,6 @@ so that thousands of combinations are compared without a trace. The best ones ar
 facets in one block and adjacent prisms.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property, lru_cache

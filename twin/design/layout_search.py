@@ -123,25 +123,9 @@ class SearchResult:
             out.update(end.refused)
         return dict(out)
 
-    @property
-    def beams(self) -> int:
-        """Number of beams that were evaluated alone, over all searches."""
-        return sum(end.tried for end in self.ends)
-
-    @property
-    def feasible(self) -> int:
-        """Number of beams that are feasible alone, over all searches."""
-        return sum(end.feasible for end in self.ends)
-
-    @property
-    def compared(self) -> int:
-        """Number of combinations of beams whose merit was computed, over all searches."""
-        return sum(end.compared for end in self.ends)
-
-    @property
-    def built(self) -> int:
-        """Number of layouts that were built as a whole, over all searches."""
-        return sum(end.built for end in self.ends)
+    def total(self, number: str) -> int:
+        """Return the sum over all searches of ``tried``, ``feasible``, ``compared`` or ``built``."""
+        return sum(getattr(end, number) for end in self.ends)
 
 
 def merit(sigmas: Mapping[str, Mapping[str, float]], bench: LayoutBench) -> float:

@@ -1,7 +1,5 @@
 """Report of a search for a monitor's layout: Pareto front, limiting causes, drawings and the instruments' files."""
 
-from __future__ import annotations
-
 from math import sqrt
 
 import numpy as np
@@ -93,9 +91,10 @@ def _row(run: MonitorDesignRun, name: str, facts: LayoutFacts) -> list[str | int
 
 def _search_text(run: MonitorDesignRun) -> str:
     results = run.results
+    tried, feasible, compared, built = map(results.total, ("tried", "feasible", "compared", "built"))
     text = (
-        f"{results.beams} beams were evaluated alone, of which {results.feasible} are feasible; {results.compared} "
-        f"combinations were compared and {results.built} built as a whole, {len(results.layouts)} of them feasible."
+        f"{tried} beams were evaluated alone, of which {feasible} are feasible; {compared} combinations were compared "
+        f"and {built} built as a whole, {len(results.layouts)} of them feasible."
     )
     refused = sorted(results.refused.items(), key=lambda item: -item[1])[:3]
     if refused:

@@ -11,8 +11,6 @@ unequal costs). Surviving paths carry more weight, so that all expected sums are
 the nominal path are all followed: they carry most of the light, and are short.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from math import log

@@ -4,8 +4,6 @@ Several parameters may move one body. Their rotation vectors and shifts are adde
 that the order in a file does not matter.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -22,8 +20,7 @@ from optics.thermal.heat import Temperature
 from scenes.models.instrument_model import Instrument
 from scenes.models.thermal_model import TemperatureError, ThermalModel
 from scenes.specs.course import noll
-from scenes.specs.motion_text import AXES, find_node
-from scenes.specs.perturbation import PlainPerturbationSpec, perturbation_issues
+from scenes.specs.perturbation import AXES, PlainPerturbationSpec, find_node, perturbation_issues
 from scenes.specs.tolerance import CompensatorSpec, ToleranceSetup, ToleranceSpec, Varied
 from scenes.yaml.errors import InputError, KeyPath, Problem, shown
 from scenes.yaml.spec import Spec

@@ -4,8 +4,6 @@ The Jacobian holds the derivatives of the study's responses (result numbers) wit
 spread of a factor is the sigma of its normal distribution, otherwise half of the range of its values.
 """
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Callable, Sequence
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Figures of a study: distributions, response curves, effects, pairs, convergence and Pareto fronts."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Report of a study: ``report.html``, the figures and tables in ``artefacts``, and ``statistics.json``."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
