@@ -37,13 +37,8 @@ POSE_QUANTITIES = ("z", "y", "tilt")
 BIAS = "field_bias"
 _STEPS = {"z": ("", "shift", 2), "y": ("", "shift", 1), "tilt": ("/face", "rotate", 0)}
 _NUMBERS: Mapping[str, Path] = FrozenMap(
-    {
-        "curvature": ("surface", "curvature"),
-        "conic": ("surface", "conic"),
-        "A4": ("surface", "even", 0),
-        "A6": ("surface", "even", 1),
-        "A8": ("surface", "even", 2),
-    }
+    {"curvature": ("surface", "curvature"), "conic": ("surface", "conic")}
+    | {f"A{4 + 2 * k}": ("surface", "even", k) for k in range(3)}
 )
 
 
@@ -367,15 +362,8 @@ def _differentiated(
     systems = prescription.tangents(variables, "imaging")
     keep = range(len(prescription.names))
     flat = (count, -1, 3)
-    pushed = jvp(
-        backend,
-        systems,
-        np.broadcast_to(launch, shape).reshape(flat),
-        np.broadcast_to(heading, shape).reshape(flat),
-        launch_step.reshape(flat),
-        heading_step.reshape(flat),
-        keep=keep,
-    )
+    starts = (np.broadcast_to(launch, shape), np.broadcast_to(heading, shape), launch_step, heading_step)
+    pushed = jvp(backend, systems, *(start.reshape(flat) for start in starts), keep=keep)
     assert systems.world_tangents is not None
     rotation, rotation_step = (np.swapaxes(p.rotation, 0, 1) for p in (systems.world, systems.world_tangents))
     origin_step = np.swapaxes(systems.world_tangents.translation, 0, 1)

@@ -651,17 +651,8 @@ def _sizes(prescription: Prescription, variables: Sequence[Variable]) -> np.ndar
     return np.asarray(np.maximum(np.abs(prescription.values(variables)), least))
 
 
-_SMALLEST = {
-    "curvature": 1e-2,
-    "conic": 1.0,
-    "A4": 1e-3,
-    "A6": 1e-3,
-    "A8": 1e-3,
-    "z": 0.1,
-    "y": 0.01,
-    "tilt": 0.01,
-    "field_bias": 0.01,
-}
+_SMALLEST = {"conic": 1.0, "z": 0.1}
+_SMALLEST |= dict.fromkeys(("A4", "A6", "A8"), 1e-3) | dict.fromkeys(("curvature", "y", "tilt", "field_bias"), 1e-2)
 """Quantity -> smallest typical size of a variable of this kind in its SI unit, for scaling in the least squares."""
 
 

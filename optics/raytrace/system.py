@@ -147,17 +147,9 @@ class SystemBatch:
         def taken(value: np.ndarray) -> np.ndarray:
             return np.asarray(value[systems])
 
-        return SystemBatch(
-            self.structure,
-            self.form,
-            self.numbers[:, systems],
-            map_leaves(taken, self.world),
-            map_leaves(taken, self.tangents),
-            map_leaves(taken, self.world_tangents),
-            self.size[systems],
-            self.grids,
-            len(systems),
-        )
+        poses = (map_leaves(taken, part) for part in (self.world, self.tangents, self.world_tangents))
+        numbers, size = self.numbers[:, systems], self.size[systems]
+        return SystemBatch(self.structure, self.form, numbers, *poses, size, self.grids, len(systems))
 
 
 @dataclass(frozen=True, eq=False)

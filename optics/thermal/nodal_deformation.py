@@ -209,21 +209,10 @@ def nodal_deformation(
     grid, lost, between = _gridded(positions[:, :2], residual, weight, aperture, spacing)
     from scipy.spatial.transform import Rotation
 
-    return NodalDeformation(
-        triple(Rotation.from_matrix(rotation).as_rotvec()),
-        triple(shift),
-        size - 1.0,
-        FrozenMap({j: float(a) for j, a in enumerate(fitted, 1)}),
-        grid,
-        positions[:, :2],
-        weight,
-        change,
-        residual,
-        lost,
-        between,
-        spacing,
-        len(order) - len(points),
-    )
+    figure = FrozenMap({j: float(a) for j, a in enumerate(fitted, 1)})
+    motion = (triple(Rotation.from_matrix(rotation).as_rotvec()), triple(shift), size - 1.0, figure, grid)
+    nodes = (positions[:, :2], weight, change, residual)
+    return NodalDeformation(*motion, *nodes, lost, between, spacing, len(order) - len(points))
 
 
 _CHECK = "displacements in the unit of the column heads, and nodes in the named frame"

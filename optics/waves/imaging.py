@@ -197,14 +197,8 @@ def fit_part(x: np.ndarray, y: np.ndarray, weight: np.ndarray, difference: np.nd
     square = float(share @ flat**2)
     residual = float(share @ (flat - basis @ coefficients) ** 2)
     phasor = share @ np.exp(2j * np.pi * flat)
-    return PartFit(
-        level,
-        coefficients,
-        parts,
-        float(np.sqrt(max(square, 0.0))),
-        float(np.sqrt(max(residual, 0.0))),
-        float(abs(phasor) ** 2),
-    )
+    rms, rest = (float(np.sqrt(max(mean_square, 0.0))) for mean_square in (square, residual))
+    return PartFit(level, coefficients, parts, rms, rest, float(abs(phasor) ** 2))
 
 
 AIM_TOLERANCE = 1e-12

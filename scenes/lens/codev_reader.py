@@ -180,16 +180,8 @@ def take(system: CodevSystem, s: Statement) -> None:
         source.note(s, "not understood")
 
 
-_FIELDS = {
-    "XAN": "angles",
-    "YAN": "angles",
-    "XOB": "object heights",
-    "YOB": "object heights",
-    "XIM": "image heights",
-    "YIM": "image heights",
-    "XRI": "real image heights",
-    "YRI": "real image heights",
-}
+_KINDS = {"AN": "angles", "OB": "object heights", "IM": "image heights", "RI": "real image heights"}
+_FIELDS = {f"{axis}{ending}": kind for ending, kind in _KINDS.items() for axis in "XY"}
 
 
 def _qualified(s: Statement) -> bool:
@@ -424,18 +416,11 @@ def _prescription(system: CodevSystem, glasses: Glasses) -> Prescription:
     pupil, pairs = system.pupil, paired(system.x, system.y)
     if pupil is not None and pupil.kind == "diameter":
         pupil = Pupil("diameter", pupil.value * scale, pupil.line)
-    return chain.prescription(
-        "STO",
-        read[0].thickness * scale,
-        system.name,
-        wavelength=wavelength,
-        wavelengths=tuple(dict.fromkeys(system.waves)),
-        fields=pairs if system.field_kind == "angles" else (),
-        heights=() if system.field_kind == "angles" else tuple((x * scale, y * scale) for x, y in pairs),
-        field_kind=system.field_kind,
-        pupil=pupil,
-        glasses=named_glasses(glasses, chain.surfaces),
-    )
+    light = {"wavelength": wavelength, "wavelengths": tuple(dict.fromkeys(system.waves)), "pupil": pupil}
+    heights = tuple((x * scale, y * scale) for x, y in pairs)
+    field = {"fields": pairs} if system.field_kind == "angles" else {"heights": heights}
+    light |= {**field, "field_kind": system.field_kind, "glasses": named_glasses(glasses, chain.surfaces)}
+    return chain.prescription("STO", read[0].thickness * scale, system.name, **light)
 
 
 def _behind(source: Source, surface: CodevSurface, wavelength: float, glasses: Glasses) -> tuple[float, str] | None:

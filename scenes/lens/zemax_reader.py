@@ -8,6 +8,7 @@ right-handed.
 import math
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 from optics.geometry.aperture import Aperture, Circle, Edge, EdgeShape, Ellipse, Rectangle
 from optics.geometry.pose import about_axis
@@ -286,18 +287,13 @@ def _prescription(system: _System, glasses: statements.Glasses) -> Prescription:
         radius = next((s.radius for s in read if s.stop), 0.0) * scale
         pupil = Pupil("stop", radius, pupil.line) if radius > 0.0 else None
     kinds = ("angles", "object heights", "paraxial image heights", "real image heights", "theodolite angles")
-    return chain.prescription(
-        "STOP",
-        read[0].thickness * scale,
-        system.name,
-        wavelength=primary,
-        wavelengths=tuple(dict.fromkeys(waves)),
-        fields=_fields(system) if system.field_type == 0 else (),
-        heights=tuple((x * scale, y * scale) for x, y in _pairs(system)) if 1 <= system.field_type <= 3 else (),
-        field_kind=kinds[min(system.field_type, 4)],
-        pupil=pupil,
-        glasses=statements.named_glasses(glasses, chain.surfaces),
-    )
+    light: dict[str, Any] = {"wavelength": primary, "wavelengths": tuple(dict.fromkeys(waves)), "pupil": pupil}
+    light |= {"fields": _fields(system)} if system.field_type == 0 else {}
+    if 1 <= system.field_type <= 3:
+        light["heights"] = tuple((x * scale, y * scale) for x, y in _pairs(system))
+    light |= {"field_kind": kinds[min(system.field_type, 4)]}
+    light |= {"glasses": statements.named_glasses(glasses, chain.surfaces)}
+    return chain.prescription("STOP", read[0].thickness * scale, system.name, **light)
 
 
 def _pairs(system: _System) -> tuple[tuple[float, float], ...]:

@@ -40,17 +40,10 @@ AXES = "xyz"
 INDEFINITE = -1e-9
 """Eigenvalue below which a correlation matrix is indefinite; values between it and 0 are rounding errors."""
 UNITS: Mapping[str, tuple[str, float]] = {
-    "shift": ("um", 1e-6),
-    "rotate": ("arcsec", parse_quantity("1 arcsec", ANGLE)),
-    "scale": ("ppm", 1e-6),
-    "radius": ("ppm", 1e-6),
-    "conic": ("ppm", 1e-6),
-    "index": ("ppm", 1e-6),
-    "abbe": ("percent", 1e-2),
-    "figure": ("nm", 1e-9),
-    "temperature": ("K", 1.0),
-    "gradient": ("mK/m", 1e-3),
-    "index_gradient": ("ppm/m", 1e-6),
+    **{"shift": ("um", 1e-6), "rotate": ("arcsec", parse_quantity("1 arcsec", ANGLE)), "figure": ("nm", 1e-9)},
+    **dict.fromkeys(("scale", "radius", "conic", "index"), ("ppm", 1e-6)),
+    **{"abbe": ("percent", 1e-2), "index_gradient": ("ppm/m", 1e-6)},
+    **{"temperature": ("K", 1.0), "gradient": ("mK/m", 1e-3)},
 }
 """Kind of component -> the unit in which its amounts are printed, and the size of that unit in SI."""
 HEAT = ("temperature", "gradient")
@@ -504,9 +497,8 @@ def _of_joint(
             if about and about not in info.known_pivots:
                 raise unknown(f"{path} has no such pivot", about, info.known_pivots)
             if (path, kind, axis) in named:
-                raise Problem(
-                    "a component is named twice", shown(name), f"once; it is the same as {named[path, kind, axis]}"
-                )
+                same = f"once; it is the same as {named[path, kind, axis]}"
+                raise Problem("a component is named twice", shown(name), same)
         except Problem as wrong:
             issues.append(spec.issue(wrong, (disturbances.JOINT, "components", name)))
             continue
@@ -516,9 +508,8 @@ def _of_joint(
     matrix = np.eye(len(joint.components)) if joint.correlation is None else np.array(joint.correlation)
     if (least := _least(matrix)) < INDEFINITE:
         text = f"the correlation matrix is not positive definite: it has an eigenvalue of {least:.3g}"
-        issues.append(
-            spec.issue(Problem(text, allowed="correlations of real quantities"), (disturbances.JOINT, "correlation"))
-        )
+        problem = Problem(text, allowed="correlations of real quantities")
+        issues.append(spec.issue(problem, (disturbances.JOINT, "correlation")))
     if issues:
         return [], np.zeros((0, 0)), issues
     moving = [k for k, c in enumerate(components) if c.sigma > 0.0]
@@ -735,7 +726,6 @@ def joint_disturbances(
     nodes: Mapping[str, NodeInfo],
     reason: str,
     description: str = "",
-    time: disturbances.TimeLawSpec | None = None,
 ) -> disturbances.DisturbancesSpec:
     """Return a disturbances specification, with `joint`, of components with a given covariance.
 
@@ -756,8 +746,6 @@ def joint_disturbances(
         Origin of the numbers, written into the file.
     description : str
         Description written into the file.
-    time : TimeLawSpec or None
-        Law of time in a series of measurements; constant by default.
 
     Raises
     ------
@@ -782,19 +770,9 @@ def joint_disturbances(
     if len(moving) and np.linalg.eigvalsh(correlation)[0] < INDEFINITE:
         raise ValueError("the covariance has a negative eigenvalue")
     names = [_name(components[k], nodes) for k in moving]
-    plain = {
-        "name": name,
-        "description": description,
-        "joint": {
-            "components": {
-                component_name: disturbances.written_sigma(component_name, float(sigma[k]))
-                for component_name, k in zip(names, moving, strict=True)
-            },
-            "correlation": correlation.tolist(),
-            "time": (time or disturbances.TimeLawSpec(kind="constant")).plain(),
-            "reason": reason,
-        },
-    }
+    sigmas = {key: disturbances.written_sigma(key, float(sigma[k])) for key, k in zip(names, moving, strict=True)}
+    joint = {"components": sigmas, "correlation": correlation.tolist(), "time": {"kind": "constant"}, "reason": reason}
+    plain = {"name": name, "description": description, "joint": joint}
     if len(set(names)) < len(names):
         raise ValueError("a component is named twice")
     return validate(disturbances.DisturbancesSpec, YamlFile(name, plain, {}))

@@ -246,16 +246,8 @@ def _build(
         assembly = monitor_chain.square_facets(assembly, channels, cameras, backend)
     nodes = _nodes(assembly, cameras, solids)
     lengths = {key: chain.glass for key, chain in chains.items()}
-    drawn = Instrument(
-        spec,
-        assembly,
-        cameras,
-        tuple(channels),
-        FrozenMap(nodes),
-        solids,
-        FrozenMap(lengths),
-        _baffles(spec, assembly.tree),
-    )
+    parts = (FrozenMap(nodes), solids, FrozenMap(lengths), _baffles(spec, assembly.tree))
+    drawn = Instrument(spec, assembly, cameras, tuple(channels), *parts)
     instrument = as_built(drawn)
     try:
         _check_room(instrument, backend, free_beams, free_bodies)

@@ -188,19 +188,10 @@ def mirror_surface(
     surface, aperture = element.figured(motion).scaled(size), element.aperture.scaled(size)
     vertices, triangles, apart = sheet_mesh(surface, aperture)
     optical, rear = finishes.mirror, finishes.mirror_back
-    return SceneSurface(
-        element.name,
-        element.name,
-        (element.name,),
-        placed.pose(element.body),
-        surface,
-        vertices,
-        triangles,
-        front=optical if optical_side > 0.0 else rear,
-        back=rear if optical_side > 0.0 else optical,
-        apertures=(aperture,),
-        clearance=LEAST_CLEARANCE + apart,
-    )
+    name, pose, sides = element.name, placed.pose(element.body), (optical, rear)
+    sides = sides if optical_side > 0.0 else sides[::-1]
+    limits: dict[str, Any] = {"apertures": (aperture,), "clearance": LEAST_CLEARANCE + apart}
+    return SceneSurface(name, name, (name,), pose, surface, vertices, triangles, *sides, **limits)
 
 
 def solid_surfaces(
@@ -233,24 +224,16 @@ def solid_surfaces(
         vertices, triangles = polygon_mesh(pose.inverse().apply(pose_of_solid.apply(polygon)))
         finish = finishes.of(face.coating)
         name = f"{solid.path}/{face.name}"
-        out.append(
-            SceneSurface(
-                name,
-                name,
-                tuple(name for name, _ in elements),
-                pose,
-                plane(),
-                vertices,
-                triangles,
-                front=finish,
-                back=finish,
-                outside=finish if solid.transparent or not apertures else finishes.ground,
-                apertures=apertures,
-                ends=False,
-                solid=solid.path,
-                index=index,
-            )
-        )
+        names, mesh_of_face = tuple(name for name, _ in elements), (vertices, triangles)
+        outside = finish if solid.transparent or not apertures else finishes.ground
+        body: dict[str, Any] = {
+            "apertures": apertures,
+            "outside": outside,
+            "ends": False,
+            "solid": solid.path,
+            "index": index,
+        }
+        out.append(SceneSurface(name, name, names, pose, plane(), *mesh_of_face, finish, finish, **body))
     return out
 
 
@@ -301,20 +284,10 @@ def plate_surfaces(
     out = []
     for number, plate in enumerate(plates):
         vertices, triangles, _ = sheet_mesh(plane(), plate.outline)
-        out.append(
-            SceneSurface(
-                f"{plate.name}/{number}",
-                plate.name,
-                (),
-                placed.pose(plate.body) @ plate.pose,
-                plane(),
-                vertices,
-                triangles,
-                plate.finish if baffle is None else baffle,
-                plate.finish if baffle is None else baffle,
-                apertures=(plate.outline,),
-            )
-        )
+        pose, finish = placed.pose(plate.body) @ plate.pose, plate.finish if baffle is None else baffle
+        shape = (plane(), vertices, triangles, finish, finish)
+        name = f"{plate.name}/{number}"
+        out.append(SceneSurface(name, plate.name, (), pose, *shape, apertures=(plate.outline,)))
     return out
 
 
@@ -325,19 +298,8 @@ def detector_surface(
     half_x, half_y = 0.5 * detector.columns * detector.pitch[0], 0.5 * detector.rows * detector.pitch[1]
     outline = Rectangle(half_x, half_y)
     vertices, triangles, _ = sheet_mesh(plane(), outline)
-    return SceneSurface(
-        detector.name,
-        detector.name,
-        elements,
-        pose,
-        plane(),
-        vertices,
-        triangles,
-        front=finishes.detector,
-        back=finishes.board,
-        apertures=(outline,),
-        detector=detector.name,
-    )
+    name, shape, finish = detector.name, (plane(), vertices, triangles), (finishes.detector, finishes.board)
+    return SceneSurface(name, name, elements, pose, *shape, *finish, apertures=(outline,), detector=name)
 
 
 RECIPROCAL_TO = 0.3

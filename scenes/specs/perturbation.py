@@ -23,15 +23,8 @@ from scenes.yaml.units import LENGTH, SCALE, parse_quantity, split_quantity
 
 AXES = {"x": 0, "y": 1, "z": 2}
 KINDS = {
-    "shift": "x|y|z LENGTH",
-    "rotate": "x|y|z ANGLE",
-    "scale": "SHARE",
-    "radius": "SHARE",
-    "conic": "NUMBER",
-    "index": "NUMBER",
-    "abbe": "SHARE",
-    "figure": "Z5 LENGTH",
-    "temperature": "DIFFERENCE",
+    **{"shift": "x|y|z LENGTH", "rotate": "x|y|z ANGLE", "scale": "SHARE", "radius": "SHARE", "conic": "NUMBER"},
+    **{"index": "NUMBER", "abbe": "SHARE", "figure": "Z5 LENGTH", "temperature": "DIFFERENCE"},
     "gradient": "x|y|z DIFFERENCE/LENGTH",
 }
 """Kind of a perturbation -> form of the text after the kind, such as `x|y|z LENGTH`."""
@@ -333,17 +326,8 @@ class PlainPerturbationSpec(Spec):
     def motion(self) -> Motion:
         """Return the motion, SI, that the perturbation without its temperature gives the body in a state."""
         figure = {course.noll(term): value for term, value in self.figure.items()}
-        return Motion(
-            self.rotate,
-            self.shift,
-            self.pivot,
-            self.scale,
-            figure,
-            index=self.index or 0.0,
-            radius=self.radius or 0.0,
-            conic=self.conic or 0.0,
-            abbe=self.abbe or 0.0,
-        )
+        shape = {name: getattr(self, name) or 0.0 for name in ("index", "radius", "conic", "abbe")}
+        return Motion(self.rotate, self.shift, self.pivot, self.scale, figure, **shape)
 
 
 def _sums(first: Spec, other: Spec) -> dict[str, Any]:

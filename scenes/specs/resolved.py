@@ -151,14 +151,9 @@ def _with_instrument(job: JobSpec, instrument: InstrumentSpec) -> ResolvedJob:
     if job.render.target_images:
         line_detectors = FrozenMap({name: line_detector(camera) for name, camera in cameras.items()})
     # The parts are already validated; validating again would require quantities as text.
-    return ResolvedJob.model_construct(
-        job=job,
-        instrument=instrument,
-        cameras=cameras,
-        detector=detector,
-        line_detectors=line_detectors,
-        disturbances=load.find_disturbances(job, instrument),
-    )
+    found = {"detector": detector, "line_detectors": line_detectors}
+    found["disturbances"] = load.find_disturbances(job, instrument)
+    return ResolvedJob.model_construct(job=job, instrument=instrument, cameras=cameras, **found)
 
 
 def resolve_budget(budget: ErrorBudgetSpec) -> ResolvedJob:

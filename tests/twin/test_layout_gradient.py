@@ -25,8 +25,20 @@ from scenes.models.monitor_layout import (
 from tests.twin.test_monitor_layouts import FIRST, SECOND
 from twin.design import monitor_design
 from twin.design.layout_bench import FULLEST, LayoutBench, LayoutFacts, _OutsideLimitsError
-from twin.design.layout_refinement import LayoutNumber, Slope, known_of, numbers_of, refined, slope_of
-from twin.design.layout_search import Candidate, End, SearchResult, merit, optima, spread
+from twin.design.layout_search import (
+    Candidate,
+    End,
+    LayoutNumber,
+    SearchResult,
+    Slope,
+    known_of,
+    merit,
+    numbers_of,
+    optima,
+    refined,
+    slope_of,
+    spread,
+)
 from twin.framework.procedure import BenchError
 from twin.monitor.information import Information
 

@@ -35,7 +35,7 @@ from tests.optics.bench import unit
 from tests.optics.test_scatter_table import lambert, of_lobe
 from tests.tiers import quick
 from tests.twin.path_bench import facing, flat_mirror, frame, glass_scene, screen, slab
-from twin.path_tracing.importance_sampling import OutgoingPaths, TableSampling, sample_bsdf
+from twin.path_tracing.kernel import OutgoingPaths, TableSampling, sample_bsdf
 from twin.path_tracing.path_families import Event, decode
 from twin.path_tracing.path_result import Family, PathResult
 from twin.path_tracing.tables import upload_finishes

@@ -27,7 +27,7 @@ from twin.tolerance.monitor_merit import Merit
 from twin.tolerance.samples import Workforce, draw_samples
 from twin.tolerance.tolerance_bench import Adjustments, ToleranceBench
 from twin.tolerance.tolerance_run import MeritResult, Yield, run_tolerance, worst_jobs
-from twin.tolerance.variations import spectrum_shares, states_of, tolerance_parameters
+from twin.tolerance.variations import ParameterMaker, spectrum_shares, states_of
 
 
 @pytest.fixture(scope="module")
@@ -339,7 +339,8 @@ def test_bad_input_is_told_with_its_key(name: str, changes: dict, key: str, word
 def test_a_body_warmed_within_what_is_known_grows_by_its_expansion(bench, tmp_path) -> None:
     setup = budget(tmp_path, tolerances={"a": {"motion": "focal_plane temperature", "limit": "5 K"}})
     thermal = bench.experiment.thermal
-    (number,) = tolerance_parameters(setup, bench.instrument, thermal)
+    maker = ParameterMaker(setup.test, bench.instrument, thermal)
+    (number,) = (n for name, entry in setup.test.tolerances.items() for n in maker.tolerance(name, entry))
     grown = {body: move.shape["expansion"] for body, move in number.moves.items()}
     assert grown.keys() == {"base/gf7/focal_plane", "base/gf7/focal_plane/line"}
     assert grown == pytest.approx({body: thermal.materials[body].expansion for body in grown})

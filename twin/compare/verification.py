@@ -462,6 +462,18 @@ class Repetition:
         states = {file.state for file in self.files} - {SAME, EXCLUDED}
         return DIFFERENT if states - {ROUNDED, REDRAWN} else ROUNDED if states else SAME
 
+    def numbers(self) -> dict[str, Any]:
+        """Return the repetition as plain data."""
+        there = self.elsewhere
+        about = {"state": self.state, "what": self.what or "the whole run", "seconds": self.seconds}
+        about |= {"other_program": list(there.program), "other_processor": list(there.processor)}
+        files = [
+            {"file": f.file, "state": f.state, "quantities": f.count, "why": f.why}
+            | {"differ_most": [asdict(quantity) for quantity in f.quantities]}
+            for f in self.files
+        ]
+        return {**about, "provenance_known": there.known, "files": files}
+
 
 def obstacle(state: FolderState) -> str:
     """Return the reason why a run cannot be repeated from its folder; empty if it can be."""
@@ -504,15 +516,8 @@ def repeat(state: FolderState, folder: Path, quiet: bool) -> Repetition:
     if not Path(started_in).is_dir():
         raise CannotRepeat(f"the folder in which it was started is missing: {started_in}")
     # -P: never import modules from the folder in which the run was started
-    command = [
-        sys.executable,
-        "-P",
-        "-m",
-        f"{provenance.BEFORE}{arguments[0]}",
-        *arguments[1:],
-        "--out",
-        str(folder.absolute()),
-    ]
+    program = f"{provenance.BEFORE}{arguments[0]}"
+    command = [sys.executable, "-P", "-m", program, *arguments[1:], "--out", str(folder.absolute())]
     command += ["--quiet"] if quiet and manifest.program != "twin.validate" else []
     root = provenance.ROOT.parent if provenance.BEFORE else provenance.ROOT
     paths = os.pathsep.join(filter(None, (str(root), os.environ.get("PYTHONPATH"))))
@@ -697,6 +702,7 @@ class Verification:
         """Return the verification as plain data, for the command's option ``--json``."""
         state, repetition = self.state, self.repetition
         manifest = state.manifest
+        made_again = None if repetition is None else repetition.numbers()
         return {
             "run": str(state.folder),
             "of": manifest.kind,
@@ -705,26 +711,7 @@ class Verification:
             **{name: list(getattr(state, name)) for name in ("changed", "missing", "additional")},
             "sealed": state.sealed,
             **{name: list(getattr(state, name)) for name in ("inputs_changed", "inputs_gone")},
-            "made_again": None
-            if repetition is None
-            else {
-                "state": repetition.state,
-                "what": repetition.what or "the whole run",
-                "seconds": repetition.seconds,
-                "other_program": list(repetition.elsewhere.program),
-                "other_processor": list(repetition.elsewhere.processor),
-                "provenance_known": repetition.elsewhere.known,
-                "files": [
-                    {
-                        "file": file.file,
-                        "state": file.state,
-                        "quantities": file.count,
-                        "why": file.why,
-                        "differ_most": [asdict(quantity) for quantity in file.quantities],
-                    }
-                    for file in repetition.files
-                ],
-            },
+            "made_again": made_again,
             "cannot": self.obstacle,
             "checks": manifest.checks,
             "verdict": self.verdict,

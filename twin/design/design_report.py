@@ -36,10 +36,7 @@ def design_report(run: DesignRun) -> Report:
         "Wavefront error by field",
         "Waves rms, piston and tilt removed; the other half of the field is the mirror image.",
         ("x [deg]", "y [deg]", "before", "after"),
-        [
-            [float(x), float(y), float(b), float(a)]
-            for (x, y), b, a in zip(fields, before.errors, after.errors, strict=True)
-        ],
+        np.column_stack([fields, before.errors, after.errors]).tolist(),
         (3, 3, 4, 4),
     )
     changed = Table(

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -97,16 +98,9 @@ def run_design(
         raise camera.error(problem, ("mirrors",), allowed="a camera whose whole field gets light") from error
     operands = camera_design.operands_of(setup, first.principal_distance, first.envelope)
     try:
+        variables, show = camera_design.variables_of(test), partial(advance, "optimise")
         searched = optimiser.search(
-            backend,
-            start,
-            camera_design.variables_of(test),
-            beams,
-            operands,
-            test.steps,
-            test.starts,
-            seed,
-            advance=lambda done, total: advance("optimise", done, total),
+            backend, start, variables, beams, operands, test.steps, test.starts, seed, advance=show
         )
     except optimiser.DesignError as error:
         key = next((_KEYS[kind] for kind in error.violated if kind in _KEYS), ("vary",))

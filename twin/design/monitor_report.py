@@ -28,16 +28,9 @@ def monitor_design_report(run: MonitorDesignRun) -> Report:
     setup, results = run.setup, run.results
     start, test = setup.instrument.name, setup.test
     rows = [_row(run, start, results.start), *(_row(run, point.name, point.facts) for point in run.points)]
-    heads = (
-        "layout",
-        "beams per end",
-        *(f"{GOAL_NAMES[g]}, σ [{unit_for_reports(UNITS[g][0])}]" for g in test.goal.wanted),
-        "worst σ / goal",
-        "pupil [%]",
-        "prisms [kg]",
-        "glass path [m]",
-        "spots, σ [px]",
-    )
+    goals = (f"{GOAL_NAMES[g]}, σ [{unit_for_reports(UNITS[g][0])}]" for g in test.goal.wanted)
+    costs = ("worst σ / goal", "pupil [%]", "prisms [kg]", "glass path [m]", "spots, σ [px]")
+    heads = ("layout", "beams per end", *goals, *costs)
     goal_decimals = [
         decimals_for(min(run.worst(f, g) for _, f in _named(run)) / UNITS[g][1], 3) for g in test.goal.wanted
     ]

@@ -35,16 +35,9 @@ def numbers_of(reference: str, folder: Path) -> CameraNumbers:
     mounted, site = next(iter(instrument.cameras.items()))
     camera = resolved.cameras[site.camera]
     alone = len(instrument.cameras) == 1
-    return CameraNumbers(
-        camera,
-        reference_from(reference, folder),
-        instrument.name,
-        mounted,
-        "" if alone else f"{mounted}/",
-        instrument.monitor is not None,
-        sharpness(camera, backend).worst,
-        bool(derive_camera(camera, backend).first_order.scale[0, 0, 0] < 0.0),
-    )
+    names = (reference_from(reference, folder), instrument.name, mounted, "" if alone else f"{mounted}/")
+    upright = bool(derive_camera(camera, backend).first_order.scale[0, 0, 0] < 0.0)
+    return CameraNumbers(camera, *names, instrument.monitor is not None, sharpness(camera, backend).worst, upright)
 
 
 def reference_from(reference: str, folder: Path) -> str:

@@ -23,7 +23,7 @@ from scenes.models.scenery import Scenery
 from twin.path_tracing import kernel
 from twin.path_tracing import tables as layout
 from twin.path_tracing.clear_ways import Patch
-from twin.path_tracing.importance_sampling import LearnedRoulette, sample_scattering
+from twin.path_tracing.kernel import LearnedRoulette, sample_scattering
 from twin.path_tracing.path_families import Event, code, decode, signature
 from twin.path_tracing.path_result import Accumulators, Arrival, record
 
@@ -325,16 +325,8 @@ class _NominalTracer:
         # the loop handles paths that do not follow nominal light
         reason = dr.select(on & ~continues & ~(arrives & ~as_nominal), MISSED, reason)
         if step.ends:
-            return (
-                p,
-                d,
-                weight,
-                length,
-                rng_state,
-                passed,
-                dr.select(continues, ENDED, reason),
-                continues & False,
-            ), pending
+            ended = dr.select(continues, ENDED, reason)
+            return (p, d, weight, length, rng_state, passed, ended, continues & False), pending
         turned = dr.fma(at.normal, -2.0 * at.cosine, d)
         if step.event == Event.TRANSMIT:
             bent = dr.copysign(shared.bent, at.cosine)

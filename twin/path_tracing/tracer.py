@@ -17,8 +17,16 @@ from optics.numerics.backend import Backend
 from optics.raytrace.aim import transverse_axes
 from scenes.models.scenery import Scenery
 from twin.path_tracing.clear_ways import ClearSegments, Patch
-from twin.path_tracing.importance_sampling import LearnedRoulette, PathHistory, learn_survival
-from twin.path_tracing.kernel import Features, Launch, Limits, PreparedScene, follow
+from twin.path_tracing.kernel import (
+    Features,
+    Launch,
+    LearnedRoulette,
+    Limits,
+    PathHistory,
+    PreparedScene,
+    follow,
+    learn_survival,
+)
 from twin.path_tracing.path_families import SurfaceEvent, signature, surface_events
 from twin.path_tracing.path_result import NOMINAL, Accumulators, Collector, Key, PathResult, make_accumulators
 from twin.path_tracing.sequential import Departures, Step, continue_paths, make_steps, trace_nominal

@@ -39,7 +39,7 @@ from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.monitor.truth import LINE_POINTS, line_points
 from twin.targets.target_images import wavelengths_enough
 from twin.tolerance.monitor_merit import Merit, MonitorMerit, merits_of, obstructed_shares, require_bodies
-from twin.tolerance.variations import VariedParameter, compensator_parameters, states_of, tolerance_parameters
+from twin.tolerance.variations import ParameterMaker, VariedParameter, states_of
 
 TRANSFER = 1e-3
 """Largest allowed error of the nominal pupil's MTF when it is computed at fixed points of the pupil."""
@@ -453,8 +453,11 @@ class ToleranceBench:
         self.camera = judged_camera(setup.test, self.instrument)
         self.line = line_points(instrument, self.camera)
         thermal = self.experiment.thermal
-        self.numbers: tuple[VariedParameter, ...] = tolerance_parameters(setup, instrument, thermal)
-        self.compensators: tuple[VariedParameter, ...] = compensator_parameters(setup, instrument, thermal)
+        maker = ParameterMaker(test, instrument, thermal)
+        self.numbers: tuple[VariedParameter, ...] = tuple(
+            number for name, tolerance in test.tolerances.items() for number in maker.tolerance(name, tolerance)
+        )
+        self.compensators = tuple(maker.compensator(name, spec) for name, spec in test.compensators.items())
         self.merits, self.fields = merits_of(dict(test.merits), len(self._along), tuple(instrument.cameras))
         if not len(self.fields) and self.compensators:
             allowed = "a merit of kind wavefront, mtf or chief_ray, at whose fields the wavefront is made least"
@@ -535,15 +538,8 @@ class ToleranceBench:
         except (VignettedBeamError, RoughWavefrontError) as error:
             raise self.setup.test.error(str(error), ("merits",), allowed=error.allowed) from error
         self._roots = WavefrontNorm.of(self.beams.illuminated_nodes(), self.beams.degree)
-        self._transfers = fixed_transfers(
-            self.optics,
-            self.setup.test,
-            self.merits,
-            self.fields,
-            (colours, shares),
-            self.beams.cosines,
-            self.beams.degree,
-        )
+        beams, light = (self.beams.cosines, self.beams.degree), (colours, shares)
+        self._transfers = fixed_transfers(self.optics, self.setup.test, self.merits, self.fields, light, *beams)
         self._adjust = Adjustments(self.ranges, self.grid_steps, self.accuracies, self._adjustment_slope())
 
     def _adjustment_slope(self) -> np.ndarray:
@@ -789,14 +785,8 @@ class ToleranceBench:
 
     def _modulations(self, k: int, merit: Merit, eikonals: np.ndarray) -> np.ndarray:
         longer = eikonals - self.beams.designed.eikonals[0]
-        return np.stack(
-            [
-                transfer.modulation(longer[:, f])
-                for f, row in zip(merit.fields, self._transfers[k], strict=True)
-                for transfer in row
-            ],
-            axis=-1,
-        )
+        pairs = zip(merit.fields, self._transfers[k], strict=True)
+        return np.stack([part.modulation(longer[:, f]) for f, row in pairs for part in row], axis=-1)
 
     def _line(self, states: Sequence[State]) -> dict[str, np.ndarray]:
         """Return the parts of the merits about the camera's image line (boresight, roll, distortion, ...), by kind."""

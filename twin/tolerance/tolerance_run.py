@@ -269,9 +269,8 @@ def run_tolerance(
         runs.
     """
     test, force = setup.test, force or Workforce()
-    engine_warnings: dict[
-        str, None
-    ] = {}  # each message once, although the cameras and those that judge an allocation both give it
+    # each message once, although the cameras and those that judge an allocation both give it
+    engine_warnings: dict[str, None] = {}
 
     def warn(text: str, further: Callable[[str], None] = force.warn) -> None:
         engine_warnings[text] = None
@@ -287,7 +286,8 @@ def run_tolerance(
     inverse = merit_models.inverse_limits(bench, sensitivity, advance)
     samples = draw_samples(setup, bench, backend, test.samples, seed, force, "cameras", advance)
     passing = bench.passing(samples.values)
-    models = ModelPredictions.of(bench, sensitivity, samples)
+    orders = (sensitivity.model.linear, sensitivity.model.quadratic)
+    models = [bench.values(order(samples.x)) for order in orders]
     many = draw_parameters(setup, bench, merit_models.model_draws(bench, sensitivity.model), seed + _MODEL)
     shares = merit_models.VarianceShares.of(bench, sensitivity.model, many)
     merits = tuple(
@@ -305,20 +305,9 @@ def run_tolerance(
         *_warnings(bench, sensitivity, samples, merits, allocation, judged, test.allocation),
         *interpolation_warnings(missed, EXACT),
     )
-    return ToleranceRun(
-        setup,
-        bench,
-        sensitivity,
-        inverse,
-        samples,
-        merits,
-        Yield.count(np.all(passing, axis=-1)),
-        allocation,
-        judged,
-        FrozenMap(worst_jobs(setup, bench, samples)),
-        warnings,
-        FrozenMap(missed),
-    )
+    computed = (sensitivity, inverse, samples, merits, Yield.count(np.all(passing, axis=-1)), allocation, judged)
+    jobs = FrozenMap(worst_jobs(setup, bench, samples))
+    return ToleranceRun(setup, bench, *computed, jobs, warnings, FrozenMap(missed))
 
 
 def _amounts(bench: ToleranceBench, samples: Samples, rows: np.ndarray) -> np.ndarray:
@@ -379,33 +368,11 @@ def _validated_yield(
     return Yield.count(np.all(bench.passing(drawn.values), axis=-1))
 
 
-@dataclass(frozen=True, eq=False)
-class ModelPredictions:
-    """Merits of the Monte Carlo cameras predicted by the models of first and second order.
-
-    Array dimensions: S cameras, M merits.
-
-    Attributes
-    ----------
-    linear, quadratic : (S, M) ndarray
-        Merits to the first and to the second order, SI units.
-    """
-
-    linear: np.ndarray
-    quadratic: np.ndarray
-
-    @classmethod
-    def of(cls, bench: ToleranceBench, sensitivity: merit_models.Sensitivities, samples: Samples) -> ModelPredictions:
-        """Evaluate the models of first and second order at the random parameters of the cameras."""
-        model = sensitivity.model
-        return cls(bench.values(model.linear(samples.x)), bench.values(model.quadratic(samples.x)))
-
-
 def _merit_result(
     bench: ToleranceBench,
     sensitivity: merit_models.Sensitivities,
     samples: Samples,
-    models: ModelPredictions,
+    models: Sequence[np.ndarray],
     shares: merit_models.VarianceShares,
     m: int,
     passing: np.ndarray,
@@ -419,7 +386,7 @@ def _merit_result(
         known = sign * column[np.isfinite(column)]
         return tuple(float(sign * np.quantile(known, share)) for share in LEVELS) if len(known) else (np.nan,) * 3
 
-    by_model = models.linear[:, m], models.quadratic[:, m]
+    by_model = [values_by_model[:, m] for values_by_model in models]
     return MeritResult(
         merit,
         float(sensitivity.nominal[m]),
