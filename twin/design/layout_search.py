@@ -478,7 +478,7 @@ class End:
         Merits during the refinement by gradients; empty without one.
     tried : int
         Number of beams evaluated alone.
-    standing : int
+    feasible : int
         Number of these beams that are feasible.
     compared : int
         Number of combinations whose merit was computed.
