@@ -40,10 +40,14 @@ AXES = "xyz"
 INDEFINITE = -1e-9
 """Eigenvalue below which a correlation matrix is indefinite; values between it and 0 are rounding errors."""
 UNITS: Mapping[str, tuple[str, float]] = {
-    **{"shift": ("um", 1e-6), "rotate": ("arcsec", parse_quantity("1 arcsec", ANGLE)), "figure": ("nm", 1e-9)},
+    "shift": ("um", 1e-6),
+    "rotate": ("arcsec", parse_quantity("1 arcsec", ANGLE)),
+    "figure": ("nm", 1e-9),
     **dict.fromkeys(("scale", "radius", "conic", "index"), ("ppm", 1e-6)),
-    **{"abbe": ("percent", 1e-2), "index_gradient": ("ppm/m", 1e-6)},
-    **{"temperature": ("K", 1.0), "gradient": ("mK/m", 1e-3)},
+    "abbe": ("percent", 1e-2),
+    "index_gradient": ("ppm/m", 1e-6),
+    "temperature": ("K", 1.0),
+    "gradient": ("mK/m", 1e-3),
 }
 """Kind of component -> the unit in which its amounts are printed, and the size of that unit in SI."""
 HEAT = ("temperature", "gradient")

@@ -23,8 +23,15 @@ from scenes.yaml.units import LENGTH, SCALE, parse_quantity, split_quantity
 
 AXES = {"x": 0, "y": 1, "z": 2}
 KINDS = {
-    **{"shift": "x|y|z LENGTH", "rotate": "x|y|z ANGLE", "scale": "SHARE", "radius": "SHARE", "conic": "NUMBER"},
-    **{"index": "NUMBER", "abbe": "SHARE", "figure": "Z5 LENGTH", "temperature": "DIFFERENCE"},
+    "shift": "x|y|z LENGTH",
+    "rotate": "x|y|z ANGLE",
+    "scale": "SHARE",
+    "radius": "SHARE",
+    "conic": "NUMBER",
+    "index": "NUMBER",
+    "abbe": "SHARE",
+    "figure": "Z5 LENGTH",
+    "temperature": "DIFFERENCE",
     "gradient": "x|y|z DIFFERENCE/LENGTH",
 }
 """Kind of a perturbation -> form of the text after the kind, such as `x|y|z LENGTH`."""
