@@ -363,7 +363,8 @@ def _differentiated(
     keep = range(len(prescription.names))
     flat = (count, -1, 3)
     starts = (np.broadcast_to(launch, shape), np.broadcast_to(heading, shape), launch_step, heading_step)
-    pushed = jvp(backend, systems, *(start.reshape(flat) for start in starts), keep=keep)
+    position, direction, position_step, direction_step = (start.reshape(flat) for start in starts)
+    pushed = jvp(backend, systems, position, direction, position_step, direction_step, keep=keep)
     assert systems.world_tangents is not None
     rotation, rotation_step = (np.swapaxes(p.rotation, 0, 1) for p in (systems.world, systems.world_tangents))
     origin_step = np.swapaxes(systems.world_tangents.translation, 0, 1)

@@ -270,7 +270,7 @@ def _catalogue() -> Iterator[Glass]:
     with Path(__file__).with_name("glasses.csv").open(encoding="utf-8", newline="") as stream:
         for name, *cells, source in list(csv.reader(stream))[1:]:
             n = [float(cell) for cell in cells if cell]
-            thermal = ThermalDispersion(*n[8:]) if n[8:] else None
+            thermal = ThermalDispersion(n[8], n[9], n[10], n[11], n[12], n[13]) if n[8:] else None
             yield Glass(name, (n[0], n[1], n[2]), (n[3], n[4], n[5]), n[6], n[7], source, thermal)
 
 

@@ -115,7 +115,8 @@ def _catalogue() -> Iterator[Material]:
     with Path(__file__).with_name("materials.csv").open(encoding="utf-8", newline="") as stream:
         for name, *numbers, source, coldest, hottest, why in list(csv.reader(stream))[1:]:
             known = TemperatureRange.celsius(float(coldest), float(hottest), why)
-            yield Material(name, *map(float, numbers), source, known)
+            expansion, density, modulus, ratio, conductivity = map(float, numbers)
+            yield Material(name, expansion, density, modulus, ratio, conductivity, source, known)
 
 
 MATERIALS: Mapping[str, Material] = FrozenMap({entry.name: entry for entry in _catalogue()})

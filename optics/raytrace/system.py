@@ -147,9 +147,10 @@ class SystemBatch:
         def taken(value: np.ndarray) -> np.ndarray:
             return np.asarray(value[systems])
 
-        poses = (map_leaves(taken, part) for part in (self.world, self.tangents, self.world_tangents))
+        parts = ("world", "tangents", "world_tangents")
+        update: dict[str, Any] = {name: map_leaves(taken, getattr(self, name)) for name in parts}
         numbers, size = self.numbers[:, systems], self.size[systems]
-        return SystemBatch(self.structure, self.form, numbers, *poses, size, self.grids, len(systems))
+        return replace(self, numbers=numbers, size=size, states=len(systems), **update)
 
 
 @dataclass(frozen=True, eq=False)

@@ -278,7 +278,8 @@ class PupilStack:
         shadow = None if self.shadow is None else self.shadow.take(which)
         terms = (self.eikonal_terms, self.amplitude_terms, self.span, self.residual, self.amplitude_residual)
         edge = (self.centre[which], self.axes[which], self.harmonics[:, which])
-        return PupilStack(*edge, *(part[which] for part in terms), shadow)
+        eikonal, amplitude, span, residual, amplitude_residual = (part[which] for part in terms)
+        return PupilStack(*edge, eikonal, amplitude, span, residual, amplitude_residual, shadow)
 
     def functions(self) -> tuple[PupilFunction, ...]:
         """Return each pupil as a ``PupilFunction``."""

@@ -333,7 +333,7 @@ class PlainPerturbationSpec(Spec):
     def motion(self) -> Motion:
         """Return the motion, SI, that the perturbation without its temperature gives the body in a state."""
         figure = {course.noll(term): value for term, value in self.figure.items()}
-        shape = {name: getattr(self, name) or 0.0 for name in ("index", "radius", "conic", "abbe")}
+        shape: dict[str, Any] = {name: getattr(self, name) or 0.0 for name in ("index", "radius", "conic", "abbe")}
         return Motion(self.rotate, self.shift, self.pivot, self.scale, figure, **shape)
 
 

@@ -151,7 +151,7 @@ def _with_instrument(job: JobSpec, instrument: InstrumentSpec) -> ResolvedJob:
     if job.render.target_images:
         line_detectors = FrozenMap({name: line_detector(camera) for name, camera in cameras.items()})
     # The parts are already validated; validating again would require quantities as text.
-    found = {"detector": detector, "line_detectors": line_detectors}
+    found: dict[str, Any] = {"detector": detector, "line_detectors": line_detectors}
     found["disturbances"] = load.find_disturbances(job, instrument)
     return ResolvedJob.model_construct(job=job, instrument=instrument, cameras=cameras, **found)
 

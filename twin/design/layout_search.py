@@ -787,9 +787,10 @@ class _SingleSearch:
             else []
         )
         merits = tuple(merit(facts.sigmas, self.bench) for facts in path[1:])
-        counts = map(len, (self.tried, self.pool, self.compared, self.built))
+        tried, feasible = len(self.tried), len(self.pool)
+        compared, built, refused = len(self.compared), len(self.built), dict(self.refused)
         name, layouts = self.name or self.setup.instrument.name, [*reversed(path[1:]), *layouts]
-        return End(name, tuple(layouts), tuple(progress), merits, *counts, dict(self.refused))
+        return End(name, tuple(layouts), tuple(progress), merits, tried, feasible, compared, built, refused)
 
     def _part(self, words: str) -> str:
         return f"{self.name}: {words}" if self.name else words

@@ -310,10 +310,10 @@ def describe(values: np.ndarray, sampled: bool) -> Description:
     if n == 0:
         return Description(0)
     ordered = np.sort(good)
-    quantiles = [
+    median, p95, p997 = (
         Estimate(float(np.quantile(ordered, q)), quantile_interval(ordered, q) if sampled else (None, None))
         for q in (0.5, 0.95, 0.997)
-    ]
+    )
     std = None
     if n > 1:
         std = Estimate(float(np.std(good, ddof=1)), std_interval(good) if sampled else (None, None))
@@ -321,7 +321,7 @@ def describe(values: np.ndarray, sampled: bool) -> Description:
     mean = Estimate(float(np.mean(good)), mean_interval(good) if sampled else (None, None))
     tails = (float(np.quantile(ordered, TAILS[0])), float(np.quantile(ordered, TAILS[1]))) if enough else None
     shape = normality(good) if sampled else None
-    return Description(n, mean, std, *quantiles, float(ordered[0]), float(ordered[-1]), shape, tails)
+    return Description(n, mean, std, median, p95, p997, float(ordered[0]), float(ordered[-1]), shape, tails)
 
 
 def mean_interval(values: np.ndarray) -> Interval:
