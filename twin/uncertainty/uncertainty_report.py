@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -398,7 +398,7 @@ def _reduced(axes: Axes, limits: MonitorLimits) -> None:
     for k, (name, split) in enumerate(limits.splits.items()):
         best = name == BEST
         colour, fill = (svg.VERMILION, svg.VERMILION) if best else (svg.GREY, "none")
-        look = {"ms": 6.5, "zorder": 3} if best else {"ms": 4.5, "zorder": 2}
+        look: dict[str, Any] = {"ms": 6.5, "zorder": 3} if best else {"ms": 4.5, "zorder": 2}
         axes.plot(split.sigma / before, y, MARKS[k % len(MARKS)], color=colour, mfc=fill, label=name, **look)
     axes.axvline(1.0, color=svg.INK, lw=0.8, ls=":")
     axes.set_xscale("log")
