@@ -60,21 +60,28 @@ from optics.numerics.llvm import LibraryMissing, ensure_llvm
 
 if TYPE_CHECKING:
     from optics.camera.ghosts import Ghost, ghosts
-    from optics.camera.image_quality import Wavefront, mtf, psf, wavefront
-    from optics.camera.prescription import Camera, OpticalSurface
-    from optics.camera.ray_bundle import TracedRays, distortion, launch_rays, spot_radius, trace
-    from optics.camera.seidel import SeidelSums, seidel
-    from optics.geometry.annular_zernike import annular_zernike
+    from optics.camera.image_quality import (
+        TracedRays,
+        Wavefront,
+        distortion,
+        launch_rays,
+        mtf,
+        psf,
+        spot_radius,
+        trace,
+        wavefront,
+    )
+    from optics.camera.prescription import Camera, OpticalSurface, SeidelSums, seidel
+    from optics.geometry.zernike import annular_zernike, noll_to_nm, zernike
     from optics.geometry.zernike import fit as fit_zernikes
     from optics.geometry.zernike import name as zernike_name
-    from optics.geometry.zernike import noll_to_nm, zernike
     from optics.materials.fresnel_scatter import fresnel
     from optics.materials.glass import abbe_number, glass_names, refractive_index
     from optics.materials.glass import find_glass as glass
     from optics.numerics.quadrature import PupilNodes
     from optics.numerics.quadrature import disk as pupil_quadrature
     from optics.waves.diffraction import airy
-    from optics.waves.sampled_psf import annular_mtf, encircled_energy, ensquared_energy, mtf_from_psf
+    from optics.waves.imaging import annular_mtf, encircled_energy, ensquared_energy, mtf_from_psf
 
 # Before anything can import drjit: it looks for LLVM once, and on many systems finds one that kills the process. What
 # is missing is said by `load_backend`, where a command can tell its user, and not in the middle of an import.
@@ -117,18 +124,17 @@ __all__ = [
 ]
 
 _MODULES = {
-    "camera.prescription": ("Camera", "OpticalSurface"),
-    "camera.ray_bundle": ("TracedRays", "distortion", "launch_rays", "spot_radius", "trace"),
+    "camera.prescription": ("Camera", "OpticalSurface", "SeidelSums", "seidel"),
     "camera.ghosts": ("Ghost", "ghosts"),
-    "camera.image_quality": ("Wavefront", "mtf", "psf", "wavefront"),
-    "camera.seidel": ("SeidelSums", "seidel"),
-    "geometry.annular_zernike": ("annular_zernike",),
-    "geometry.zernike": ("fit_zernikes", "noll_to_nm", "zernike", "zernike_name"),
+    "camera.image_quality": (
+        *("TracedRays", "Wavefront", "distortion", "launch_rays", "mtf", "psf", "spot_radius", "trace", "wavefront"),
+    ),
+    "geometry.zernike": ("annular_zernike", "fit_zernikes", "noll_to_nm", "zernike", "zernike_name"),
     "materials.fresnel_scatter": ("fresnel",),
     "materials.glass": ("abbe_number", "glass", "glass_names", "refractive_index"),
     "numerics.quadrature": ("PupilNodes", "pupil_quadrature"),
     "waves.diffraction": ("airy",),
-    "waves.sampled_psf": ("annular_mtf", "encircled_energy", "ensquared_energy", "mtf_from_psf"),
+    "waves.imaging": ("annular_mtf", "encircled_energy", "ensquared_energy", "mtf_from_psf"),
 }
 """Name of a module below ``optics`` -> the public names that are imported from it."""
 

@@ -214,7 +214,7 @@ def test_what_computes_neither_draws_nor_fills_templates() -> None:
 def test_the_library_knows_no_commands() -> None:
     """Nor does anything that it imports: a test's type, its run and its report lie below what a terminal shows."""
     library = [name for name in modules() if LIBRARY.fullmatch(name)]
-    assert set(library) >= {"twin", "twin.scripting.procedures", "twin.scripting.results", "twin.study.scripted"}
+    assert set(library) >= {"twin", "twin.scripting.results", "twin.study.scripted"}
     assert [" imports ".join(way) for name in library if (way := way_to(TERMINALS, name, every_import()))] == []
     assert way_to(TERMINALS, "twin.framework.command", every_import())
 

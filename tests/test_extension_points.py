@@ -82,9 +82,8 @@ from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.orbit.flight.earth import Earth
 from twin.orbit.flight.orbit import Orbit, acceleration, propagate
 from twin.path_tracing.path_result import NOMINAL
-from twin.path_tracing.source import RaySource
 from twin.path_tracing.stray_light import monitor_families
-from twin.path_tracing.tracer import PathTracer
+from twin.path_tracing.tracer import PathTracer, RaySource
 from twin.sensors.area_detector import EmvaDetector
 from twin.study import scripted
 from twin.study.report.study_report import write_report

@@ -49,8 +49,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from scenes.yaml.errors import InputError
     from twin.scripting.instrument_twin import InstrumentTwin, load, load_camera
-    from twin.scripting.procedures import TestResult, perform
-    from twin.scripting.results import Found, Shot
+    from twin.scripting.results import Found, Shot, TestResult, perform
     from twin.study.scripted import study
 
 __all__ = ["Found", "InputError", "InstrumentTwin", "Shot", "TestResult", "load", "load_camera", "perform", "study"]
@@ -61,8 +60,8 @@ _MODULES = {
     "InstrumentTwin": "twin.scripting.instrument_twin",
     "Shot": "twin.scripting.results",
     "Found": "twin.scripting.results",
-    "TestResult": "twin.scripting.procedures",
-    "perform": "twin.scripting.procedures",
+    "TestResult": "twin.scripting.results",
+    "perform": "twin.scripting.results",
     "InputError": "scenes.yaml.errors",
 }
 

@@ -17,8 +17,7 @@ from scenes.yaml.standard_output import Terminal, print_json, to_stdout
 from twin.framework import cli, durable
 
 if TYPE_CHECKING:  # modules that compute are imported on use
-    from twin.compare.folder_state import FolderState
-    from twin.compare.verification import Repetition
+    from twin.compare.verification import FolderState, Repetition
 
 app = cli.program()
 
@@ -66,7 +65,7 @@ def main(
     silent = as_json or quiet
     with cli.explained(errors), durable.exit_on_terminate():
         from twin.compare import verification
-        from twin.compare.folder_state import folder_state
+        from twin.compare.verification import folder_state
 
         if files and (every or keep is not None):
             raise cli.InputErrorText("--files repeats nothing, so that it cannot be combined with --all or --keep")

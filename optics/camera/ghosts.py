@@ -5,16 +5,14 @@ surface before it. It is traced exactly, through all surfaces between the two, m
 time. Mirrors reflect all light.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
 
 import numpy as np
 
+from optics.camera.image_quality import Field, launch_rays
 from optics.camera.prescription import Camera
-from optics.camera.ray_bundle import Field, launch_rays
 from optics.materials.fresnel_scatter import reflectance
 from optics.numerics.backend import Backend, default_backend
 from optics.numerics.quadrature import circle, even_disk

@@ -1,7 +1,5 @@
 """Kinds of telescopes of which `optics.camera.telescopes.first_design` makes a first design; help texts list them."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

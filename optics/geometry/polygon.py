@@ -5,8 +5,6 @@ the plane; the others are interpolated along with them (such as the corner's pos
 corners repeats one; a polygon without area is empty.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from functools import cache
 

@@ -5,10 +5,8 @@ A kind of term (``XYPolynomial``, ``ZernikeSag``) is a frozen dataclass whose fi
 exactly nothing, so that all surfaces of a batch or scene share the code of all their terms.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import make_dataclass
 from functools import cache
 from typing import Any, ClassVar, Protocol, runtime_checkable
 
@@ -98,114 +96,51 @@ def check_height(kind: type[SagTerm], backend: Backend) -> None:
         ) from error
 
 
-@dataclass(frozen=True)
-class XYPolynomial:
+def _numbers(**powers: int) -> Any:
+    """Return a frozen dataclass of numbers, 0 by default, from the power of the metre in the unit of each."""
+    fields = [(name, Any, 0.0) for name in powers]
+    return make_dataclass("_Numbers", fields, frozen=True, namespace={"POWERS": FrozenMap(powers)})
+
+
+_EXPONENTS: Mapping[str, tuple[int, int]] = FrozenMap(
+    **{"x2": (2, 0), "xy": (1, 1), "y2": (0, 2), "x3": (3, 0), "x2y": (2, 1), "xy2": (1, 2), "y3": (0, 3)},
+    **{"x4": (4, 0), "x3y": (3, 1), "x2y2": (2, 2), "xy3": (1, 3), "y4": (0, 4)},
+)
+"""Exponents (a, b) of x^a y^b by the name of its coefficient."""
+
+_Coefficients: Any = _numbers(**{name: 1 - a - b for name, (a, b) in _EXPONENTS.items()})
+
+
+class XYPolynomial(_Coefficients):
     """Freeform sag: sum of c_ab x^a y^b over 2 <= a + b <= 4, with x, y and the sag in metres.
 
     The field ``x2y`` is the coefficient of x^2 y; units are 1/m, 1/m^2 and 1/m^3 for degrees a + b of 2, 3 and 4.
     """
 
-    POWERS: ClassVar[Mapping[str, int]] = FrozenMap(
-        **dict.fromkeys(("x2", "xy", "y2"), -1),
-        **dict.fromkeys(("x3", "x2y", "xy2", "y3"), -2),
-        **dict.fromkeys(("x4", "x3y", "x2y2", "xy3", "y4"), -3),
-    )
-    x2: Any = 0.0
-    xy: Any = 0.0
-    y2: Any = 0.0
-    x3: Any = 0.0
-    x2y: Any = 0.0
-    xy2: Any = 0.0
-    y3: Any = 0.0
-    x4: Any = 0.0
-    x3y: Any = 0.0
-    x2y2: Any = 0.0
-    xy3: Any = 0.0
-    y4: Any = 0.0
-
-    def _terms(self) -> dict[tuple[int, int], Any]:
-        """Return the mapping from exponents (a, b) to the coefficient of x^a y^b."""
-        return {
-            (2, 0): self.x2,
-            (1, 1): self.xy,
-            (0, 2): self.y2,
-            (3, 0): self.x3,
-            (2, 1): self.x2y,
-            (1, 2): self.xy2,
-            (0, 3): self.y3,
-            (4, 0): self.x4,
-            (3, 1): self.x3y,
-            (2, 2): self.x2y2,
-            (1, 3): self.xy3,
-            (0, 4): self.y4,
-        }
-
     def sag(self, x: Any, y: Any) -> Any:
         """Return the height at points x, y, in metres (NumPy arrays)."""
-        return np.asarray(sum(c * x**a * y**b for (a, b), c in self._terms().items()))
+        return np.asarray(sum(getattr(self, name) * x**a * y**b for name, (a, b) in _EXPONENTS.items()))
 
     def height(self, x: Any, y: Any) -> tuple[Any, Any, Any]:
         """Return the height at points x, y, in metres, and its derivatives along x and y (Dr.Jit arrays)."""
         coefficients: list[Any] = [0.0] * zernike.triangle_size(4)
-        for (a, b), c in self._terms().items():
-            coefficients[zernike.triangle_index(a, b)] = c
+        for name, (a, b) in _EXPONENTS.items():
+            coefficients[zernike.triangle_index(a, b)] = getattr(self, name)
         return zernike.triangle_polynomial(x, y, coefficients, 4)
 
 
 LAST_NOLL = 36
 """Highest Noll index of Zernike sag terms: all terms to radial order 7."""
 
+_Amplitudes: Any = _numbers(**dict.fromkeys(("radius", "x0", "y0", *(f"Z{j}" for j in range(1, LAST_NOLL + 1))), 1))
 
-@dataclass(frozen=True)
-class ZernikeSag:
+
+class ZernikeSag(_Amplitudes):
     """Freeform sag as designed: a sum of Zernike polynomials, a_j Z_j((x - x0)/radius, (y - y0)/radius).
 
     j is the Noll index and the amplitude a_j the rms over the disk of ``radius`` about (x0, y0), in metres. A mirror's
     figure error is not part of it; that belongs to the state (``Motion.figure``).
     """
-
-    POWERS: ClassVar[Mapping[str, int]] = FrozenMap(
-        dict.fromkeys(("radius", "x0", "y0", *(f"Z{j}" for j in range(1, LAST_NOLL + 1))), 1)
-    )
-    radius: Any = 0.0
-    x0: Any = 0.0
-    y0: Any = 0.0
-    Z1: Any = 0.0
-    Z2: Any = 0.0
-    Z3: Any = 0.0
-    Z4: Any = 0.0
-    Z5: Any = 0.0
-    Z6: Any = 0.0
-    Z7: Any = 0.0
-    Z8: Any = 0.0
-    Z9: Any = 0.0
-    Z10: Any = 0.0
-    Z11: Any = 0.0
-    Z12: Any = 0.0
-    Z13: Any = 0.0
-    Z14: Any = 0.0
-    Z15: Any = 0.0
-    Z16: Any = 0.0
-    Z17: Any = 0.0
-    Z18: Any = 0.0
-    Z19: Any = 0.0
-    Z20: Any = 0.0
-    Z21: Any = 0.0
-    Z22: Any = 0.0
-    Z23: Any = 0.0
-    Z24: Any = 0.0
-    Z25: Any = 0.0
-    Z26: Any = 0.0
-    Z27: Any = 0.0
-    Z28: Any = 0.0
-    Z29: Any = 0.0
-    Z30: Any = 0.0
-    Z31: Any = 0.0
-    Z32: Any = 0.0
-    Z33: Any = 0.0
-    Z34: Any = 0.0
-    Z35: Any = 0.0
-    Z36: Any = 0.0
 
     @property
     def amplitudes(self) -> dict[int, Any]:

@@ -9,10 +9,8 @@ Manufacturers give indices relative to air of 20 C and 1013 hPa (``Glass.index``
 ``Glass.vacuum_index``.
 """
 
-from __future__ import annotations
-
 import csv
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from math import sqrt
@@ -267,34 +265,16 @@ def air_index(wavelength_m: float) -> float:
     return 1.0 + at_15 / (1.0 + 3.4785e-3 * 5.0)
 
 
-FUSED_SILICA = Glass(
-    "fused silica",
-    (0.6961663, 0.4079426, 0.8974794),
-    (0.0684043**2, 0.1162414**2, 9.896161**2),
-    0.21e-6,
-    3.71e-6,
-    "dispersion: Malitson, JOSA 55, 1205 (1965); dn/dT: Schott Lithosil-Q, Zemax catalogue of 2017-01-20 (checked); "
-    "Corning 7980 has a dn/dT some 5 % higher (Rego, Sensors 23, 6023 (2023))",
-    ThermalDispersion(2.06e-5, 2.51e-8, -2.47e-11, 3.12e-7, 4.22e-10, 0.16),
-)
-N_BK7 = Glass(
-    "N-BK7",
-    (1.03961212, 0.231792344, 1.01046945),
-    (0.00600069867, 0.0200179144, 103.560653),
-    0.3e-6,
-    2.5e-6,
-    "Schott, Zemax catalogue of 2017-01-20 (checked)",
-    ThermalDispersion(1.86e-6, 1.31e-8, -1.37e-11, 4.34e-7, 6.27e-10, 0.17),
-)
-ZERODUR = Glass(
-    "Zerodur",
-    (1.3182408, 0.0244, 1.08915181),
-    (0.00879, 0.0609, 110.0),
-    0.365e-6,
-    2.325e-6,
-    "Schott TIE-43, Optical Properties of ZERODUR, November 2007 (no constants of Schott's dn/dT formula published)",
-)
-GLASSES: Mapping[str, Glass] = FrozenMap({g.name: g for g in (FUSED_SILICA, N_BK7, ZERODUR)})
+def _catalogue() -> Iterator[Glass]:
+    """Yield the glasses of ``glasses.csv``, which states the source of every row."""
+    with Path(__file__).with_name("glasses.csv").open(encoding="utf-8", newline="") as stream:
+        for name, *cells, source in list(csv.reader(stream))[1:]:
+            n = [float(cell) for cell in cells if cell]
+            thermal = ThermalDispersion(n[8], n[9], n[10], n[11], n[12], n[13]) if n[8:] else None
+            yield Glass(name, (n[0], n[1], n[2]), (n[3], n[4], n[5]), n[6], n[7], source, thermal)
+
+
+GLASSES: Mapping[str, Glass] = FrozenMap({entry.name: entry for entry in _catalogue()})
 """Built-in glasses, by name."""
 
 

@@ -5,9 +5,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+import csv
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from difflib import get_close_matches
+from pathlib import Path
 
 from optics.numerics.number_tree import FrozenMap
 
@@ -108,122 +110,16 @@ class Material:
             raise ValueError(f"{self.name}: Poisson's ratio must lie between -1 and 0.5, found {self.poisson_ratio}")
 
 
-_ALL = (
-    Material(
-        "Zerodur",
-        0.0,
-        2530.0,
-        90.3e9,
-        0.24,
-        1.46,
-        "Schott, ZERODUR catalogue. CTE is the middle of the makers' class: 0 +- 0.05e-6/K in class 1, mean of 0..50 C "
-        "(checked against Schott's table of classes; down to 0 +- 0.007e-6/K can be had). Other sheets give E = 91 GPa",
-        TemperatureRange.celsius(
-            -50.0, 100.0, "Schott's curves stay within 0.1e-6/K of zero there (not checked); its classes are of 0..50 C"
-        ),
-    ),
-    Material(
-        "fused silica",
-        0.52e-6,
-        2201.0,
-        72.7e9,
-        0.16,
-        1.38,
-        "Corning HPFS 7980: CTE (5..35 C) and density checked against Corning's Zemax catalogue, E and Poisson's ratio "
-        "from its data sheet. Heraeus states 0.51e-6/K. Conductivity: makers state 1.30 (Corning) to 1.38 (Heraeus)",
-        TemperatureRange.celsius(
-            -100.0, 200.0, "Corning's means of -100..200 C and of 0..200 C, 0.48 and 0.57e-6/K (not checked)"
-        ),
-    ),
-    Material(
-        "N-BK7",
-        7.1e-6,
-        2510.0,
-        82.0e9,
-        0.206,
-        1.114,
-        "Schott data sheet N-BK7; CTE of -30..70 C; CTE and density checked against Schott's Zemax catalogue",
-        TemperatureRange.celsius(-30.0, 70.0, "Schott's CTE is the mean of that range"),
-    ),
-    Material(
-        "SiC",
-        2.2e-6,
-        3150.0,
-        420.0e9,
-        0.17,
-        180.0,
-        "sintered SiC-100 (Boostec/Mersen) data sheet, room temperature; not checked. Sintered SiC "
-        "in general: E 370..490 GPa, Poisson's ratio 0.14..0.21, density 3000..3200 kg/m^3",
-        TemperatureRange.celsius(0.0, 50.0, "room temperature; its CTE grows by half a per cent in 1 K (not checked)"),
-    ),
-    Material(
-        "Invar",
-        1.26e-6,
-        8050.0,
-        141.0e9,
-        0.259,
-        10.4,
-        "Invar 36 as in Yoder, Opto-Mechanical Systems Design; CarTech's sheet has the density and 10 W/(m K). CTE "
-        "depends on the heat treatment: the fit of NIST's cryogenic data base gives 0.94e-6/K at 20 C (E 152 GPa, "
-        "13.8 W/(m K)), ASTM F1684 allows 1.2..2.7e-6/K over 30..150 C",
-        TemperatureRange.celsius(-50.0, 150.0, "makers' sheets differ by more than the CTE changes by there"),
-    ),
-    Material(
-        "Ti-6Al-4V",
-        8.6e-6,
-        4430.0,
-        113.8e9,
-        0.342,
-        6.7,
-        "annealed, ASM/MatWeb and Allvac: CTE of 20..100 C; makers' sheets differ by 4 % in CTE and 7 % in E and k",
-        TemperatureRange.celsius(-50.0, 100.0, "CTE of 20..100 C; at -50 C it is some 6 % less (not checked)"),
-    ),
-    Material(
-        "CFRP",
-        0.1e-6,
-        1650.0,
-        110.0e9,
-        0.30,
-        35.0,
-        "typical quasi-isotropic high-modulus laminate, in plane; a design value, real laminates range -1..1e-6/K",
-        TemperatureRange.celsius(-100.0, 100.0, "laminates differ by more than the CTE changes by there"),
-    ),
-    Material(
-        "aluminium",
-        23.6e-6,
-        2700.0,
-        68.9e9,
-        0.33,
-        167.0,
-        "6061-T6, ASM Metals Handbook vol. 2; CTE of 20..100 C",
-        TemperatureRange.celsius(-50.0, 100.0, "CTE of 20..100 C; at -50 C it is some 8 % less (not checked)"),
-    ),
-    Material(
-        "alumina",
-        5.4e-6,
-        3700.0,
-        320.0e9,
-        0.23,
-        24.0,
-        "96 % alumina of circuit boards, Kyocera A-476 (density, E, k checked). Kyocera's CTE of 7.2e-6/K is the mean "
-        "of 40..400 C; at 20 C it is 5.4e-6 +- 0.8e-6/K (Touloukian et al., Thermophysical Properties of Matter 13, "
-        "not checked)",
-        TemperatureRange.celsius(0.0, 50.0, "at 20 C with its +- 0.8e-6/K, by which it changes in some 30 K"),
-    ),
-    Material(
-        "AlN",
-        3.0e-6,
-        3260.0,
-        325.0e9,
-        0.22,
-        170.0,
-        "aluminium nitride of circuit boards, makers' sheets (density 3250..3300, E 320..331 GPa, k 170..175 checked). "
-        "Their CTE of 4.5..4.6e-6/K is the mean of 20..400 C; at 20 C it is 2.6..3.3e-6/K (after Slack and Bartram, "
-        "J. Appl. Phys. 46, 89 (1975); not checked)",
-        TemperatureRange.celsius(0.0, 50.0, "at 20 C with what sources differ by, by which it changes in some 30 K"),
-    ),
-)
-MATERIALS: Mapping[str, Material] = FrozenMap({m.name: m for m in _ALL})
+def _catalogue() -> Iterator[Material]:
+    """Yield the materials of ``materials.csv``, which states the source of every row and of its temperatures."""
+    with Path(__file__).with_name("materials.csv").open(encoding="utf-8", newline="") as stream:
+        for name, *numbers, source, coldest, hottest, why in list(csv.reader(stream))[1:]:
+            known = TemperatureRange.celsius(float(coldest), float(hottest), why)
+            expansion, density, modulus, ratio, conductivity = map(float, numbers)
+            yield Material(name, expansion, density, modulus, ratio, conductivity, source, known)
+
+
+MATERIALS: Mapping[str, Material] = FrozenMap({entry.name: entry for entry in _catalogue()})
 """Built-in materials, by name."""
 _OTHER_NAMES: Mapping[str, str] = FrozenMap(
     {"bk7": "n-bk7", "aluminum": "aluminium", "titanium": "ti-6al-4v", "al2o3": "alumina", "aluminium nitride": "aln"}

@@ -4,8 +4,6 @@
 dataclass that users make. The checks are of kinds alone: a number, text, a camera. Ranges are those of the function.
 """
 
-from __future__ import annotations
-
 import functools
 import inspect
 import numbers

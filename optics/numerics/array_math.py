@@ -13,8 +13,6 @@ impossible result is an error. ``PhysicalError`` marks what physics forbids (lig
 as against faults of the program.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from typing import Any
 

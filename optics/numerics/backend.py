@@ -232,13 +232,8 @@ def one_kernel_thread() -> Iterator[None]:
 
 THREADS_VARIABLE = "TWIN_THREADS"
 """Environment variable with the largest number of cores that ``cores`` returns, for processes that share a machine."""
-ONE_THREAD = {
-    THREADS_VARIABLE: "1",
-    "OMP_NUM_THREADS": "1",
-    "OPENBLAS_NUM_THREADS": "1",
-    "MKL_NUM_THREADS": "1",
-    "NUMEXPR_NUM_THREADS": "1",
-}
+_LIBRARIES = ("OMP", "OPENBLAS", "MKL", "NUMEXPR")
+ONE_THREAD = dict.fromkeys((THREADS_VARIABLE, *(f"{name}_NUM_THREADS" for name in _LIBRARIES)), "1")
 """Environment variables with which a worker process and its linear algebra run on one thread."""
 
 

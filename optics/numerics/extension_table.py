@@ -1,7 +1,5 @@
 """Tables that other installed distributions extend by entry points (docs/architecture.md, "Where to add")."""
 
-from __future__ import annotations
-
 from collections import UserDict
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass

@@ -7,8 +7,6 @@ branch, and has no leaves.
 ``FrozenMap`` is a dict that cannot be changed, so that values that contain one can be hashed, compared and pickled.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable
 from dataclasses import fields, is_dataclass, replace
 from functools import cache

@@ -1,7 +1,5 @@
 """Quadrature rules: sample points and weights for integrals over a pupil or an interval."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import cache
 

@@ -234,17 +234,12 @@ class Assembly:
         for path, motion in state.items():
             if any(motion.index_gradient):
                 raise ValueError(f"{path}: a nominal state cannot have a gradient of the refractive index")
-        return replace(
-            self,
-            tree=self.tree.with_nominal(state),
-            elements={
-                name: replace(element, surface=element.figured(state[element.body]))
-                if element.body in state
-                else element
-                for name, element in self.elements.items()
-            },
-            media={path: index + state[path].index if path in state else index for path, index in self.media.items()},
-        )
+        elements = dict(self.elements)
+        for name, element in self.elements.items():
+            if element.body in state:
+                elements[name] = replace(element, surface=element.figured(state[element.body]))
+        media = {path: index + state[path].index if path in state else index for path, index in self.media.items()}
+        return replace(self, tree=self.tree.with_nominal(state), elements=elements, media=media)
 
     def place(
         self, states: Sequence[State] = ({},), step: Sequence[tuple[str, str, int]] | None = None

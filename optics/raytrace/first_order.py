@@ -4,8 +4,6 @@ First-order data are parabasal about a chief ray, or paraxial about the axis. Th
 of sight, roll and principal distance.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
@@ -89,15 +87,9 @@ def ray_matrix(
         Two launch axes perpendicular to the direction.
     """
     zero = np.zeros_like(axes)
-    out = jvp(
-        backend,
-        systems,
-        np.repeat(position[:, None], 4, axis=1),
-        np.repeat(direction[:, None], 4, axis=1),
-        np.concatenate([axes, zero], axis=1),
-        np.concatenate([zero, axes], axis=1),
-        keep=(stop,),
-    )
+    start, heading = (np.repeat(vector[:, None], 4, axis=1) for vector in (position, direction))
+    step, turn = (np.concatenate(pair, axis=1) for pair in ((axes, zero), (zero, axes)))
+    out = jvp(backend, systems, start, heading, step, turn, keep=(stop,))
     # columns are launch steps, rows x and y
     image, angle, hit = (np.swapaxes(step[..., :2], 1, 2) for step in (out.position, out.direction, out.hits[stop]))
     parts = (image[..., :2], image[..., 2:], angle[..., :2], angle[..., 2:], hit[..., :2], hit[..., 2:])

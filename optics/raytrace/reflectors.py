@@ -22,8 +22,6 @@ Both have a hollow counterpart without glass in the beam: plane mirrors on plate
 Bar and plates are one body for heat; the bar is the reflector's own body, which carries the plates.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise, product

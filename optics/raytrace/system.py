@@ -22,18 +22,8 @@ from optics.geometry import zernike
 from optics.geometry.tree import AT_REST, COMPLEX_STEP, Motion, PlacedBodies, State
 from optics.numerics.backend import Backend
 from optics.numerics.number_tree import form_of, map_leaves, numbers_in
+from optics.raytrace import element_numbers
 from optics.raytrace.assembly import Assembly, Element
-from optics.raytrace.element_numbers import (
-    ElementNumbers,
-    FrameNumbers,
-    LocalNumbers,
-    Medium,
-    Structure,
-    grid_numbers,
-    local_numbers_of,
-    media_along,
-    structure_of,
-)
 
 
 def changed_bodies(assembly: Assembly, states: Sequence[State], placed: PlacedBodies) -> set[str]:
@@ -99,11 +89,11 @@ class SystemBatch:
         Number of states S; systems are ordered sequence by sequence, B = sequences * S.
     """
 
-    structure: tuple[Structure, ...]
-    form: tuple[tuple[ElementNumbers, ...], FrameNumbers]
+    structure: tuple[element_numbers.Structure, ...]
+    form: tuple[tuple[element_numbers.ElementNumbers, ...], element_numbers.FrameNumbers]
     numbers: np.ndarray
     world: Poses
-    tangents: tuple[ElementNumbers, ...] | None
+    tangents: tuple[element_numbers.ElementNumbers, ...] | None
     world_tangents: Poses | None
     size: np.ndarray
     grids: tuple[np.ndarray | None, ...]
@@ -115,7 +105,7 @@ class SystemBatch:
         return int(self.numbers.shape[1])
 
     @cached_property
-    def values(self) -> tuple[ElementNumbers, ...]:
+    def values(self) -> tuple[element_numbers.ElementNumbers, ...]:
         """Numbers that the trace reads per element, each of shape (B,) for B systems."""
         return map_leaves(lambda row: self.numbers[row], self.form[0])
 
@@ -157,17 +147,10 @@ class SystemBatch:
         def taken(value: np.ndarray) -> np.ndarray:
             return np.asarray(value[systems])
 
-        return SystemBatch(
-            self.structure,
-            self.form,
-            self.numbers[:, systems],
-            map_leaves(taken, self.world),
-            map_leaves(taken, self.tangents),
-            map_leaves(taken, self.world_tangents),
-            self.size[systems],
-            self.grids,
-            len(systems),
-        )
+        parts = ("world", "tangents", "world_tangents")
+        update: dict[str, Any] = {name: map_leaves(taken, getattr(self, name)) for name in parts}
+        numbers, size = self.numbers[:, systems], self.size[systems]
+        return replace(self, numbers=numbers, size=size, states=len(systems), **update)
 
 
 @dataclass(frozen=True, eq=False)
@@ -185,9 +168,9 @@ class Poses:
     rotation: np.ndarray
     translation: np.ndarray
 
-    def last(self) -> FrameNumbers:
+    def last(self) -> element_numbers.FrameNumbers:
         """Return the world poses of the last element of each system, as ``FrameNumbers``."""
-        return FrameNumbers.of(self.last_rows())
+        return element_numbers.FrameNumbers.of(self.last_rows())
 
     def last_rows(self) -> np.ndarray:
         """Return the poses of the last elements of B systems as 12 numbers each, (12, B).
@@ -224,8 +207,8 @@ class UploadedSystems:
     """
 
     backend: Backend
-    structure: tuple[Structure, ...]
-    form: tuple[tuple[ElementNumbers, ...], FrameNumbers]
+    structure: tuple[element_numbers.Structure, ...]
+    form: tuple[tuple[element_numbers.ElementNumbers, ...], element_numbers.FrameNumbers]
     numbers: Any
     grids: tuple[Any, ...]
     count: int
@@ -233,7 +216,7 @@ class UploadedSystems:
     first: int | None = None
 
     @cached_property
-    def values(self) -> tuple[ElementNumbers, ...]:
+    def values(self) -> tuple[element_numbers.ElementNumbers, ...]:
         """Numbers that the trace reads per element, as Dr.Jit arrays with one value for each of B systems, (B,)."""
         import drjit as dr
 
@@ -306,10 +289,10 @@ class _Chains:
     """
 
     elements: tuple[tuple[Element, ...], ...]
-    media: tuple[tuple[Medium, ...], ...]
+    media: tuple[tuple[element_numbers.Medium, ...], ...]
     bodies: np.ndarray
     depends: tuple[frozenset[str], ...]
-    nominal: tuple[Structure, ...]
+    nominal: tuple[element_numbers.Structure, ...]
 
     @classmethod
     def of(cls, assembly: Assembly, sequences: tuple[str | tuple[str, ...], ...]) -> _Chains:
@@ -319,14 +302,14 @@ class _Chains:
         lengths = {len(chain) for chain in chains}
         if len(lengths) != 1:
             raise ValueError(f"sequences of different lengths cannot be batched: {sorted(lengths)}")
-        media = tuple(tuple(media_along(chain)) for chain in chains)
+        media = tuple(tuple(element_numbers.media_along(chain)) for chain in chains)
         index = assembly.place().index
         depends = []
         for i in range(len(chains[0])):
             glass = {m.solid for along in media for m in along[i : i + 2] if m.solid is not None}
             depends.append(frozenset(glass.union(chain[i].body for chain in chains)))
         bodies = np.array([[index[element.body] for element in chain] for chain in chains])
-        designed = tuple(structure_of(column) for column in zip(*chains, strict=True))
+        designed = tuple(element_numbers.structure_of(column) for column in zip(*chains, strict=True))
         return cls(chains, media, bodies, tuple(depends), designed)
 
     def radius(self, i: int, c: int) -> float:
@@ -344,7 +327,7 @@ class _Chains:
         """Return the elements at position ``i`` of all chains."""
         return [chain[i] for chain in self.elements]
 
-    def structure(self, shapes: _Shapes) -> tuple[Structure, ...]:
+    def structure(self, shapes: _Shapes) -> tuple[element_numbers.Structure, ...]:
         """Return the structure of each element, including what the states' changes of shape add to it."""
         changed, out = shapes.orders.keys() | shapes.gridded | shapes.graded, list(self.nominal)
         for i, nominal in enumerate(out):
@@ -367,29 +350,29 @@ class _Chains:
         self,
         assembly: Assembly,
         i: int,
-        structure: Structure,
+        structure: element_numbers.Structure,
         states: Sequence[State],
         placed: PlacedBodies,
         step: Sequence[tuple[str, str, int]] | None = None,
-    ) -> tuple[LocalNumbers, np.ndarray | None]:
+    ) -> tuple[element_numbers.LocalNumbers, np.ndarray | None]:
         """Return shapes and indices of the elements at position ``i``, and the tables of their grid figures.
 
         Each number has the shape (C * S,) for C chains in S states. An element that several chains share is computed
         once.
         """
-        by_key: dict[tuple[str, Medium, Medium], LocalNumbers] = {}
+        by_key: dict[tuple[str, element_numbers.Medium, element_numbers.Medium], element_numbers.LocalNumbers] = {}
         keys = [(chain[i].name, m[i], m[i + 1]) for chain, m in zip(self.elements, self.media, strict=True)]
         for key in keys:
             if key not in by_key:
                 name, before, after = key
-                by_key[key] = local_numbers_of(
+                by_key[key] = element_numbers.local_numbers_of(
                     assembly, assembly.elements[name], (before, after), structure, states, placed, step
                 )
         parts = [by_key[key] for key in keys]
         numbers = map_leaves(lambda *arrays: np.concatenate(arrays), parts[0], *parts[1:])
         if not structure.grid:
             return numbers, None
-        grid, spline = grid_numbers(self.elements_at(i), states)
+        grid, spline = element_numbers.grid_numbers(self.elements_at(i), states)
         return replace(numbers, surface=replace(numbers.surface, grid=grid)), spline
 
 
@@ -443,8 +426,8 @@ class _Design:
     """
 
     chains: _Chains
-    structure: tuple[Structure, ...]
-    form: tuple[tuple[ElementNumbers, ...], FrameNumbers]
+    structure: tuple[element_numbers.Structure, ...]
+    form: tuple[tuple[element_numbers.ElementNumbers, ...], element_numbers.FrameNumbers]
     numbers: np.ndarray
     grids: tuple[np.ndarray | None, ...]
     scaling: Mapping[int, tuple[np.ndarray, np.ndarray, np.ndarray]]
@@ -452,17 +435,19 @@ class _Design:
     frame_rows: np.ndarray
 
     @classmethod
-    def of(cls, assembly: Assembly, chains: _Chains, structure: tuple[Structure, ...]) -> _Design:
+    def of(cls, assembly: Assembly, chains: _Chains, structure: tuple[element_numbers.Structure, ...]) -> _Design:
         """Return the nominal numbers of chains whose elements have a given structure."""
-        placed, frame = assembly.place(), FrameNumbers.of(np.zeros((12, len(chains.elements))))
+        placed, frame = assembly.place(), element_numbers.FrameNumbers.of(np.zeros((12, len(chains.elements))))
         twice = replace(placed, scale=np.full_like(placed.scale, 2.0))
 
-        def values(placed: PlacedBodies) -> tuple[tuple[ElementNumbers, ...], list[np.ndarray | None]]:
+        def values(placed: PlacedBodies) -> tuple[tuple[element_numbers.ElementNumbers, ...], list[np.ndarray | None]]:
             local, grids = zip(
                 *(chains.local_numbers(assembly, i, kind, ({},), placed) for i, kind in enumerate(structure)),
                 strict=True,
             )
-            return tuple(ElementNumbers(frame, o.surface, o.aperture, o.before, o.after) for o in local), grids
+            return tuple(
+                element_numbers.ElementNumbers(frame, o.surface, o.aperture, o.before, o.after) for o in local
+            ), grids
 
         designed, grids = values(placed)
         form = form_of((designed, frame))
@@ -483,7 +468,7 @@ class _Design:
         return cls(chains, structure, form, numbers, tuple(grids), scaling, cls._sides(chains, form[0]), frames)
 
     @staticmethod
-    def _sides(chains: _Chains, form: tuple[ElementNumbers, ...]) -> dict[str, _Sides]:
+    def _sides(chains: _Chains, form: tuple[element_numbers.ElementNumbers, ...]) -> dict[str, _Sides]:
         """Return a mapping from each glass body to the sides of elements that it fills."""
         by_solid: dict[str, list[tuple[Any, int, int]]] = {}
         for c, media in enumerate(chains.media):
@@ -549,7 +534,7 @@ class _Design:
         self,
         out: np.ndarray,
         i: int,
-        structure: Structure,
+        structure: element_numbers.Structure,
         states: Sequence[State],
         known: dict[tuple[str, int, float], np.ndarray],
     ) -> None:
@@ -645,7 +630,11 @@ def assemble(
     values = []
     for i, frame in enumerate(frames_of(placed, chains.bodies)):
         local, grids[i] = chains.local_numbers(assembly, i, structure[i], states, placed, step)
-        values.append(ElementNumbers(FrameNumbers.of(frame), local.surface, local.aperture, local.before, local.after))
+        values.append(
+            element_numbers.ElementNumbers(
+                element_numbers.FrameNumbers.of(frame), local.surface, local.aperture, local.before, local.after
+            )
+        )
     numbers = np.array([number.real for number in numbers_in((tuple(values), world.last()))])
     tangents, world_tangents = None, None
     if step is not None:

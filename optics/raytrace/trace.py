@@ -80,19 +80,6 @@ class GradedRay:
         along = gx * tangent.x + gy * tangent.y + gz * tangent.z
         return cls(p, tangent, index, gradient, along, gx * gx + gy * gy + gz * gz)
 
-    def detached(self) -> GradedRay:
-        """Return the rays without derivatives."""
-        import drjit as dr
-
-        return GradedRay(
-            dr.detach(self.origin),
-            dr.detach(self.tangent),
-            dr.detach(self.index),
-            tuple(dr.detach(g) for g in self.gradient),
-            dr.detach(self.along),
-            dr.detach(self.square),
-        )
-
     def position(self, tau: Any) -> Any:
         """Return the point of the ray at the parameter ``tau``, the integral of length over index, in metres."""
         x2 = self.square * tau * tau
@@ -148,7 +135,7 @@ def curve_intersection(
     numbers, ray = surface, curve
     if attached:
         numbers = map_leaves(dr.detach, surface)
-        ray, tau = curve.detached(), dr.detach(tau)
+        ray, tau = dr.detach((curve, tau))
     for _ in range(steps):
         tau = step(ray, tau, numbers)
     return step(curve, tau, surface) if attached else tau

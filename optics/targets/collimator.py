@@ -1,7 +1,5 @@
 """Collimator as the camera sees it: a plane wave with wavefront error, curved when the target is out of focus."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 

@@ -1,7 +1,5 @@
 """Finite-element meshes of mirror substrates and of glass prisms."""
 
-from __future__ import annotations
-
 from itertools import pairwise
 from typing import Any, assert_never
 

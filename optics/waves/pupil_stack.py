@@ -275,33 +275,21 @@ class PupilStack:
 
     def take(self, which: np.ndarray | slice) -> PupilStack:
         """Return some of the pupils, given by their indices."""
-        return PupilStack(
-            self.centre[which],
-            self.axes[which],
-            self.harmonics[:, which],
-            self.eikonal_terms[which],
-            self.amplitude_terms[which],
-            self.span[which],
-            self.residual[which],
-            self.amplitude_residual[which],
-            None if self.shadow is None else self.shadow.take(which),
-        )
+        shadow = None if self.shadow is None else self.shadow.take(which)
+        terms = (self.eikonal_terms, self.amplitude_terms, self.span, self.residual, self.amplitude_residual)
+        edge = (self.centre[which], self.axes[which], self.harmonics[:, which])
+        eikonal, amplitude, span, residual, amplitude_residual = (part[which] for part in terms)
+        return PupilStack(*edge, eikonal, amplitude, span, residual, amplitude_residual, shadow)
 
     def functions(self) -> tuple[PupilFunction, ...]:
         """Return each pupil as a ``PupilFunction``."""
-        return tuple(
-            PupilFunction(
-                self.centre[i],
-                self.axes[i],
-                PupilEdge(self.harmonics[:, i]),
-                self.eikonal_terms[i],
-                self.amplitude_terms[i],
-                float(self.residual[i]),
-                float(self.amplitude_residual[i]),
-                None if self.shadow is None else self.shadow.take(slice(i, i + 1)),
-            )
-            for i in range(len(self.centre))
-        )
+        out = []
+        for i, edge in enumerate(map(PupilEdge, np.moveaxis(self.harmonics, 1, 0))):
+            shadow = None if self.shadow is None else self.shadow.take(slice(i, i + 1))
+            terms = (self.eikonal_terms[i], self.amplitude_terms[i])
+            rests = (float(self.residual[i]), float(self.amplitude_residual[i]))
+            out.append(PupilFunction(self.centre[i], self.axes[i], edge, *terms, *rests, shadow))
+        return tuple(out)
 
     def transfer(self, frequency: np.ndarray, wavelengths: np.ndarray, weights: np.ndarray) -> np.ndarray:
         """Return polychromatic transfer functions in the plane of the traced detector, for M frequencies of B images.

@@ -10,8 +10,6 @@ smooth map; normalised so that its first harmonic is the unit circle it is
 with small complex harmonics c_n.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import lru_cache

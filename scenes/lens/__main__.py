@@ -239,7 +239,7 @@ def new(
         sizes = [_quantity("--aperture", aperture, LENGTH), _quantity("--wavelength", wavelength, LENGTH)]
         half, step = _quantity("--field", field, ANGLE), _quantity("--pitch", pitch, LENGTH)
         back = _quantity("--behind", behind, LENGTH)
-        from scenes.lens.first_design import first_camera
+        from scenes.lens.prescription import first_camera
         from scenes.specs.camera import CameraSpec
         from scenes.yaml.spec import validate
         from scenes.yaml.yaml_file import parse_yaml

@@ -3,8 +3,6 @@
 In batoid light comes down from +z; here it enters toward +z. Everything is rotated about x by 180 deg.
 """
 
-from __future__ import annotations
-
 import math
 import warnings
 from collections.abc import Mapping
@@ -165,19 +163,10 @@ class _Reader:
         if given.get("type") == "Baffle" and not (shape.is_plane and edges):
             self.notes.append(Note(self.line(key), name, "a baffle that is not plane, or without an edge: omitted"))
             return
-        surface = LensSurface(
-            name,
-            pose,
-            shape,
-            how,
-            index / self.ambient,
-            clear,
-            self.line(key),
-            self.named[index].name if index in self.named else "",
-            rest,
-        )
+        glass, ratio = self.named[index].name if index in self.named else "", index / self.ambient
         # Rotate the world, and the frame of each surface with it.
-        self.surfaces.append(turned_over(LensSurface(**{**vars(surface), "pose": OVER @ pose})))
+        surface = LensSurface(name, OVER @ pose, shape, how, ratio, clear, self.line(key), glass, rest)
+        self.surfaces.append(turned_over(surface))
 
     def _placed(self, given: Mapping[str, Any], key: KeyPath, pose: Pose) -> Pose:
         """Return a pose after the shifts and rotations of a ``coordSys``, each about the axes reached so far."""
@@ -411,17 +400,8 @@ def read_batoid(path: str | Path, wavelength: float) -> Prescription:
     name, surfaces = str(system.get("name", "")) or Path(path).stem, tuple(reader.surfaces)
     # The dispersion relative to another medium than the first one of the file differs.
     glasses = {glass.name: glass for glass in reader.named.values()} if reader.ambient == 1.0 else {}
-    return Prescription(
-        name,
-        str(path),
-        surfaces,
-        stop,
-        wavelength,
-        (wavelength,),
-        field_kind="none",
-        notes=tuple(notes),
-        glasses=FrozenMap(glasses),
-    )
+    further: dict[str, Any] = {"field_kind": "none", "notes": tuple(notes), "glasses": FrozenMap(glasses)}
+    return Prescription(name, str(path), surfaces, stop, wavelength, (wavelength,), **further)
 
 
 def _loaded(path: str | Path) -> object:

@@ -4,8 +4,6 @@
 and a curved image.
 """
 
-from __future__ import annotations
-
 import math
 import re
 from dataclasses import dataclass, replace
@@ -34,8 +32,7 @@ from scenes.lens.prescription import (
     written,
 )
 from scenes.models.camera_model import CameraModel, collimated, derive_camera, field_direction
-from scenes.specs.camera import CameraSpec
-from scenes.specs.glass import glass_entry
+from scenes.specs.camera import CameraSpec, glass_entry
 from scenes.yaml.errors import InputError, Problem, printable
 from scenes.yaml.units import ANGLE, LENGTH, format_quantity, power_of_length
 

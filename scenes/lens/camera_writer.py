@@ -7,8 +7,6 @@ The pupil is defined by the size of the stop, with real ray aiming.
 batoid: there light comes down from +z; here it enters toward +z. Everything is rotated about x by 180 deg.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from dataclasses import replace
@@ -40,14 +38,9 @@ def prescription_of(model: CameraModel) -> Prescription:
         index_behind[name] = index
     surfaces = [
         LensSurface(
-            name,
-            model.mirror_pose(name),
-            joined(model.surfaces[name]),
-            LIGHT[mirror.light],
-            index_behind[name],
-            *_cut(model, name),
+            name, model.mirror_pose(name), joined(model.surfaces[name]), how, index_behind[name], *_cut(model, name)
         )
-        for name, mirror in spec.mirrors.items()
+        for name, how in ((name, LIGHT[mirror.light]) for name, mirror in spec.mirrors.items())
     ]
     surfaces.append(LensSurface(IMAGE, model.image_body, plane(), Interaction.PASS, index))
     return Prescription(

@@ -11,18 +11,16 @@ rotation before. Rotations about x and y are left-handed, those about z right-ha
 | REV | the inverse of the same decentre, behind the surface: it undoes one |
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 
-from optics.geometry.aperture import Aperture, Circle, Edge
+from optics.geometry.aperture import Aperture, Circle, Edge, Ellipse, Rectangle
 from optics.geometry.pose import Pose, about_axis
 from optics.geometry.surface import Surface
-from scenes.lens.prescription import LARGEST_ORDER, Prescription, Pupil, clear, even_asphere, polynomial
+from scenes.lens.prescription import LARGEST_ORDER, Prescription, Pupil, even_asphere, polynomial
 from scenes.lens.statements import (
     MOST_SURFACES,
     NO_GLASSES,
@@ -34,6 +32,7 @@ from scenes.lens.statements import (
     is_number,
     joined,
     named_glasses,
+    paired,
     read_lines,
     require_d_line,
     statement_of,
@@ -181,16 +180,8 @@ def take(system: CodevSystem, s: Statement) -> None:
         source.note(s, "not understood")
 
 
-_FIELDS = {
-    "XAN": "angles",
-    "YAN": "angles",
-    "XOB": "object heights",
-    "YOB": "object heights",
-    "XIM": "image heights",
-    "YIM": "image heights",
-    "XRI": "real image heights",
-    "YRI": "real image heights",
-}
+_KINDS = {"AN": "angles", "OB": "object heights", "IM": "image heights", "RI": "real image heights"}
+_FIELDS = {f"{axis}{ending}": kind for ending, kind in _KINDS.items() for axis in "XY"}
 
 
 def _qualified(s: Statement) -> bool:
@@ -422,28 +413,14 @@ def _prescription(system: CodevSystem, glasses: Glasses) -> Prescription:
             chain.pose = chain.pose @ back
         if not last:
             chain.move((0.0, 0.0, surface.thickness * scale))
-    pupil = system.pupil
+    pupil, pairs = system.pupil, paired(system.x, system.y)
     if pupil is not None and pupil.kind == "diameter":
         pupil = Pupil("diameter", pupil.value * scale, pupil.line)
-    return chain.prescription(
-        "STO",
-        read[0].thickness * scale,
-        system.name,
-        wavelength=wavelength,
-        wavelengths=tuple(dict.fromkeys(system.waves)),
-        fields=_pairs(system) if system.field_kind == "angles" else (),
-        heights=() if system.field_kind == "angles" else tuple((x * scale, y * scale) for x, y in _pairs(system)),
-        field_kind=system.field_kind,
-        pupil=pupil,
-        glasses=named_glasses(glasses, chain.surfaces),
-    )
-
-
-def _pairs(system: CodevSystem) -> tuple[tuple[float, float], ...]:
-    """Return the field coordinates (x, y) of the file; missing numbers are 0."""
-    count = max(len(system.x), len(system.y))
-    x, y = ([*given, *[0.0] * count][:count] for given in (system.x, system.y))
-    return tuple(zip(x, y, strict=True))
+    light = {"wavelength": wavelength, "wavelengths": tuple(dict.fromkeys(system.waves)), "pupil": pupil}
+    heights = tuple((x * scale, y * scale) for x, y in pairs)
+    field = {"fields": pairs} if system.field_kind == "angles" else {"heights": heights}
+    light |= {**field, "field_kind": system.field_kind, "glasses": named_glasses(glasses, chain.surfaces)}
+    return chain.prescription("STO", read[0].thickness * scale, system.name, **light)
 
 
 def _behind(source: Source, surface: CodevSurface, wavelength: float, glasses: Glasses) -> tuple[float, str] | None:
@@ -498,10 +475,10 @@ def _edges_of(surface: CodevSurface) -> tuple[Aperture | None, tuple[Edge, ...]]
     blocked = (Edge(Circle(surface.hole, centre), blocks=True),) if surface.hole else ()
     if "REX" in sizes or "REY" in sizes:
         wide = sizes.get("REX", sizes.get("REY", 0.0)), sizes.get("REY", sizes.get("REX", 0.0))
-        return clear(rectangle=wide, centre=centre), blocked
+        return Rectangle(*wide, centre), blocked
     if "ELX" in sizes or "ELY" in sizes:
         wide = sizes.get("ELX", sizes.get("ELY", 0.0)), sizes.get("ELY", sizes.get("ELX", 0.0))
-        return clear(ellipse=wide, centre=centre), blocked
+        return Ellipse(*wide, centre), blocked
     if "CIR" in sizes:
-        return clear(sizes["CIR"], surface.hole, centre=centre), ()
+        return Circle(sizes["CIR"], centre, surface.hole), ()
     return None, blocked

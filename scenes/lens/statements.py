@@ -5,8 +5,6 @@ catalogues, as manufacturers publish them, and those of the twin, by the names t
 relative to air of 20 C and 1013 hPa, as in prescriptions on the ground.
 """
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -273,6 +271,13 @@ def named_glasses(glasses: Glasses, surfaces: Iterable[LensSurface]) -> Glasses:
     """Return the glasses of surfaces whose dispersion is known, by the names that the surfaces use."""
     names = {surface.glass for surface in surfaces if surface.glass}
     return FrozenMap({name: glasses[glass_key(name)] for name in sorted(names) if glass_key(name) in glasses})
+
+
+def paired(x: Sequence[float], y: Sequence[float], count: int = 0) -> tuple[tuple[float, float], ...]:
+    """Return the pairs of x and y fields, as many as counted or as the longer row has; missing ones are zero."""
+    count = count or max(len(x), len(y))
+    x, y = ([*given, *[0.0] * count][:count] for given in (x, y))
+    return tuple(zip(x, y, strict=True))
 
 
 def require_d_line(source: Source, what: str, name: str, wavelength: float, line: int) -> None:

@@ -5,32 +5,17 @@ before; with its order flag set it does the reverse: rotations about z, y and x,
 right-handed.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 from optics.geometry.aperture import Aperture, Circle, Edge, EdgeShape, Ellipse, Rectangle
 from optics.geometry.pose import about_axis
 from optics.geometry.surface import Surface, ZernikeFigure
 from optics.geometry.zernike import MAX_NOLL
-from scenes.lens.prescription import Prescription, Pupil, clear, even_asphere, polynomial
-from scenes.lens.statements import (
-    MOST_SURFACES,
-    NO_GLASSES,
-    Chain,
-    Glasses,
-    Source,
-    Statement,
-    index_of,
-    joined,
-    named_glasses,
-    of_makers,
-    read_lines,
-    require_d_line,
-    statement_of,
-)
+from scenes.lens import statements
+from scenes.lens.prescription import Prescription, Pupil, even_asphere, polynomial
 
 UNITS = {"MM": 1e-3, "CM": 1e-2, "IN": 25.4e-3, "INCH": 25.4e-3, "ME": 1.0, "M": 1.0, "METER": 1.0}
 
@@ -83,7 +68,7 @@ class _Surface:
     radius: float = 0.0
     parameters: dict[int, float] = field(default_factory=dict)
     extra: dict[int, float] = field(default_factory=dict)
-    edges: dict[str, tuple[Statement, float, float]] = field(default_factory=dict)
+    edges: dict[str, tuple[statements.Statement, float, float]] = field(default_factory=dict)
     centre: tuple[float, float] = (0.0, 0.0)
 
 
@@ -91,7 +76,7 @@ class _Surface:
 class _System:
     """Optical system of a Zemax file: surfaces and settings from the statements read so far."""
 
-    source: Source
+    source: statements.Source
     scale: float = 1e-3
     name: str = ""
     catalogues: tuple[str, ...] = ()
@@ -107,7 +92,7 @@ class _System:
     surfaces: list[_Surface] = field(default_factory=list)
 
 
-def read_zemax(path: str | Path, glasses: Glasses = NO_GLASSES) -> Prescription:
+def read_zemax(path: str | Path, glasses: statements.Glasses = statements.NO_GLASSES) -> Prescription:
     """Read a .zmx file.
 
     Parameters
@@ -122,28 +107,26 @@ def read_zemax(path: str | Path, glasses: Glasses = NO_GLASSES) -> Prescription:
     InputError
         The file is damaged, or has a statement that would be misread; the message names the line.
     """
-    source = Source(str(path))
-    lines = read_lines(source)
+    source = statements.Source(str(path))
+    lines = statements.read_lines(source)
     system = _System(source)
     for number, text in enumerate(lines, start=1):
-        if (statement := statement_of(number, text.rstrip("\x1a"))) is not None:
+        if (statement := statements.statement_of(number, text.rstrip("\x1a"))) is not None:
             _take(system, statement)
     if not system.surfaces:
         raise source.error("no surface in this file", len(lines), allowed="SURF 0, SURF 1, ... of a Zemax file")
     if len(system.surfaces) < 3:
-        problem, found = (
-            "too few surfaces: the file is truncated or not an optical system",
-            f"{len(system.surfaces)} surfaces",
-        )
+        problem = "too few surfaces: the file is truncated or not an optical system"
+        found = f"{len(system.surfaces)} surfaces"
         raise source.error(problem, system.surfaces[-1].line, found, "object, optics and image")
     return _prescription(system, glasses)
 
 
-def _take(system: _System, s: Statement) -> None:
+def _take(system: _System, s: statements.Statement) -> None:
     """Apply one statement of the file to the system that is being read."""
     source = system.source
     if s.command == "SURF":
-        number = source.whole(s, 0, "the surface's number", 0, MOST_SURFACES)
+        number = source.whole(s, 0, "the surface's number", 0, statements.MOST_SURFACES)
         if number != len(system.surfaces):
             raise source.error("surfaces are not in order", s.line, number, f"SURF {len(system.surfaces)}")
         system.surfaces.append(_Surface(number, s.line))
@@ -163,7 +146,7 @@ def _take(system: _System, s: Statement) -> None:
         source.note(s, "not understood")
 
 
-def _take_system(system: _System, s: Statement) -> None:
+def _take_system(system: _System, s: statements.Statement) -> None:
     """Apply a statement about the whole system: title, units, pupil, wavelengths, fields."""
     source = system.source
     match s.command:
@@ -173,7 +156,7 @@ def _take_system(system: _System, s: Statement) -> None:
         case "GCAT":
             system.catalogues = tuple(word.upper() for word in s.words)
         case "NAME":
-            system.name = joined(s.words)
+            system.name = statements.joined(s.words)
         case "UNIT":
             unit = s.words[0].upper() if s.words else ""
             if unit not in UNITS:
@@ -212,7 +195,7 @@ def _take_system(system: _System, s: Statement) -> None:
                 source.note(s, "vignetting factors are omitted; beams are limited by the stop")
 
 
-def _positive(source: Source, s: Statement, what: str) -> float:
+def _positive(source: statements.Source, s: statements.Statement, what: str) -> float:
     """Return the first number of a statement; raise InputError if it is not positive."""
     value = source.finite(s, 0, what)
     if not value > 0.0:
@@ -220,14 +203,14 @@ def _positive(source: Source, s: Statement, what: str) -> float:
     return value
 
 
-def _wave(source: Source, s: Statement, micrometres: float) -> float:
+def _wave(source: statements.Source, s: statements.Statement, micrometres: float) -> float:
     """Return a wavelength in metres from one in micrometres, after checking it."""
     if not 0.1 <= micrometres <= 100.0:
         raise source.error("no wavelength of light", s.line, s.text, "0.1 to 100 um")
     return micrometres / 1e6
 
 
-def _take_surface(system: _System, surface: _Surface, s: Statement) -> None:
+def _take_surface(system: _System, surface: _Surface, s: statements.Statement) -> None:
     """Apply a statement about one surface: its type, curvature, thickness, glass, parameters or aperture."""
     source = system.source
     match s.command:
@@ -236,7 +219,7 @@ def _take_surface(system: _System, surface: _Surface, s: Statement) -> None:
         case "STOP":
             surface.stop = True
         case "COMM":
-            surface.name = joined(s.words)
+            surface.name = statements.joined(s.words)
         case "CURV":
             surface.curvature = source.finite(s, 0, "the curvature")
         case "CONI":
@@ -268,14 +251,14 @@ def _take_surface(system: _System, surface: _Surface, s: Statement) -> None:
             surface.edges[what] = (s, source.finite(s, 0, "its size"), source.finite(s, 1, "its size"))
 
 
-def _prescription(system: _System, glasses: Glasses) -> Prescription:
+def _prescription(system: _System, glasses: statements.Glasses) -> Prescription:
     """Return the prescription of a file whose statements are read."""
     source, scale = system.source, system.scale
     waves = [system.waves[k] for k in sorted(system.waves) if not system.wave_count or k <= system.wave_count]
     if not waves:
         raise source.error("no wavelength in this file", 1, allowed="WAVM or WAVL")
     primary = system.waves.get(system.primary, waves[0])
-    chain, read, glasses = Chain(source), system.surfaces, of_makers(glasses, system.catalogues)
+    chain, read, glasses = statements.Chain(source), system.surfaces, statements.of_makers(glasses, system.catalogues)
     if read[0].kind == "COORDBRK" or read[0].glass:
         raise source.error("the object is a coordinate break or in glass", read[0].line)
     for k, surface in enumerate(read[1:], start=1):
@@ -304,25 +287,18 @@ def _prescription(system: _System, glasses: Glasses) -> Prescription:
         radius = next((s.radius for s in read if s.stop), 0.0) * scale
         pupil = Pupil("stop", radius, pupil.line) if radius > 0.0 else None
     kinds = ("angles", "object heights", "paraxial image heights", "real image heights", "theodolite angles")
-    return chain.prescription(
-        "STOP",
-        read[0].thickness * scale,
-        system.name,
-        wavelength=primary,
-        wavelengths=tuple(dict.fromkeys(waves)),
-        fields=_fields(system) if system.field_type == 0 else (),
-        heights=tuple((x * scale, y * scale) for x, y in _pairs(system)) if 1 <= system.field_type <= 3 else (),
-        field_kind=kinds[min(system.field_type, 4)],
-        pupil=pupil,
-        glasses=named_glasses(glasses, chain.surfaces),
-    )
+    light: dict[str, Any] = {"wavelength": primary, "wavelengths": tuple(dict.fromkeys(waves)), "pupil": pupil}
+    light |= {"fields": _fields(system)} if system.field_type == 0 else {}
+    if 1 <= system.field_type <= 3:
+        light["heights"] = tuple((x * scale, y * scale) for x, y in _pairs(system))
+    light |= {"field_kind": kinds[min(system.field_type, 4)]}
+    light |= {"glasses": statements.named_glasses(glasses, chain.surfaces)}
+    return chain.prescription("STOP", read[0].thickness * scale, system.name, **light)
 
 
 def _pairs(system: _System) -> tuple[tuple[float, float], ...]:
     """Return the field coordinates (x, y) of the file; missing numbers are 0."""
-    count = system.field_count or max(len(system.x), len(system.y))
-    x, y = ([*given, *[0.0] * count][:count] for given in (system.x, system.y))
-    return tuple(zip(x, y, strict=True))
+    return statements.paired(system.x, system.y, system.field_count)
 
 
 def _fields(system: _System) -> tuple[tuple[float, float], ...]:
@@ -333,7 +309,7 @@ def _fields(system: _System) -> tuple[tuple[float, float], ...]:
     return tuple((math.radians(a), math.radians(b)) for a, b in _pairs(system))
 
 
-def _break(source: Source, chain: Chain, surface: _Surface, scale: float) -> None:
+def _break(source: statements.Source, chain: statements.Chain, surface: _Surface, scale: float) -> None:
     """Move the frame of the following surfaces by a coordinate break."""
     p = surface.parameters
     shift = (p.get(1, 0.0) * scale, p.get(2, 0.0) * scale, 0.0)
@@ -345,7 +321,9 @@ def _break(source: Source, chain: Chain, surface: _Surface, scale: float) -> Non
         chain.move(shift)
 
 
-def _behind(source: Source, surface: _Surface, wavelength: float, glasses: Glasses) -> tuple[float, str] | None:
+def _behind(
+    source: statements.Source, surface: _Surface, wavelength: float, glasses: statements.Glasses
+) -> tuple[float, str] | None:
     """Return index at the primary wavelength, and name, of the medium behind a surface; None for a mirror."""
     words, line = surface.glass, surface.glass_line
     if not words:
@@ -353,13 +331,13 @@ def _behind(source: Source, surface: _Surface, wavelength: float, glasses: Glass
     if words[0].upper() == "MIRROR":
         return None
     if words[0] == "___BLANK" or (len(words) > 1 and words[1] == "1"):
-        stated = source.finite(Statement(line, "GLAS", words, " ".join(words)), 3, "the index")
-        require_d_line(source, "model", words[0], wavelength, line)
+        stated = source.finite(statements.Statement(line, "GLAS", words, " ".join(words)), 3, "the index")
+        statements.require_d_line(source, "model", words[0], wavelength, line)
         return stated, words[0]
-    return index_of(source, glasses, words[0], wavelength, line), words[0]
+    return statements.index_of(source, glasses, words[0], wavelength, line), words[0]
 
 
-def _shape(source: Source, surface: _Surface, scale: float) -> Surface:
+def _shape(source: statements.Source, surface: _Surface, scale: float) -> Surface:
     """Return the shape of a surface, in metres."""
     line = surface.kind_line or surface.line
     if surface.kind not in SHAPES:
@@ -408,10 +386,12 @@ def _edges_of(surface: _Surface, scale: float) -> tuple[Aperture | None, tuple[E
         blocked.append(Rectangle(*sizes["blocked rectangle"], centre))
     if "blocked ellipse" in sizes:
         blocked.append(Ellipse(*sizes["blocked ellipse"], centre))
-    edge = clear(rectangle=sizes.get("rectangle"), ellipse=sizes.get("ellipse"), centre=centre)
-    if edge is None and "clear" in sizes:
+    edge: Aperture | None = None
+    if "rectangle" in sizes or "ellipse" in sizes:
+        edge = Rectangle(*sizes["rectangle"], centre) if "rectangle" in sizes else Ellipse(*sizes["ellipse"], centre)
+    elif "clear" in sizes:
         inner, outer = sizes["clear"]
-        edge = clear(outer, hole or inner, centre=centre)
-    elif hole:
+        edge = Circle(outer, centre, hole or inner)
+    if hole and not isinstance(edge, Circle):
         blocked.append(Circle(hole, centre))
     return edge, tuple(Edge(shape, blocks=True) for shape in blocked)

@@ -1,7 +1,5 @@
 """Conversion between a camera's file, the prescription that an optimisation varies, and the file of its result."""
 
-from __future__ import annotations
-
 import io
 from pathlib import Path
 from typing import Any, Self
@@ -9,8 +7,7 @@ from typing import Any, Self
 import numpy as np
 from ruamel.yaml import YAML
 
-from optics.design.design_variables import Prescription, Variable, VertexPose
-from optics.design.merit_function import Beams, Operands
+from optics.design.merit_function import Beams, Operands, Prescription, Variable, VertexPose
 from optics.geometry.surface import plane
 from optics.numerics import quadrature
 from scenes.models.camera_model import IMAGE, surface_of

@@ -22,7 +22,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from optics.camera.ray_bundle import direction_of
+from optics.camera.image_quality import direction_of
 from optics.geometry.aperture import Aperture, Circle, Edge, Ellipse, Rectangle, outer_edge
 from optics.geometry.pose import Pose, about_axis, rotation_matrix
 from optics.geometry.surface import Surface, plane

@@ -200,17 +200,9 @@ class FieldBeams:
         require_rays(valid.reshape(shape), f"camera {spec.name}")
         position, direction = position.reshape(*shape, 3), direction.reshape(*shape, 3)
         step = position[:, 0] - model.mirror_pose(model.mirrors[last]).apply(traced.hit(last).reshape(*shape, 3)[:, 0])
-        return cls(
-            spec,
-            np.array(fields),
-            nodes,
-            position,
-            direction,
-            path.reshape(shape),
-            float(model.first_order.exit_pupil_distance[0]),
-            np.sum(step * direction[:, 0], axis=-1),
-            illuminated,
-        )
+        pupil, along = float(model.first_order.exit_pupil_distance[0]), np.sum(step * direction[:, 0], axis=-1)
+        ends = (position, direction, path.reshape(shape))
+        return cls(spec, np.array(fields), nodes, *ends, pupil, along, illuminated)
 
     @property
     def share(self) -> np.ndarray:

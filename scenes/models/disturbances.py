@@ -27,18 +27,9 @@ from optics.numerics.array_math import covariance_root
 from optics.thermal.heat import Temperature, Temperatures
 from scenes.models.instrument_model import Instrument
 from scenes.models.thermal_model import TemperatureError, ThermalModel
+from scenes.specs import disturbances
 from scenes.specs.course import noll
-from scenes.specs.disturbances import (
-    JOINT,
-    CauseSpec,
-    DisturbancesSpec,
-    JointSpec,
-    TimeLawSpec,
-    component_parts,
-    written_sigma,
-)
-from scenes.specs.motion_text import find_node
-from scenes.specs.perturbation import NodeInfo
+from scenes.specs.perturbation import NodeInfo, find_node
 from scenes.specs.resolved import ResolvedJob
 from scenes.yaml.errors import InputError, Issue, KeyPath, Problem, names_text, nearest, shown, unknown
 from scenes.yaml.spec import validate
@@ -51,15 +42,12 @@ INDEFINITE = -1e-9
 UNITS: Mapping[str, tuple[str, float]] = {
     "shift": ("um", 1e-6),
     "rotate": ("arcsec", parse_quantity("1 arcsec", ANGLE)),
-    "scale": ("ppm", 1e-6),
-    "radius": ("ppm", 1e-6),
-    "conic": ("ppm", 1e-6),
-    "index": ("ppm", 1e-6),
-    "abbe": ("percent", 1e-2),
     "figure": ("nm", 1e-9),
+    **dict.fromkeys(("scale", "radius", "conic", "index"), ("ppm", 1e-6)),
+    "abbe": ("percent", 1e-2),
+    "index_gradient": ("ppm/m", 1e-6),
     "temperature": ("K", 1.0),
     "gradient": ("mK/m", 1e-3),
-    "index_gradient": ("ppm/m", 1e-6),
 }
 """Kind of component -> the unit in which its amounts are printed, and the size of that unit in SI."""
 HEAT = ("temperature", "gradient")
@@ -144,7 +132,7 @@ class DisturbancePrior:
     name: str
     components: tuple[Component, ...]
     correlation: np.ndarray
-    laws: tuple[TimeLawSpec, ...]
+    laws: tuple[disturbances.TimeLawSpec, ...]
     jump_false_alarm: float | None = None
 
     @property
@@ -203,7 +191,9 @@ def disturbance_prior(resolved: ResolvedJob, instrument: Instrument) -> Disturba
     return prior_of_spec(spec, instrument, lambda *problem: _issue_at(resolved, *problem))
 
 
-def prior_of_spec(spec: DisturbancesSpec, instrument: Instrument, issue: _Where | None = None) -> DisturbancePrior:
+def prior_of_spec(
+    spec: disturbances.DisturbancesSpec, instrument: Instrument, issue: _Where | None = None
+) -> DisturbancePrior:
     """Return the prior that a disturbances file gives for an instrument.
 
     Parameters
@@ -226,7 +216,7 @@ def prior_of_spec(spec: DisturbancesSpec, instrument: Instrument, issue: _Where 
     issue_at = issue or (lambda cause, key, wrong: spec.issue(wrong, ("causes", cause, *key)))
     glass = {solid.path for solid in instrument.solids if solid.transparent}
     components: list[Component] = []
-    laws: list[TimeLawSpec] = []
+    laws: list[disturbances.TimeLawSpec] = []
     blocks: list[np.ndarray] = []
     issues, nodes = _unmatched_patterns(spec, instrument, issue_at), instrument.nodes
     for name, cause in spec.causes.items():
@@ -424,7 +414,7 @@ def _issue_at(resolved: ResolvedJob, cause: str, key: KeyPath, wrong: Problem) -
     return resolved.disturbances.issue(wrong, ("causes", cause, *key))
 
 
-def _unmatched_patterns(spec: DisturbancesSpec, instrument: Instrument, where: _Where) -> list[Issue]:
+def _unmatched_patterns(spec: disturbances.DisturbancesSpec, instrument: Instrument, where: _Where) -> list[Issue]:
     """Return an issue for each pattern that matches no body of the instrument, at the first cause that has it."""
     first: dict[str, tuple[str, int]] = {}
     causes: dict[str, list[str]] = {}
@@ -451,9 +441,9 @@ def _nearest(pattern: str, nodes: Iterable[str]) -> str | None:
 
 
 def _of_cause(
-    spec: DisturbancesSpec,
+    spec: disturbances.DisturbancesSpec,
     name: str,
-    cause: CauseSpec,
+    cause: disturbances.CauseSpec,
     bodies: Sequence[str],
     instrument: Instrument,
     glass: set[str],
@@ -493,14 +483,14 @@ def default_pivot(info: NodeInfo) -> str:
 
 
 def _of_joint(
-    spec: DisturbancesSpec, joint: JointSpec, instrument: Instrument, glass: set[str]
+    spec: disturbances.DisturbancesSpec, joint: disturbances.JointSpec, instrument: Instrument, glass: set[str]
 ) -> tuple[list[Component], np.ndarray, list[Issue]]:
     """Return the components of the key `joint` that move, their correlations, and the issues of faulty ones."""
     components: list[Component] = []
     issues: list[Issue] = []
     named: dict[tuple[str, str, int], str] = {}
     for name, sigma in joint.components.items():
-        node, kind, what, about = component_parts(name)
+        node, kind, what, about = disturbances.component_parts(name)
         axis = noll(what) if kind == "figure" else max(AXES.find(what), 0) if what else 0
         try:
             path = find_node(node, instrument.nodes)
@@ -511,19 +501,19 @@ def _of_joint(
             if about and about not in info.known_pivots:
                 raise unknown(f"{path} has no such pivot", about, info.known_pivots)
             if (path, kind, axis) in named:
-                raise Problem(
-                    "a component is named twice", shown(name), f"once; it is the same as {named[path, kind, axis]}"
-                )
+                same = f"once; it is the same as {named[path, kind, axis]}"
+                raise Problem("a component is named twice", shown(name), same)
         except Problem as wrong:
-            issues.append(spec.issue(wrong, (JOINT, "components", name)))
+            issues.append(spec.issue(wrong, (disturbances.JOINT, "components", name)))
             continue
         named[path, kind, axis] = name
         pivot = about or default_pivot(info)
-        components.append(Component(JOINT, path, kind, axis, pivot, sigma / spec.sigmas))
+        components.append(Component(disturbances.JOINT, path, kind, axis, pivot, sigma / spec.sigmas))
     matrix = np.eye(len(joint.components)) if joint.correlation is None else np.array(joint.correlation)
     if (least := _least(matrix)) < INDEFINITE:
         text = f"the correlation matrix is not positive definite: it has an eigenvalue of {least:.3g}"
-        issues.append(spec.issue(Problem(text, allowed="correlations of real quantities"), (JOINT, "correlation")))
+        problem = Problem(text, allowed="correlations of real quantities")
+        issues.append(spec.issue(problem, (disturbances.JOINT, "correlation")))
     if issues:
         return [], np.zeros((0, 0)), issues
     moving = [k for k, c in enumerate(components) if c.sigma > 0.0]
@@ -540,7 +530,7 @@ def _possible(info: NodeInfo, transparent: bool) -> set[str]:
     return {*info.allows, *(("index_gradient",) if transparent else ())}
 
 
-def _sigmas(cause: CauseSpec) -> Iterator[tuple[KeyPath, str, int, float]]:
+def _sigmas(cause: disturbances.CauseSpec) -> Iterator[tuple[KeyPath, str, int, float]]:
     """Yield key, kind, axis and standard deviation of every number of a cause."""
     for kind in ("shift", "rotate", "index_gradient"):
         for axis, value in enumerate(getattr(cause, kind) or ()):
@@ -557,7 +547,7 @@ def _sigmas(cause: CauseSpec) -> Iterator[tuple[KeyPath, str, int, float]]:
 
 
 def _correlation(
-    name: str, cause: CauseSpec, components: Sequence[Component], where: _Where
+    name: str, cause: disturbances.CauseSpec, components: Sequence[Component], where: _Where
 ) -> tuple[np.ndarray, list[Issue]]:
     """Return the correlation matrix of a cause's components and the issues found in it.
 
@@ -603,7 +593,7 @@ def _correlation(
     return matrix, issues
 
 
-def _first_impossible(cause: CauseSpec, known: Mapping[str, int]) -> int:
+def _first_impossible(cause: disturbances.CauseSpec, known: Mapping[str, int]) -> int:
     """Return the index of the first entry of ``correlations`` with which the correlation matrix becomes indefinite."""
     matrix, last = np.eye(len(known)), len(cause.correlations) - 1
     for n, group in enumerate(cause.correlations[:last]):
@@ -647,7 +637,7 @@ def drawn_motions(prior: DisturbancePrior, seconds: Array, source: Callable[[int
     return out
 
 
-def drawn_course(law: TimeLawSpec, seconds: Array, rng: np.random.Generator, count: int) -> Array:
+def drawn_course(law: disturbances.TimeLawSpec, seconds: Array, rng: np.random.Generator, count: int) -> Array:
     """Draw independent random time series of unit standard deviation with the covariance of a time law.
 
     Parameters
@@ -740,8 +730,7 @@ def joint_disturbances(
     nodes: Mapping[str, NodeInfo],
     reason: str,
     description: str = "",
-    time: TimeLawSpec | None = None,
-) -> DisturbancesSpec:
+) -> disturbances.DisturbancesSpec:
     """Return a disturbances specification, with `joint`, of components with a given covariance.
 
     ``prior_of_spec`` makes of it the components that move, in this order and with these standard deviations, and
@@ -761,8 +750,6 @@ def joint_disturbances(
         Origin of the numbers, written into the file.
     description : str
         Description written into the file.
-    time : TimeLawSpec or None
-        Law of time in a series of measurements; constant by default.
 
     Raises
     ------
@@ -787,25 +774,15 @@ def joint_disturbances(
     if len(moving) and np.linalg.eigvalsh(correlation)[0] < INDEFINITE:
         raise ValueError("the covariance has a negative eigenvalue")
     names = [_name(components[k], nodes) for k in moving]
-    plain = {
-        "name": name,
-        "description": description,
-        "joint": {
-            "components": {
-                component_name: written_sigma(component_name, float(sigma[k]))
-                for component_name, k in zip(names, moving, strict=True)
-            },
-            "correlation": correlation.tolist(),
-            "time": (time or TimeLawSpec(kind="constant")).plain(),
-            "reason": reason,
-        },
-    }
+    sigmas = {key: disturbances.written_sigma(key, float(sigma[k])) for key, k in zip(names, moving, strict=True)}
+    joint = {"components": sigmas, "correlation": correlation.tolist(), "time": {"kind": "constant"}, "reason": reason}
+    plain = {"name": name, "description": description, "joint": joint}
     if len(set(names)) < len(names):
         raise ValueError("a component is named twice")
-    return validate(DisturbancesSpec, YamlFile(name, plain, {}))
+    return validate(disturbances.DisturbancesSpec, YamlFile(name, plain, {}))
 
 
-def joint_files(spec: DisturbancesSpec, stem: str, remark: str = "") -> dict[str, str]:
+def joint_files(spec: disturbances.DisturbancesSpec, stem: str, remark: str = "") -> dict[str, str]:
     """Return the files of a specification with `joint`: a YAML, and a CSV of the correlations if there are many.
 
     Parameters

@@ -1,7 +1,5 @@
 """Construction of an instrument from its file: cameras, monitor channels, central prism, and departures as built."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
@@ -20,19 +18,7 @@ from optics.numerics.number_tree import FrozenMap
 from optics.raytrace.assembly import Assembly, Element, Interaction
 from optics.raytrace.reflectors import facet_block
 from optics.raytrace.system import assemble
-from scenes.models import monitor_chain
-from scenes.models.camera_model import (
-    CameraModel,
-    above_d_line,
-    camera_bodies,
-    camera_elements,
-    camera_sequences,
-    derive_camera,
-    focal_plane_body,
-    glass_indices,
-    lenses,
-    shape_changes,
-)
+from scenes.models import camera_model, monitor_chain
 from scenes.models.camera_sharpness import no_cameras
 from scenes.models.instrument_model import Instrument, MisplacedError
 from scenes.models.monitor_chain import square_facets
@@ -196,12 +182,12 @@ def _build(
     """Build an instrument anew, without looking it up in the cache."""
     if spec.monitor is not None:
         monitor_chain.check_prisms(spec)
-    derived: dict[str, CameraModel] = {}
+    derived: dict[str, camera_model.CameraModel] = {}
     for site in spec.cameras.values():
         if site.camera not in derived:
             if spec.monitor is not None:
                 camera_specs[site.camera].require_mirrors("a camera with a monitor")  # type: ignore[attr-defined]
-            derived[site.camera] = derive_camera(camera_specs[site.camera], backend)  # type: ignore[arg-type]
+            derived[site.camera] = camera_model.derive_camera(camera_specs[site.camera], backend)  # type: ignore[arg-type]
     bodies = [Body(BASE)]
     if spec.central_prism is not None:
         bodies.append(Body(CENTRAL_PRISM, Pose(np.eye(3), np.array(spec.central_prism.position))))
@@ -216,11 +202,14 @@ def _build(
         root = f"{BASE}/{name}"
         to_base = Pose(about_axis(1, site.look), np.array(site.position))
         camera_channels = _channels(spec, name, model)
-        bodies += [*camera_bodies(root, to_base, model), *_monitor_bodies(focal_plane_body(root), camera_channels)]
-        elements.update({**camera_elements(name, root, model), **_ccd_elements(camera_channels)})
-        sequences.update(camera_sequences(name, model))
-        index |= {f"{root}/{lens}": n for lens, n in glass_indices(model.spec).items()}
-        above_d |= {f"{root}/{lens}": step for lens, step in above_d_line(model.spec).items()}
+        bodies += [
+            *camera_model.camera_bodies(root, to_base, model),
+            *_monitor_bodies(camera_model.focal_plane_body(root), camera_channels),
+        ]
+        elements.update({**camera_model.camera_elements(name, root, model), **_ccd_elements(camera_channels)})
+        sequences.update(camera_model.camera_sequences(name, model))
+        index |= {f"{root}/{lens}": n for lens, n in camera_model.glass_indices(model.spec).items()}
+        above_d |= {f"{root}/{lens}": step for lens, step in camera_model.above_d_line(model.spec).items()}
         if not camera_channels:
             continue
         bodies += [Body(f"{root}/monitor"), *(Body(f"{root}/monitor/{channel.name}") for channel in camera_channels)]
@@ -257,16 +246,8 @@ def _build(
         assembly = monitor_chain.square_facets(assembly, channels, cameras, backend)
     nodes = _nodes(assembly, cameras, solids)
     lengths = {key: chain.glass for key, chain in chains.items()}
-    drawn = Instrument(
-        spec,
-        assembly,
-        cameras,
-        tuple(channels),
-        FrozenMap(nodes),
-        solids,
-        FrozenMap(lengths),
-        _baffles(spec, assembly.tree),
-    )
+    parts = (FrozenMap(nodes), solids, FrozenMap(lengths), _baffles(spec, assembly.tree))
+    drawn = Instrument(spec, assembly, cameras, tuple(channels), *parts)
     instrument = as_built(drawn)
     try:
         _check_room(instrument, backend, free_beams, free_bodies)
@@ -326,7 +307,7 @@ def _check_alike(spec: InstrumentSpec, assembly: Assembly) -> None:
         raise spec.error(text, ("cameras",), allowed=alike) from error
 
 
-def _channels(spec: InstrumentSpec, camera: str, model: CameraModel) -> list[Channel]:
+def _channels(spec: InstrumentSpec, camera: str, model: camera_model.CameraModel) -> list[Channel]:
     """Return the monitor channels of a camera.
 
     Their reticles and area CCDs are placed at f tan(field) along the line CCD, with the principal distance f and the
@@ -400,7 +381,9 @@ def _baffles(spec: InstrumentSpec, tree: RigidTree) -> tuple[Plate, ...]:
     return tuple(out)
 
 
-def _nodes(assembly: Assembly, cameras: Mapping[str, CameraModel], solids: tuple[Solid, ...]) -> dict[str, NodeInfo]:
+def _nodes(
+    assembly: Assembly, cameras: Mapping[str, camera_model.CameraModel], solids: tuple[Solid, ...]
+) -> dict[str, NodeInfo]:
     """Return path of each body -> motions and changes that it allows.
 
     The base is the reference frame and does not move.
@@ -411,7 +394,7 @@ def _nodes(assembly: Assembly, cameras: Mapping[str, CameraModel], solids: tuple
     cold = _without_heat(cameras)
     reshaped: dict[str, tuple[str, ...]] = {}
     for name, model in cameras.items():
-        reshaped |= shape_changes(model, f"{BASE}/{name}")
+        reshaped |= camera_model.shape_changes(model, f"{BASE}/{name}")
     out = {}
     for body in assembly.tree.bodies:
         if body.path == BASE:
@@ -429,7 +412,7 @@ def _nodes(assembly: Assembly, cameras: Mapping[str, CameraModel], solids: tuple
     return out
 
 
-def _without_heat(cameras: Mapping[str, CameraModel]) -> dict[str, str]:
+def _without_heat(cameras: Mapping[str, camera_model.CameraModel]) -> dict[str, str]:
     """Return path of each body without a temperature of its own -> the reason, in words.
 
     These are further faces of a lens, which have the temperature of the first; planes that light passes, which belong
@@ -437,7 +420,7 @@ def _without_heat(cameras: Mapping[str, CameraModel]) -> dict[str, str]:
     """
     out: dict[str, str] = {}
     for name, model in cameras.items():
-        root, faces = f"{BASE}/{name}", lenses(model.spec)
+        root, faces = f"{BASE}/{name}", camera_model.lenses(model.spec)
         for face, mirror in model.spec.mirrors.items():
             if mirror.light == "passes":
                 out[f"{root}/{face}"] = f"it is part of the structure, {root}"

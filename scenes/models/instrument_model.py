@@ -1,7 +1,5 @@
 """Instrument ready to be perturbed and traced: its assembly, cameras, monitor channels and solids."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 

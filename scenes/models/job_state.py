@@ -7,8 +7,6 @@ deforms the body's own finite elements, whose optical faces move and bend. It ca
 finite elements, nor for the index of glass; a table with a residual there that matters is refused.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
@@ -19,8 +17,17 @@ from optics.geometry.pose import Pose
 from optics.geometry.tree import Motion, State, compose
 from optics.numerics.number_tree import FrozenMap
 from optics.thermal.heat import Temperature
-from optics.thermal.nodal_deformation import PRINTED, SEEN, TERMS, NodalDeformation, NodesError, nodal_deformation
-from optics.thermal.nodal_temperature import Coverage, NodalTemperature, linear_part
+from optics.thermal.nodal_deformation import (
+    PRINTED,
+    SEEN,
+    TERMS,
+    Coverage,
+    NodalDeformation,
+    NodalTemperature,
+    NodesError,
+    linear_part,
+    nodal_deformation,
+)
 from optics.thermal.thermo_elastic import Displacement, FaceChange
 from scenes.models.disturbances import UNITS, DisturbancePrior
 from scenes.models.instrument_model import Instrument

@@ -5,8 +5,6 @@ and transfers it to the central prism's side; the rhomboid displaces it by a giv
 transfer of the 180-deg prism follows from the position of the facet, which is perpendicular to the beam.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from math import sqrt

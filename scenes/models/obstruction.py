@@ -530,9 +530,9 @@ def imaging_segments(instrument: Instrument, backend: Backend, camera: str, rays
     radius = stop.inscribed
     start = np.repeat(points, rays, axis=0)[None]
     chain = assembly.sequences[f"{camera}/image_to_object"]
-    position, direction = _aimed_rays(
-        instrument, backend, camera, f"{camera}/image_to_stop", start, np.tile(radius * _disk(rays), (3, 1))
-    )
+    target, guess = np.tile(radius * _disk(rays), (1, 3, 1)), instrument.toward_optics(placed, camera)[0]
+    to_stop = assemble(assembly, [f"{camera}/image_to_stop"])
+    position, direction = aimed_rays(backend, to_stop, start, guess, target, _AIM)
     systems = assemble(assembly, [chain])
     traced = trace(backend, systems, make_rays(backend, position, direction), keep=range(len(chain)), world=True)
     assert traced.world is not None
@@ -767,35 +767,6 @@ def _segments(points: list[np.ndarray]) -> np.ndarray:
     """Return start and end points, (N, K, 2, 3), of the K segments between consecutive points of N rays."""
     path = np.stack(points, axis=1)
     return np.stack([path[:, :-1], path[:, 1:]], axis=2)
-
-
-def _aimed_rays(
-    instrument: Instrument, backend: Backend, camera: str, sequence: str, start: np.ndarray, target: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Aim N rays from points of a focal plane at points of the last element of a sequence.
-
-    Parameters
-    ----------
-    instrument : Instrument
-        The instrument.
-    backend : Backend
-        Backend that traces the rays.
-    camera : str
-        Name of the camera.
-    sequence : str
-        Name of the sequence of elements.
-    start : (1, N, 3) ndarray
-        Start points in the world, in metres.
-    target : (N, 2) ndarray
-        Points to hit in the last element's x, y, in metres.
-
-    Returns
-    -------
-    tuple of ndarray
-        Positions and unit vectors of the rays, (1, N, 3) each.
-    """
-    guess = instrument.toward_optics(instrument.assembly.place(), camera)[0]
-    return aimed_rays(backend, assemble(instrument.assembly, [sequence]), start, guess, target[None], _AIM)
 
 
 def _used(instrument: Instrument, path: str, segments: np.ndarray) -> np.ndarray:

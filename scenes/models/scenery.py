@@ -7,8 +7,6 @@ do not matter for stray light. So are motions of single footprints on a glass fa
 each other.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -20,17 +18,7 @@ from optics.geometry.pose import Pose
 from optics.geometry.solid import Coating, Face, Solid, solid_mesh
 from optics.geometry.surface import Surface, plane
 from optics.geometry.tree import AT_REST, Motion, PlacedBodies, State
-from optics.materials.fresnel_scatter import (
-    ABSORBER,
-    BARE,
-    BLACK,
-    COATED,
-    GROUND,
-    MIRROR,
-    SILICON,
-    CoatingTable,
-    Finish,
-)
+from optics.materials import fresnel_scatter
 from optics.raytrace.assembly import Assembly, Element, Interaction
 from scenes.models.camera_model import line_body
 from scenes.models.instrument_model import Instrument
@@ -72,17 +60,17 @@ class Finishes:
         Mirror faces of glass bodies; None for the finish of the mirrors.
     """
 
-    mirror: Finish = MIRROR
-    mirror_back: Finish = BLACK
-    coated: Finish = COATED
-    bare: Finish = BARE
-    ground: Finish = GROUND
-    detector: Finish = SILICON
-    board: Finish = BLACK
-    baffle: Finish | None = None
-    metallised: Finish | None = None
+    mirror: fresnel_scatter.Finish = fresnel_scatter.MIRROR
+    mirror_back: fresnel_scatter.Finish = fresnel_scatter.BLACK
+    coated: fresnel_scatter.Finish = fresnel_scatter.COATED
+    bare: fresnel_scatter.Finish = fresnel_scatter.BARE
+    ground: fresnel_scatter.Finish = fresnel_scatter.GROUND
+    detector: fresnel_scatter.Finish = fresnel_scatter.SILICON
+    board: fresnel_scatter.Finish = fresnel_scatter.BLACK
+    baffle: fresnel_scatter.Finish | None = None
+    metallised: fresnel_scatter.Finish | None = None
 
-    def of(self, coating: Coating) -> Finish:
+    def of(self, coating: Coating) -> fresnel_scatter.Finish:
         """Return the finish of a face of a glass body that has this coating."""
         return {
             Coating.MIRROR: self.mirror if self.metallised is None else self.metallised,
@@ -160,9 +148,9 @@ class SceneSurface:
     surface: Surface
     vertices: np.ndarray
     triangles: np.ndarray
-    front: Finish
-    back: Finish
-    outside: Finish = ABSORBER
+    front: fresnel_scatter.Finish
+    back: fresnel_scatter.Finish
+    outside: fresnel_scatter.Finish = fresnel_scatter.ABSORBER
     apertures: tuple[Aperture, ...] = ()
     ends: bool = True
     solid: str | None = None
@@ -200,19 +188,10 @@ def mirror_surface(
     surface, aperture = element.figured(motion).scaled(size), element.aperture.scaled(size)
     vertices, triangles, apart = sheet_mesh(surface, aperture)
     optical, rear = finishes.mirror, finishes.mirror_back
-    return SceneSurface(
-        element.name,
-        element.name,
-        (element.name,),
-        placed.pose(element.body),
-        surface,
-        vertices,
-        triangles,
-        front=optical if optical_side > 0.0 else rear,
-        back=rear if optical_side > 0.0 else optical,
-        apertures=(aperture,),
-        clearance=LEAST_CLEARANCE + apart,
-    )
+    name, pose, sides = element.name, placed.pose(element.body), (optical, rear)
+    sides = sides if optical_side > 0.0 else sides[::-1]
+    limits: dict[str, Any] = {"apertures": (aperture,), "clearance": LEAST_CLEARANCE + apart}
+    return SceneSurface(name, name, (name,), pose, surface, vertices, triangles, *sides, **limits)
 
 
 def solid_surfaces(
@@ -245,24 +224,16 @@ def solid_surfaces(
         vertices, triangles = polygon_mesh(pose.inverse().apply(pose_of_solid.apply(polygon)))
         finish = finishes.of(face.coating)
         name = f"{solid.path}/{face.name}"
-        out.append(
-            SceneSurface(
-                name,
-                name,
-                tuple(name for name, _ in elements),
-                pose,
-                plane(),
-                vertices,
-                triangles,
-                front=finish,
-                back=finish,
-                outside=finish if solid.transparent or not apertures else finishes.ground,
-                apertures=apertures,
-                ends=False,
-                solid=solid.path,
-                index=index,
-            )
-        )
+        names, mesh_of_face = tuple(name for name, _ in elements), (vertices, triangles)
+        outside = finish if solid.transparent or not apertures else finishes.ground
+        body: dict[str, Any] = {
+            "apertures": apertures,
+            "outside": outside,
+            "ends": False,
+            "solid": solid.path,
+            "index": index,
+        }
+        out.append(SceneSurface(name, name, names, pose, plane(), *mesh_of_face, finish, finish, **body))
     return out
 
 
@@ -296,7 +267,9 @@ def _elements_on(
     return out
 
 
-def plate_surfaces(plates: Iterable[Plate], placed: PlacedBodies, baffle: Finish | None = None) -> list[SceneSurface]:
+def plate_surfaces(
+    plates: Iterable[Plate], placed: PlacedBodies, baffle: fresnel_scatter.Finish | None = None
+) -> list[SceneSurface]:
     """Return the surfaces of baffle plates, named ``<name>/<number>``.
 
     Parameters
@@ -311,20 +284,10 @@ def plate_surfaces(plates: Iterable[Plate], placed: PlacedBodies, baffle: Finish
     out = []
     for number, plate in enumerate(plates):
         vertices, triangles, _ = sheet_mesh(plane(), plate.outline)
-        out.append(
-            SceneSurface(
-                f"{plate.name}/{number}",
-                plate.name,
-                (),
-                placed.pose(plate.body) @ plate.pose,
-                plane(),
-                vertices,
-                triangles,
-                plate.finish if baffle is None else baffle,
-                plate.finish if baffle is None else baffle,
-                apertures=(plate.outline,),
-            )
-        )
+        pose, finish = placed.pose(plate.body) @ plate.pose, plate.finish if baffle is None else baffle
+        shape = (plane(), vertices, triangles, finish, finish)
+        name = f"{plate.name}/{number}"
+        out.append(SceneSurface(name, plate.name, (), pose, *shape, apertures=(plate.outline,)))
     return out
 
 
@@ -335,19 +298,8 @@ def detector_surface(
     half_x, half_y = 0.5 * detector.columns * detector.pitch[0], 0.5 * detector.rows * detector.pitch[1]
     outline = Rectangle(half_x, half_y)
     vertices, triangles, _ = sheet_mesh(plane(), outline)
-    return SceneSurface(
-        detector.name,
-        detector.name,
-        elements,
-        pose,
-        plane(),
-        vertices,
-        triangles,
-        front=finishes.detector,
-        back=finishes.board,
-        apertures=(outline,),
-        detector=detector.name,
-    )
+    name, shape, finish = detector.name, (plane(), vertices, triangles), (finishes.detector, finishes.board)
+    return SceneSurface(name, name, elements, pose, *shape, *finish, apertures=(outline,), detector=name)
 
 
 RECIPROCAL_TO = 0.3
@@ -370,7 +322,7 @@ class MeasuredFinishes:
 
     finishes: Finishes
     scatter: Mapping[str, MeasuredScatter]
-    coatings: Mapping[str, CoatingTable]
+    coatings: Mapping[str, fresnel_scatter.CoatingTable]
 
     def to_dict(self) -> dict[str, Any]:
         """Return a summary of the tables for stray.json: kind of surface -> numbers."""
@@ -418,9 +370,9 @@ def measured_finishes(resolved: ResolvedJob) -> MeasuredFinishes | None:
     if stray is None or stray.finishes is None:
         return None
     built_in = Finishes()
-    changed: dict[str, Finish] = {}
+    changed: dict[str, fresnel_scatter.Finish] = {}
     scatter: dict[str, MeasuredScatter] = {}
-    coatings: dict[str, CoatingTable] = {}
+    coatings: dict[str, fresnel_scatter.CoatingTable] = {}
     for kind, spec in stray.finishes.by_kind.items():
         key = ("render", "stray", "finishes", kind)
         base = built_in.board if kind == "black" else getattr(built_in, kind)
@@ -451,12 +403,16 @@ def measured_finishes(resolved: ResolvedJob) -> MeasuredFinishes | None:
 
 
 def _finish(
-    base: Finish, spec: FinishSpec, kind: str, scatter: MeasuredScatter | None, coating: CoatingTable | None
-) -> Finish:
+    base: fresnel_scatter.Finish,
+    spec: FinishSpec,
+    kind: str,
+    scatter: MeasuredScatter | None,
+    coating: fresnel_scatter.CoatingTable | None,
+) -> fresnel_scatter.Finish:
     """Return a built-in finish in which measured values replace its own."""
     if kind == "black":
         assert scatter is not None
-        return Finish(table=scatter.table, scattered_only=True)
+        return fresnel_scatter.Finish(table=scatter.table, scattered_only=True)
     if spec.reflectance is not None:
         base = replace(base, reflectance=spec.reflectance)
     if coating is not None:

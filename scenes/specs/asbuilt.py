@@ -14,21 +14,8 @@ from scenes.specs.course import noll
 from scenes.specs.disturbances import DisturbancesSpec
 from scenes.specs.resolved import ExperimentSetup, ResolvedJob, resolve_on
 from scenes.specs.tolerance import Amount, CompensatorSpec, FieldShare, MeritSpec
+from scenes.yaml import spec
 from scenes.yaml.errors import Problem, names_text, unknown
-from scenes.yaml.spec import (
-    Flag,
-    Name,
-    Named,
-    NothingIsEmpty,
-    Number,
-    Ref,
-    Reference,
-    Seed,
-    Spec,
-    Text,
-    Whole,
-    require_one,
-)
 from scenes.yaml.unit_fields import Quantity, Vector
 from scenes.yaml.units import ANGLE, LENGTH, TEMPERATURE_DIFFERENCE
 
@@ -42,13 +29,13 @@ SmallAngle = Annotated[float, Quantity(ANGLE, largest="10 deg")]
 Warmth = Annotated[float, Quantity(TEMPERATURE_DIFFERENCE, largest="300 K")]
 WarmthSigma = Annotated[float, Quantity(TEMPERATURE_DIFFERENCE, above_zero=True, largest="100 K")]
 Place3 = Annotated[tuple[float, float, float], Vector(Quantity(LENGTH, largest="1 m"))]
-Modulation = Annotated[Number, Field(ge=0.0, le=1.0)]
+Modulation = Annotated[spec.Number, Field(ge=0.0, le=1.0)]
 FREE = "free"
 Focus = Literal["free"] | Annotated[float, Quantity(LENGTH, smallest="0 m", largest="1 m")]
 """`free`, or the standard deviation of the position of an interferometer's focus along the light, in metres."""
 
 
-class ReadingsSpec(Spec):
+class ReadingsSpec(spec.Spec):
     """Base of all kinds of measurement of an instrument as built.
 
     Attributes
@@ -57,12 +44,22 @@ class ReadingsSpec(Spec):
         Name of the last of the `moves` that was made before this measurement; by default none had been made.
     """
 
-    after: Name | None = None
+    after: spec.Name | None = None
 
     @property
     def has_data(self) -> bool:
         """True if the file holds the data or refers to a file of data."""
-        raise NotImplementedError
+        return any(getattr(self, key, None) is not None for key in ("values", "along_line", "file", "zernikes", "maps"))
+
+    @model_validator(mode="after")
+    def _one_for_each(self) -> ReadingsSpec:
+        positions = getattr(self, "fields", None) or getattr(self, "bodies", None)
+        for key in ("values", "along_line", "along_track"):
+            values = getattr(self, key, None)
+            if positions is not None and values is not None and len(values) != len(positions):
+                count, wanted = str(len(values)), str(len(positions))
+                raise Problem("not one value for each position", count, wanted, within=(key,))
+        return self
 
 
 class WavefrontReadingsSpec(ReadingsSpec):
@@ -97,15 +94,15 @@ class WavefrontReadingsSpec(ReadingsSpec):
     """
 
     fields: Fields
-    terms: tuple[Text, Text] = ("Z4", "Z11")
+    terms: tuple[spec.Text, spec.Text] = ("Z4", "Z11")
     sigma: Sigma
     common: Common = 0.0
     focus: Focus = "free"
-    zernikes: Reference | None = None
-    maps: Annotated[tuple[Reference, ...], Field(min_length=1, max_length=200)] | None = None
-    double_pass: Flag = False
-    reference: Reference | None = None
-    orientation: Text = "as it is"
+    zernikes: spec.Reference | None = None
+    maps: Annotated[tuple[spec.Reference, ...], Field(min_length=1, max_length=200)] | None = None
+    double_pass: spec.Flag = False
+    reference: spec.Reference | None = None
+    orientation: spec.Text = "as it is"
     sign: Literal[1, -1] = 1
 
     @model_validator(mode="after")
@@ -125,11 +122,6 @@ class WavefrontReadingsSpec(ReadingsSpec):
     def numbers(self) -> range:
         """Noll indices of the Zernike terms that are used, from the first to the last of `terms`."""
         return range(noll(self.terms[0]), noll(self.terms[1]) + 1)
-
-    @property
-    def has_data(self) -> bool:
-        """True if the measurement refers to files."""
-        return self.zernikes is not None or self.maps is not None
 
 
 class FocusReadingsSpec(ReadingsSpec):
@@ -155,18 +147,12 @@ class FocusReadingsSpec(ReadingsSpec):
     values: Positions | None = None
     sigma: Sigma
     common: Common = 0.0
-    file: Reference | None = None
+    file: spec.Reference | None = None
 
     @model_validator(mode="after")
     def _as_many(self) -> FocusReadingsSpec:
-        require_one(self, ("fields", "file"), "where was it measured?", "fields with values, or a focus.json")
-        _one_for_each(self.fields, self.values, "values")
+        spec.require_one(self, ("fields", "file"), "where was it measured?", "fields with values, or a focus.json")
         return self
-
-    @property
-    def has_data(self) -> bool:
-        """True if the file holds measured positions of best focus."""
-        return self.values is not None or self.file is not None
 
 
 class MtfReadingsSpec(ReadingsSpec):
@@ -187,23 +173,16 @@ class MtfReadingsSpec(ReadingsSpec):
     """
 
     fields: Fields
-    frequency: Annotated[Number, Field(gt=0.0, le=10_000.0)] | None = None
+    frequency: Annotated[spec.Number, Field(gt=0.0, le=10_000.0)] | None = None
     along_line: Annotated[tuple[Modulation, ...], Field(min_length=1, max_length=200)] | None = None
     along_track: Annotated[tuple[Modulation, ...], Field(min_length=1, max_length=200)] | None = None
-    sigma: Annotated[Number, Field(gt=0.0, le=1.0)]
+    sigma: Annotated[spec.Number, Field(gt=0.0, le=1.0)]
 
     @model_validator(mode="after")
     def _as_many(self) -> MtfReadingsSpec:
         if (self.along_line is None) != (self.along_track is None):
             raise Problem("MTF along one direction only", "along_line or along_track", "both", within=("along_line",))
-        _one_for_each(self.fields, self.along_line, "along_line")
-        _one_for_each(self.fields, self.along_track, "along_track")
         return self
-
-    @property
-    def has_data(self) -> bool:
-        """True if the file holds measured MTF values."""
-        return self.along_line is not None
 
 
 class DistortionReadingsSpec(ReadingsSpec):
@@ -223,19 +202,14 @@ class DistortionReadingsSpec(ReadingsSpec):
 
     fields: Annotated[tuple[FieldShare, ...], Field(min_length=3, max_length=200)] | None = None
     sigma: Sigma | None = None
-    file: Reference | None = None
+    file: spec.Reference | None = None
 
     @model_validator(mode="after")
     def _one_source(self) -> DistortionReadingsSpec:
-        require_one(self, ("fields", "file"), "where was it measured?", "a distortion.json, or fields to simulate")
+        spec.require_one(self, ("fields", "file"), "where was it measured?", "a distortion.json, or fields to simulate")
         if self.file is None and self.sigma is None:
             raise Problem("'sigma' is missing", None, "sigma: 0.5 um", within=("sigma",))
         return self
-
-    @property
-    def has_data(self) -> bool:
-        """True if the measurement refers to a file."""
-        return self.file is not None
 
 
 class SpotReadingsSpec(ReadingsSpec):
@@ -252,14 +226,9 @@ class SpotReadingsSpec(ReadingsSpec):
         Set of spots in `recovered.json` that is used: those recorded before or after the change.
     """
 
-    sigma: Annotated[Number, Field(gt=0.0, le=100.0)]
-    file: Reference | None = None
+    sigma: Annotated[spec.Number, Field(gt=0.0, le=100.0)]
+    file: spec.Reference | None = None
     state: Literal["before", "after"] = "before"
-
-    @property
-    def has_data(self) -> bool:
-        """True if the measurement refers to a file."""
-        return self.file is not None
 
 
 class SightReadingsSpec(ReadingsSpec):
@@ -296,7 +265,7 @@ class SightReadingsSpec(ReadingsSpec):
     sigma_beta: AngleSigma | None = None
     sigma_gamma: AngleSigma | None = None
     sigma_principal_distance: Sigma | None = None
-    correlation: tuple[tuple[Annotated[Number, Field(ge=-1.0, le=1.0)], ...], ...] | None = None
+    correlation: tuple[tuple[Annotated[spec.Number, Field(ge=-1.0, le=1.0)], ...], ...] | None = None
 
     @model_validator(mode="after")
     def _complete(self) -> SightReadingsSpec:
@@ -339,20 +308,10 @@ class TemperatureReadingsSpec(ReadingsSpec):
         Standard deviation of an error that all temperatures have in common, in kelvin.
     """
 
-    bodies: Annotated[tuple[Text, ...], Field(min_length=1, max_length=100)]
+    bodies: Annotated[tuple[spec.Text, ...], Field(min_length=1, max_length=100)]
     values: Annotated[tuple[Warmth, ...], Field(min_length=1)] | None = None
     sigma: WarmthSigma
     common: Annotated[float, Quantity(TEMPERATURE_DIFFERENCE, smallest="0 K", largest="100 K")] = 0.0
-
-    @model_validator(mode="after")
-    def _as_many(self) -> TemperatureReadingsSpec:
-        _one_for_each(self.bodies, self.values, "values")
-        return self
-
-    @property
-    def has_data(self) -> bool:
-        """True if the file holds measured temperatures."""
-        return self.values is not None
 
 
 class PositionReadingsSpec(ReadingsSpec):
@@ -371,31 +330,20 @@ class PositionReadingsSpec(ReadingsSpec):
         shift and rotation, which needs three bodies or more.
     """
 
-    bodies: Annotated[tuple[Text, ...], Field(min_length=1, max_length=100)]
+    bodies: Annotated[tuple[spec.Text, ...], Field(min_length=1, max_length=100)]
     values: Annotated[tuple[Place3, ...], Field(min_length=1)] | None = None
     sigma: Sigma
     frame: Literal["free", "base"] = "base"
 
     @model_validator(mode="after")
     def _as_many(self) -> PositionReadingsSpec:
-        _one_for_each(self.bodies, self.values, "values")
         if self.frame == FREE and len(self.bodies) < 3:
             found = f"{len(self.bodies)} bodies"
             raise Problem("too few bodies for a free frame", found, "three bodies, or frame: base", within=("frame",))
         return self
 
-    @property
-    def has_data(self) -> bool:
-        """True if the file holds measured positions."""
-        return self.values is not None
 
-
-def _one_for_each(positions: Any, values: Any, key: str) -> None:
-    if positions is not None and values is not None and len(values) != len(positions):
-        raise Problem("not one value for each position", str(len(values)), str(len(positions)), within=(key,))
-
-
-class MeasurementsSpec(Spec):
+class MeasurementsSpec(spec.Spec):
     """Measurements by kind; each has a name of your choice.
 
     Attributes
@@ -418,14 +366,14 @@ class MeasurementsSpec(Spec):
         Name -> positions of bodies.
     """
 
-    wavefronts: Annotated[Named[WavefrontReadingsSpec], NothingIsEmpty] = Field(default_factory=FrozenMap)
-    focus: Annotated[Named[FocusReadingsSpec], NothingIsEmpty] = Field(default_factory=FrozenMap)
-    mtf: Annotated[Named[MtfReadingsSpec], NothingIsEmpty] = Field(default_factory=FrozenMap)
-    distortion: Annotated[Named[DistortionReadingsSpec], NothingIsEmpty] = Field(default_factory=FrozenMap)
-    spots: Annotated[Named[SpotReadingsSpec], NothingIsEmpty] = Field(default_factory=FrozenMap)
-    sight: Annotated[Named[SightReadingsSpec], NothingIsEmpty] = Field(default_factory=FrozenMap)
-    temperatures: Annotated[Named[TemperatureReadingsSpec], NothingIsEmpty] = Field(default_factory=FrozenMap)
-    positions: Annotated[Named[PositionReadingsSpec], NothingIsEmpty] = Field(default_factory=FrozenMap)
+    wavefronts: Annotated[spec.Named[WavefrontReadingsSpec], spec.NothingIsEmpty] = Field(default_factory=FrozenMap)
+    focus: Annotated[spec.Named[FocusReadingsSpec], spec.NothingIsEmpty] = Field(default_factory=FrozenMap)
+    mtf: Annotated[spec.Named[MtfReadingsSpec], spec.NothingIsEmpty] = Field(default_factory=FrozenMap)
+    distortion: Annotated[spec.Named[DistortionReadingsSpec], spec.NothingIsEmpty] = Field(default_factory=FrozenMap)
+    spots: Annotated[spec.Named[SpotReadingsSpec], spec.NothingIsEmpty] = Field(default_factory=FrozenMap)
+    sight: Annotated[spec.Named[SightReadingsSpec], spec.NothingIsEmpty] = Field(default_factory=FrozenMap)
+    temperatures: Annotated[spec.Named[TemperatureReadingsSpec], spec.NothingIsEmpty] = Field(default_factory=FrozenMap)
+    positions: Annotated[spec.Named[PositionReadingsSpec], spec.NothingIsEmpty] = Field(default_factory=FrozenMap)
 
     @model_validator(mode="after")
     def _names_once(self) -> MeasurementsSpec:
@@ -464,8 +412,8 @@ class ActuatorSpec(CompensatorSpec):
         Standard deviation of the error of the traced response to this actuator, as a fraction of the response.
     """
 
-    move_error: Annotated[Number, Field(ge=0.0, le=1.0)] = 0.02
-    response: Annotated[Number, Field(ge=0.0, le=1.0)] = 0.0
+    move_error: Annotated[spec.Number, Field(ge=0.0, le=1.0)] = 0.02
+    response: Annotated[spec.Number, Field(ge=0.0, le=1.0)] = 0.0
 
 
 def _require_amounts(value: Mapping[str, Amount]) -> Mapping[str, Amount]:
@@ -474,7 +422,7 @@ def _require_amounts(value: Mapping[str, Amount]) -> Mapping[str, Amount]:
     return FrozenMap(value)
 
 
-class MoveSpec(Spec):
+class MoveSpec(spec.Spec):
     """Alignment move that was made.
 
     Attributes
@@ -483,10 +431,10 @@ class MoveSpec(Spec):
         Actuator -> amount of its move, with its unit.
     """
 
-    by: Annotated[dict[Name, Amount], AfterValidator(_require_amounts)]
+    by: Annotated[dict[spec.Name, Amount], AfterValidator(_require_amounts)]
 
 
-class SimulatedInstrumentSpec(Spec):
+class SimulatedInstrumentSpec(spec.Spec):
     """Simulated instrument, which the program draws at random, measures and moves instead of a real one.
 
     Attributes
@@ -500,11 +448,11 @@ class SimulatedInstrumentSpec(Spec):
     """
 
     law: Literal["normal", "uniform"] = "normal"
-    prior: Ref | None = None
-    seed: Seed = 0
+    prior: spec.Ref | None = None
+    seed: spec.Seed = 0
 
 
-class AsBuiltSpec(Spec):
+class AsBuiltSpec(spec.Spec):
     """Estimate of the state of one built instrument from all of its measurements.
 
     Attributes
@@ -534,17 +482,17 @@ class AsBuiltSpec(Spec):
         Simulated instrument instead of measured data; by default the data are measured.
     """
 
-    instrument: Ref
-    camera: Name | None = None
-    prior: Ref = "assembled"
+    instrument: spec.Ref
+    camera: spec.Name | None = None
+    prior: spec.Ref = "assembled"
     measurements: MeasurementsSpec
-    merits: Annotated[Named[MeritSpec], Field(min_length=1, max_length=50)]
-    actuators: Annotated[Named[ActuatorSpec], NothingIsEmpty] = Field(default_factory=FrozenMap)
-    moves: Annotated[Named[MoveSpec], NothingIsEmpty] = Field(default_factory=FrozenMap)
-    candidates: Annotated[MeasurementsSpec, NothingIsEmpty] = MeasurementsSpec.model_construct()
-    draws: Annotated[Whole, Field(ge=20, le=100_000)] = 200
-    seed: Seed = 0
-    simulate: Annotated[SimulatedInstrumentSpec, NothingIsEmpty] | None = None
+    merits: Annotated[spec.Named[MeritSpec], Field(min_length=1, max_length=50)]
+    actuators: Annotated[spec.Named[ActuatorSpec], spec.NothingIsEmpty] = Field(default_factory=FrozenMap)
+    moves: Annotated[spec.Named[MoveSpec], spec.NothingIsEmpty] = Field(default_factory=FrozenMap)
+    candidates: Annotated[MeasurementsSpec, spec.NothingIsEmpty] = MeasurementsSpec.model_construct()
+    draws: Annotated[spec.Whole, Field(ge=20, le=100_000)] = 200
+    seed: spec.Seed = 0
+    simulate: Annotated[SimulatedInstrumentSpec, spec.NothingIsEmpty] | None = None
 
     @model_validator(mode="after")
     def _belongs_together(self) -> AsBuiltSpec:
@@ -554,7 +502,7 @@ class AsBuiltSpec(Spec):
         for kind, name, measurement in self.measurements.named():
             where = ("measurements", kind, name)
             if measurement.after is not None and measurement.after not in self.moves:
-                raise unknown_within("no such move", measurement.after, self.moves, (*where, "after"))
+                raise unknown("no such move", measurement.after, self.moves, (*where, "after"))
             if self.simulate is None and not measurement.has_data:
                 raise Problem("no data", name, "values or files, or `simulate: {}` to draw them", within=where)
             if self.simulate is not None and measurement.has_data:
@@ -562,16 +510,9 @@ class AsBuiltSpec(Spec):
         for name, move in self.moves.items():
             for actuator, amount in move.by.items():
                 if actuator not in self.actuators:
-                    where = ("moves", name, "by")
-                    raise unknown_within("no such actuator", actuator, self.actuators, where)
+                    raise unknown("no such actuator", actuator, self.actuators, ("moves", name, "by"))
                 self.actuators[actuator].si(amount, "by")
         return self
-
-
-def unknown_within(text: str, found: object, names: Mapping[str, Any], within: tuple[str, ...]) -> Problem:
-    """Return the problem of a name that a key below this mapping uses and that is not among the known names."""
-    problem = unknown(text, found, tuple(names))
-    return Problem(problem.problem, problem.found, problem.allowed, problem.suggestion, within=within)
 
 
 class AsBuiltSetup(ExperimentSetup[AsBuiltSpec]):

@@ -1,6 +1,8 @@
 """Specification of a camera (scenes/library/cameras): optical prescription and line CCDs.
 
 Also the specifications of the optimisation of a camera and of the search for a monitor layout.
+
+Glass of a lens: a name of the catalogue, or a manufacturer's dispersion formula.
 """
 
 from __future__ import annotations
@@ -10,33 +12,179 @@ from math import isinf
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import Field, model_validator
+from pydantic import Field, SerializerFunctionWrapHandler, model_serializer, model_validator
 
 from optics.geometry.sag_terms import SagTerm
-from optics.materials.glass import WarmGlass
+from optics.materials.glass import (
+    FORMULAS,
+    GLASSES,
+    SCHOTT_RANGE,
+    CatalogueGlass,
+    Glass,
+    ThermalDispersion,
+    WarmGlass,
+    common_glasses,
+    glass,
+)
+from optics.materials.material import MATERIALS, TemperatureRange
+from optics.numerics.array_math import UnphysicalError
 from optics.numerics.number_tree import FrozenMap
 from optics.raytrace.reflectors import REFLECTORS
 from scenes.specs import instrument as instruments
 from scenes.specs.baffle import SurfaceEdgeSpec
 from scenes.specs.detector import PITCH_RANGE, PixelPitch
-from scenes.specs.glass import LensGlass, Medium
-from scenes.specs.spectrum import Spectrum, SpectrumSpec
+from scenes.specs.spectrum import Spectrum, SpectrumSpec, WavelengthRange
+from scenes.yaml import unit_fields
 from scenes.yaml.errors import Problem, unknown
-from scenes.yaml.spec import Name, Named, Number, Ref, Seed, Spec, Text, TitledSpec, Whole
-from scenes.yaml.unit_fields import (
-    AsphereTerms,
-    Length,
-    PositiveLength,
-    Quantity,
-    Radius,
-    SagTerms,
-    Vector,
-    Vector2,
-    Wavelength,
-)
-from scenes.yaml.units import ANGLE, LENGTH, MASS, SCALE
+from scenes.yaml.spec import Name, Named, Number, Ref, Seed, Spec, Text, TitledSpec, Whole, short_for
+from scenes.yaml.unit_fields import Quantity
+from scenes.yaml.units import ANGLE, EXPANSION, LENGTH, MASS, SCALE, format_quantity
 
-Diffusion = Annotated[float, Quantity(LENGTH, smallest="0 um", largest="1 mm")]
+Medium = Literal["vacuum", "air"]
+CATALOGUE_RANGE = TemperatureRange.celsius(-30.0, 70.0, "AGF catalogues state the mean expansion of that range")
+"""Temperature range in which the expansion of a glass in a camera's file holds."""
+
+
+def glass_entry(glass: CatalogueGlass) -> dict[str, Any]:
+    """Return a catalogue glass in the form of a camera's file."""
+    ends = [format_quantity(w, LENGTH) for w in (glass.shortest, glass.longest)]
+    out = {"name": glass.name, "formula": glass.formula, "coefficients": list(glass.coefficients), "range": ends}
+    if glass.expansion is not None:
+        out["expansion"] = format_quantity(glass.expansion, EXPANSION)
+    return out if glass.thermal is None else {**out, "thermal": list(glass.thermal)}
+
+
+class LensGlassSpec(Spec):
+    """Glass of a lens with its dispersion at 20 C.
+
+    Attributes
+    ----------
+    name : str
+        Name of a glass in the catalogue (`N-BK7`, `N-SF11`, `S-FPL53`, `FCD1`, `H-K9L`, ...), or any name beside a
+        formula.
+    formula : int | None
+        Number of the dispersion formula in AGF catalogues (1 Schott, 2 Sellmeier 1, ...); by default the catalogue's
+        glass.
+    coefficients : tuple[float, ...] | None
+        Coefficients of the formula for wavelengths in micrometres, in the order of the AGF catalogue; for Sellmeier B1,
+        C1, B2, C2, B3, C3.
+    range : tuple[float, float] | None
+        Shortest and longest wavelength at which the formula holds, in metres.
+    expansion : float | None
+        Linear thermal expansion, mean of -30 to 70 C, as in the ED line of AGF catalogues, in 1/K. By default that of
+        the twin's material of the same name; if there is none, the lens cannot be heated.
+    thermal : tuple[float, ...] | None
+        Schott's constants D0, D1, D2, E0, E1 and Lambda_TK of dn/dT in the units of data sheets, as in the TD line of
+        AGF catalogues. By default those of the catalogue; if there are none, the lens cannot be heated.
+    """
+
+    name: Text
+    formula: Annotated[Whole, Field(ge=1, le=max(FORMULAS))] | None = None
+    coefficients: Annotated[tuple[Number, ...], Field(min_length=1, max_length=12)] | None = None
+    range: WavelengthRange | None = None
+    expansion: Annotated[float, Quantity(EXPANSION, largest="1000 ppm/K")] | None = None
+    thermal: Annotated[tuple[Number, ...], Field(min_length=6, max_length=6)] | None = None
+
+    @model_validator(mode="before")
+    @classmethod
+    def _with_formula(cls, data: Any) -> Any:
+        """Return the file's data, with the formula of a common glass where they have none."""
+        known = common_glasses().get(data["name"]) if isinstance(data, dict) and "name" in data else None
+        return data if known is None or "formula" in data else {**glass_entry(known), **data}
+
+    @model_validator(mode="after")
+    def _is_known(self) -> LensGlassSpec:
+        keys = [key for key in ("formula", "coefficients", "range") if getattr(self, key) is not None]
+        if keys and len(keys) < 3:
+            raise Problem("an incomplete definition of a glass", ", ".join(keys), "formula, coefficients, range")
+        if not keys:
+            try:
+                glass(self.name)
+            except KeyError:
+                raise unknown("no such glass", self.name, (*GLASSES, *common_glasses()), within=("name",)) from None
+        return self
+
+    @model_serializer(mode="wrap")
+    def _short(self, handler: SerializerFunctionWrapHandler) -> Any:
+        """Return a catalogue glass as its name alone, another glass in full."""
+        full = handler(self)
+        plain = all(getattr(self, key) is None for key in type(self).model_fields if key != "name")
+        return self.name if plain else full
+
+    def index(self, wavelength: float, medium: Medium) -> float:
+        """Return the refractive index at 20 C.
+
+        Parameters
+        ----------
+        wavelength : float
+            Wavelength, in metres.
+        medium : {'vacuum', 'air'}
+            Medium to which the index refers: ``air`` of 20 C and 1013 hPa, as manufacturers state it, or ``vacuum``.
+
+        Raises
+        ------
+        ValueError
+            The formula does not hold at this wavelength.
+        """
+        known: Glass | CatalogueGlass
+        if self.formula is None or self.coefficients is None or self.range is None:
+            known = glass(self.name)
+        else:
+            known = CatalogueGlass(self.name, self.formula, self._filled(self.coefficients), *self.range)
+        return known.index(wavelength) if medium == "air" else known.vacuum_index(wavelength)
+
+    def warm(self, wavelength: float, medium: Medium) -> WarmGlass:
+        """Return the thermal properties of the glass at a wavelength.
+
+        Parameters
+        ----------
+        wavelength : float
+            Wavelength, in metres.
+        medium : {'vacuum', 'air'}
+            Medium to which the index refers: ``air`` of 20 C and 1013 hPa, or ``vacuum``. The medium itself is not
+            heated.
+
+        Raises
+        ------
+        ValueError
+            Neither the catalogue nor the file has its expansion or the change of its index.
+        """
+        named = None if self.formula is not None else glass(self.name)
+        solid = None if named is None else MATERIALS.get(named.name)
+        if self.expansion is None and solid is None:
+            raise UnphysicalError(
+                f"the thermal expansion of {self.name} is unknown; its glass needs `expansion: 8.2 ppm/K`, the first "
+                "number of ED in its AGF catalogue"
+            )
+        thermal = named.thermal if named is not None else None
+        if self.thermal is not None:
+            d0, d1, d2, e0, e1, lambda_tk = self.thermal
+            thermal = ThermalDispersion(d0, d1, d2, e0, e1, lambda_tk)
+        if thermal is None:
+            raise UnphysicalError(
+                f"dn/dT of {self.name} is unknown; its glass needs `thermal: "
+                "[D0, D1, D2, E0, E1, Lambda_TK]`, the first six numbers of TD in its AGF catalogue"
+            )
+        if self.expansion is not None:
+            expansion, valid = self.expansion, CATALOGUE_RANGE
+        else:
+            assert solid is not None
+            expansion, valid = solid.expansion, solid.known
+        low, high = (max(valid.coldest, SCHOTT_RANGE.coldest), min(valid.hottest, SCHOTT_RANGE.hottest))
+        source = valid.source if (low, high) == (valid.coldest, valid.hottest) else SCHOTT_RANGE.source
+        known = TemperatureRange(low, high, source)
+        return WarmGlass(self.name, expansion, known, self.index(wavelength, medium), wavelength, thermal)
+
+    @staticmethod
+    def _filled(coefficients: tuple[float, ...]) -> tuple[float, ...]:
+        return (*coefficients, *[0.0] * (12 - len(coefficients)))
+
+
+LensGlass = Annotated[LensGlassSpec, short_for("name", str)]
+"""Glass as a mapping with its keys, or the name of a catalogue glass alone."""
+
+
+Diffusion = Annotated[float, unit_fields.Quantity(LENGTH, smallest="0 um", largest="1 mm")]
 
 
 class TdiSpec(Spec):
@@ -61,7 +209,7 @@ class TdiSpec(Spec):
     phases: Annotated[Whole, Field(ge=1, le=8)] = 1
     line_time: instruments.Exposure = 3.5e-4
     open_share: Annotated[Number, Field(gt=0.0, le=1.0)] = 1.0
-    rate_error: Annotated[float, Quantity(SCALE, largest="50 percent")] = 0.0
+    rate_error: Annotated[float, unit_fields.Quantity(SCALE, largest="50 percent")] = 0.0
 
 
 class BandSpec(Spec):
@@ -85,7 +233,7 @@ class BandSpec(Spec):
         Time delay and integration; a single stage by default.
     """
 
-    offset: Length = 0.0
+    offset: unit_fields.Length = 0.0
     pixels: Annotated[Whole, Field(ge=2, le=1_000_000)]
     pitch: PixelPitch
     spectrum: Spectrum
@@ -145,15 +293,20 @@ class BeamRangesSpec(Spec):
         Photons of a spot per frame; layouts whose spots would saturate their pixels are refused.
     """
 
-    pupil_x: Vector2 | None = None
-    pupil_y: Vector2 | None = None
-    width: Vector2 | None = None
-    field: Annotated[tuple[float, float], Vector(Quantity(ANGLE, above_zero=True, largest="45 deg"), 2)] | None = None
-    prism_180_distance: Vector2 | None = None
-    prism_0_distance: Vector2 | None = None
-    shift: Vector2 | None = None
-    spread_x: Vector2 | None = None
-    spread_y: Vector2 | None = None
+    pupil_x: unit_fields.Vector2 | None = None
+    pupil_y: unit_fields.Vector2 | None = None
+    width: unit_fields.Vector2 | None = None
+    field: (
+        Annotated[
+            tuple[float, float], unit_fields.Vector(unit_fields.Quantity(ANGLE, above_zero=True, largest="45 deg"), 2)
+        ]
+        | None
+    ) = None
+    prism_180_distance: unit_fields.Vector2 | None = None
+    prism_0_distance: unit_fields.Vector2 | None = None
+    shift: unit_fields.Vector2 | None = None
+    spread_x: unit_fields.Vector2 | None = None
+    spread_y: unit_fields.Vector2 | None = None
     photons: PhotonRange | None = None
 
     @model_validator(mode="after")
@@ -236,9 +389,9 @@ class MonitorGoalSpec(Spec):
         not a goal.
     """
 
-    angle: Annotated[float, Quantity(ANGLE, above_zero=True)] | None = None
-    d_f: PositiveLength | None = None
-    height: PositiveLength | None = None
+    angle: Annotated[float, unit_fields.Quantity(ANGLE, above_zero=True)] | None = None
+    d_f: unit_fields.PositiveLength | None = None
+    height: unit_fields.PositiveLength | None = None
 
     @model_validator(mode="after")
     def _something(self) -> MonitorGoalSpec:
@@ -271,8 +424,8 @@ class MonitorLimitsSpec(Spec):
         more than a thousandth of a spot's light is excluded. By default no ghosts are traced.
     """
 
-    pupil_share: Annotated[float, Quantity(SCALE, above_zero=True, largest="100 percent")] | None = None
-    mass: Annotated[float, Quantity(MASS, above_zero=True)] | None = None
+    pupil_share: Annotated[float, unit_fields.Quantity(SCALE, above_zero=True, largest="100 percent")] | None = None
+    mass: Annotated[float, unit_fields.Quantity(MASS, above_zero=True)] | None = None
     spot_sigmas: Annotated[Number, Field(gt=0.0, le=10.0)] = 3.0
     ghost_paths: Annotated[Whole, Field(ge=10_000, le=1_000_000_000)] | None = None
 
@@ -363,9 +516,9 @@ class MonitorDesignSpec(Spec):
     seed: Seed = 0
 
 
-Rotation = Annotated[tuple[float, float, float], Vector(Quantity(ANGLE, largest="180 deg"), 3)]
+Rotation = Annotated[tuple[float, float, float], unit_fields.Vector(unit_fields.Quantity(ANGLE, largest="180 deg"), 3)]
 Light = Literal["refracts", "passes"]
-Reflectance = Annotated[float, Quantity(SCALE, smallest="0 percent", largest="100 percent")]
+Reflectance = Annotated[float, unit_fields.Quantity(SCALE, smallest="0 percent", largest="100 percent")]
 
 
 class MirrorSpec(Spec):
@@ -403,13 +556,13 @@ class MirrorSpec(Spec):
         edges.
     """
 
-    z: Length
-    decentre: Vector2 | None = None
+    z: unit_fields.Length
+    decentre: unit_fields.Vector2 | None = None
     rotate: Rotation | None = None
-    radius: Radius
+    radius: unit_fields.Radius
     conic: Number = 0.0
-    aspheric: AsphereTerms = Field(default_factory=FrozenMap)
-    sag: Annotated[FrozenMap[str, SagTerm], SagTerms()] | None = None
+    aspheric: unit_fields.AsphereTerms = Field(default_factory=FrozenMap)
+    sag: Annotated[FrozenMap[str, SagTerm], unit_fields.SagTerms()] | None = None
     light: Light | None = None
     index: Annotated[Number, Field(ge=1.0, le=10.0)] | None = None
     glass: LensGlass | None = None
@@ -454,8 +607,8 @@ class FieldSpec(Spec):
         Half angle across the line CCD, in radians.
     """
 
-    x: Annotated[float, Quantity(ANGLE, above_zero=True, largest="45 deg")]
-    y: Annotated[float, Quantity(ANGLE, above_zero=True, largest="45 deg")]
+    x: Annotated[float, unit_fields.Quantity(ANGLE, above_zero=True, largest="45 deg")]
+    y: Annotated[float, unit_fields.Quantity(ANGLE, above_zero=True, largest="45 deg")]
 
 
 class ImageSpec(Spec):
@@ -472,8 +625,8 @@ class ImageSpec(Spec):
         Reflectance of the detector, for ghosts; by default that of bare silicon, 30 percent.
     """
 
-    z: Length
-    tilt: Annotated[float, Quantity(ANGLE, largest="45 deg")] | None = None
+    z: unit_fields.Length
+    tilt: Annotated[float, unit_fields.Quantity(ANGLE, largest="45 deg")] | None = None
     reflectance: Reflectance | None = None
 
 
@@ -551,20 +704,20 @@ class CameraSpec(TitledSpec):
         Margin by which a mirror's clear aperture exceeds the beams that use it, in metres.
     """
 
-    focal_length: PositiveLength
-    entrance_pupil: PositiveLength
+    focal_length: unit_fields.PositiveLength
+    entrance_pupil: unit_fields.PositiveLength
     field_bias: instruments.FieldAngle = 0.0
     field: FieldSpec
-    wavelength: Wavelength
+    wavelength: unit_fields.Wavelength
     stop: Name
-    stop_diameter: PositiveLength | None = None
+    stop_diameter: unit_fields.PositiveLength | None = None
     mirrors: Annotated[Named[MirrorSpec], Field(min_length=1)]
     image: ImageSpec
     line: LineSpec = Field(default_factory=line_over_field)
     bands: Named[BandSpec] = Field(default_factory=FrozenMap)
     spectrum: Spectrum | None = None
     medium: Medium | None = None
-    edge_margin: Annotated[float, Quantity(LENGTH, smallest="0 mm", largest="1 m")] = 0.005
+    edge_margin: Annotated[float, unit_fields.Quantity(LENGTH, smallest="0 mm", largest="1 m")] = 0.005
 
     @model_validator(mode="after")
     def _stop_is_a_mirror(self) -> CameraSpec:
@@ -764,9 +917,9 @@ class CameraDesignSpec(Spec):
     name: Name
     description: Text = ""
     vary: Annotated[Named[tuple[Vary, ...]], Field(min_length=1)]
-    envelope: Annotated[float, Quantity(SCALE, above_zero=True, largest="200 percent")] | None = None
-    clearance: Length = 0.02
-    anamorphism: Annotated[float, Quantity(SCALE, above_zero=True, largest="100 percent")] | None = None
+    envelope: Annotated[float, unit_fields.Quantity(SCALE, above_zero=True, largest="200 percent")] | None = None
+    clearance: unit_fields.Length = 0.02
+    anamorphism: Annotated[float, unit_fields.Quantity(SCALE, above_zero=True, largest="100 percent")] | None = None
     steps: Annotated[Whole, Field(ge=1, le=100)] = 8
     starts: Annotated[Whole, Field(ge=1, le=1000)] = 2
     seed: Seed = 0

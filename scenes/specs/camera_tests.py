@@ -1,8 +1,20 @@
 """Laboratory tests of a camera at the collimator: focal-plane alignment and distortion (interior orientation).
 
 The tests run on the simulated bench or, with `measured:`, on files of a real one (docs/measured_laboratory.md).
+
+Test with two autocollimators and two mirrors on a turntable.
+
+It is the principle experiment of paper 001 (Wang et al. 2018, section 3.1), which is cited in docs/conventions.md.
+
+Turntable test of paper 004 (Li et al. 2020, section 3.3): calibration of an unknown dividing error.
+
+Dividing error = reading - true angle. With `measured:` the comparisons come from files of a real bench.
 """
 
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
 from typing import Annotated, Literal
 
 from pydantic import AfterValidator, Field, model_validator
@@ -10,22 +22,275 @@ from pydantic import AfterValidator, Field, model_validator
 from optics.numerics.number_tree import FrozenMap
 from optics.targets.collimator import Collimator
 from scenes.specs.course import Term, noll
-from scenes.specs.instrument import Frames
+from scenes.specs.detector import DetectorSpec
+from scenes.specs.instrument import AreaCcdSpec, Frames, GlassName, ReticleSpec
 from scenes.specs.perturbation import FigureTerm, PlainPerturbationSpec
-from scenes.specs.turntable import TableAngle, TurntableFiles
+from scenes.yaml import unit_fields
 from scenes.yaml.errors import Problem
 from scenes.yaml.spec import Name, Number, Paths, Ref, Reference, Seed, Spec, Text, TitledSpec, Whole, require_one
-from scenes.yaml.unit_fields import (
-    Angle,
-    AngleSigma,
-    AngleSigmas,
-    LengthSigma,
-    PositiveLength,
-    Quantity,
-    Vector,
-    Vector3,
-)
+from scenes.yaml.unit_fields import AngleSigma, Quantity
 from scenes.yaml.units import ANGLE, LENGTH, SCALE, format_quantity
+
+TableAngle = Annotated[float, Quantity(ANGLE, largest="360 deg")]
+CalibrationStep = Annotated[float, Quantity(ANGLE, above_zero=True, largest="30 deg")]
+MOST_LINES = 10_000_000
+
+
+class GraduationSpec(Spec):
+    """Errors of the lines of the turntable's grating: a random curve of harmonics of the full circle.
+
+    Attributes
+    ----------
+    rms : float
+        Expected rms of the curve over the full circle, in radians.
+    first : int
+        Lowest harmonic of the curve; harmonic 1 has one period in the full circle.
+    last : int
+        Highest harmonic of the curve, whose period is 360 deg / last.
+    slope : float
+        Exponent of the spectrum: the amplitude of harmonic k falls as k^-slope.
+    """
+
+    rms: AngleSigma
+    first: Annotated[Whole, Field(ge=1, le=10_000)] = 3
+    last: Annotated[Whole, Field(ge=1, le=10_000)]
+    slope: Annotated[Number, Field(ge=0.0, le=4.0)]
+
+    @model_validator(mode="after")
+    def _in_order(self) -> GraduationSpec:
+        if self.last < self.first:
+            raise Problem(
+                "the last harmonic is below the first", str(self.last), f"{self.first} or more", within=("last",)
+            )
+        return self
+
+
+class SubdivisionSpec(Spec):
+    """Error of the interpolation within one period of the grating's signal.
+
+    Attributes
+    ----------
+    rms : float
+        Expected rms of the interpolation error, in radians.
+    lines : int
+        Number of signal periods in a full circle.
+    harmonics : tuple[int, ...]
+        Harmonics of the signal with this error; they are equal on average.
+    """
+
+    rms: AngleSigma
+    lines: Annotated[Whole, Field(ge=100, le=MOST_LINES)]
+    harmonics: Annotated[tuple[Annotated[Whole, Field(ge=1, le=64)], ...], Field(min_length=1, max_length=16)] = (
+        1,
+        2,
+        4,
+    )
+
+    @property
+    def period(self) -> float:
+        """Angle of one period of the grating's signal, in radians."""
+        return 2.0 * math.pi / self.lines
+
+
+class DividingErrorSpec(Spec):
+    """Components of the dividing error.
+
+    Sizes are expected RMS values over the full circle; the amplitude and phase of each harmonic are drawn from the
+    seed.
+
+    Attributes
+    ----------
+    axis : float
+        Expected rms of the error due to wobble of the axis, first and second harmonic, in radians.
+    eccentricity : float
+        Expected rms of the error due to eccentricity of the grating, first harmonic, in radians.
+    graduation : GraduationSpec
+        Errors of the grating's lines.
+    subdivision : SubdivisionSpec
+        Interpolation error within a period of the signal.
+    repeatability : float
+        Standard deviation of a single reading, in radians.
+    """
+
+    axis: AngleSigma
+    eccentricity: AngleSigma
+    graduation: GraduationSpec
+    subdivision: SubdivisionSpec
+    repeatability: AngleSigma
+
+
+class ReferenceSpec(Spec):
+    """Reference standard: a polygon on an indexing table, read by an autocollimator.
+
+    Attributes
+    ----------
+    calibration : float
+        Standard uncertainty of the reference's certificate at each position, the same error in all repeats, in radians.
+    noise : float
+        Standard deviation of a single reading of the autocollimator, in radians.
+    gross_error : float
+        Size of a gross error (a shock, a draught), of either sign, in radians.
+    gross_probability : float
+        Probability of a gross error in a comparison.
+    """
+
+    calibration: AngleSigma
+    noise: AngleSigma
+    gross_error: AngleSigma
+    gross_probability: Annotated[Number, Field(ge=0.0, le=0.2)]
+
+
+class HeldOutSpec(Spec):
+    """Held-out angles, in the middle of the calibration's steps, which no fit uses.
+
+    They are measured in a separate series.
+
+    Attributes
+    ----------
+    repeats : int
+        Number of repeats of each angle.
+    spread : float
+        Half range of a random offset of the turntable from the middle of a step, in radians, so that readings cover all
+        phases of the grating's signal, as in use.
+    """
+
+    repeats: Annotated[Whole, Field(ge=2, le=1000)]
+    spread: AngleSigma
+
+
+class CalibrationPlanSpec(Spec):
+    """Plan of the calibration: the readings that are compared with the reference.
+
+    Attributes
+    ----------
+    first : float
+        First reading that is calibrated, in radians.
+    last : float
+        Last reading that is calibrated, in radians.
+    step : float
+        Step between the readings that are calibrated, in radians.
+    repeats : int
+        Number of repeats of each comparison.
+    folds : int
+        Number of folds of the cross-validation.
+    held_out : HeldOutSpec
+        Held-out angles by which the fits are compared.
+    """
+
+    first: TableAngle
+    last: TableAngle
+    step: CalibrationStep
+    repeats: Annotated[Whole, Field(ge=1, le=1000)]
+    folds: Annotated[Whole, Field(ge=2, le=1000)] = 10
+    held_out: HeldOutSpec
+
+    @property
+    def count(self) -> int:
+        """Number of readings of the turntable that are calibrated."""
+        return round((self.last - self.first) / self.step) + 1
+
+    @model_validator(mode="after")
+    def _makes_sense(self) -> CalibrationPlanSpec:
+        shown = {name: format_quantity(getattr(self, name), ANGLE) for name in ("first", "last", "step")}
+        if self.last == self.first:
+            raise Problem("all angles would be the same", shown["last"], "an angle beyond the first", within=("last",))
+        if self.last < self.first:
+            raise Problem(
+                "the last angle is before the first", shown["last"], f"above {shown['first']}", within=("last",)
+            )
+        steps = (self.last - self.first) / self.step
+        if abs(steps - round(steps)) > 1e-6 or round(steps) < 1:
+            allowed = f"a whole fraction of the region, {math.degrees(self.last - self.first):.6g} deg"
+            raise Problem("the region is not a whole number of steps", shown["step"], allowed, within=("step",))
+        if self.repeats < 2:
+            raise Problem(
+                "a single repeat does not determine the noise",
+                str(self.repeats),
+                "2 or more, and 5 or more for Chauvenet's criterion to reject any",
+                within=("repeats",),
+            )
+        if self.held_out.spread >= 0.5 * self.step:
+            raise Problem(
+                "held-out angles would overlap the calibrated ones",
+                format_quantity(self.held_out.spread, ANGLE),
+                f"below half a step, {format_quantity(0.5 * self.step, ANGLE)}",
+                within=("held_out", "spread"),
+            )
+        return self
+
+
+class TurntableTestSpec(TitledSpec):
+    """Test of a simulated turntable: calibration of its dividing error against a reference.
+
+    Attributes
+    ----------
+    dividing_error : DividingErrorSpec
+        True dividing error of the simulated turntable; the analysis does not use it.
+    reference : ReferenceSpec
+        Errors of the reference standard of angles: a polygon on an indexing table, read by an autocollimator.
+    calibration : CalibrationPlanSpec
+        Readings that are compared with the reference, and number of repeats.
+    camera_angle : float
+        Reading of the turntable at the centre of the camera's field in the distortion test, in radians.
+    seed : int
+        Seed of all random numbers.
+    """
+
+    dividing_error: DividingErrorSpec
+    reference: ReferenceSpec
+    calibration: CalibrationPlanSpec
+    camera_angle: TableAngle
+    seed: Seed = 1
+
+    @model_validator(mode="after")
+    def _camera_is_calibrated(self) -> TurntableTestSpec:
+        plan = self.calibration
+        if not plan.first < self.camera_angle < plan.last:
+            region = f"between {format_quantity(plan.first, ANGLE)} and {format_quantity(plan.last, ANGLE)}"
+            raise Problem(
+                "outside of the calibrated region",
+                format_quantity(self.camera_angle, ANGLE),
+                region,
+                within=("camera_angle",),
+            )
+        return self
+
+
+class TurntableFiles(Spec):
+    """Files with readings of a turntable and their comparisons with a reference.
+
+    Attributes
+    ----------
+    comparisons : str
+        CSV file of the calibrated readings.
+    held_out : str | None
+        CSV file of readings between the calibrated ones, from a separate series, by which the fits are judged. Without
+        it, cross-validation judges them and does not detect an error with a period below the step.
+    reference : float
+        Standard uncertainty of the reference's certificate at each position, the same error in all repeats, in radians.
+    folds : int
+        Number of folds of the cross-validation.
+    """
+
+    comparisons: Reference
+    held_out: Reference | None = None
+    reference: AngleSigma
+    folds: Annotated[Whole, Field(ge=2, le=1000)] = 10
+
+
+class MeasuredTurntableSpec(TitledSpec):
+    """Turntable test on measured readings.
+
+    Attributes
+    ----------
+    measured : TurntableFiles
+        Comparisons of readings with a reference.
+    seed : int
+        Seed of the neural network's starting values.
+    """
+
+    measured: TurntableFiles
+    seed: Seed = 1
 
 
 class CollimatorSpec(Spec):
@@ -41,8 +306,8 @@ class CollimatorSpec(Spec):
         Zernike term (Noll) -> wavefront error over the aperture, in metres rms; by default there is no error.
     """
 
-    focal_length: PositiveLength
-    aperture: PositiveLength
+    focal_length: unit_fields.PositiveLength
+    aperture: unit_fields.PositiveLength
     wavefront: Annotated[dict[Term, FigureTerm], AfterValidator(FrozenMap)] = Field(default_factory=FrozenMap)
 
     @property
@@ -68,7 +333,7 @@ class CameraUnderTestSpec(Spec):
     as_built: Paths[PlainPerturbationSpec] = Field(default_factory=FrozenMap)
 
     @model_validator(mode="after")
-    def _cold(self) -> "CameraUnderTestSpec":
+    def _cold(self) -> CameraUnderTestSpec:
         for path, what in self.as_built.items():
             if "temperature" in what.needs():
                 problem, within = "temperatures are not modelled in the laboratory", ("as_built", path, "temperature")
@@ -76,10 +341,12 @@ class CameraUnderTestSpec(Spec):
         return self
 
 
-EdgeAngle = Annotated[float, Quantity(ANGLE, smallest="2 deg", largest="15 deg")]
-Tilt = Annotated[float, Quantity(ANGLE, largest="30 deg")]
-LengthSigmas = Annotated[tuple[float, float, float], Vector(Quantity(LENGTH, smallest="0 um", largest="5 mm"))]
-Light = Annotated[float, Quantity(SCALE, smallest="0.1 percent", largest="150 percent")]
+EdgeAngle = Annotated[float, unit_fields.Quantity(ANGLE, smallest="2 deg", largest="15 deg")]
+Tilt = Annotated[float, unit_fields.Quantity(ANGLE, largest="30 deg")]
+LengthSigmas = Annotated[
+    tuple[float, float, float], unit_fields.Vector(unit_fields.Quantity(LENGTH, smallest="0 um", largest="5 mm"))
+]
+Light = Annotated[float, unit_fields.Quantity(SCALE, smallest="0.1 percent", largest="150 percent")]
 Share = Annotated[Number, Field(ge=-1.0, le=1.0)]
 
 
@@ -115,8 +382,8 @@ class ScanSpec(Spec):
         Nyquist frequency.
     """
 
-    reach: PositiveLength
-    step: PositiveLength
+    reach: unit_fields.PositiveLength
+    step: unit_fields.PositiveLength
     points: Annotated[Whole, Field(ge=7, le=101)] = 9
     depth: Annotated[Number, Field(ge=0.2, le=1.5)] = 0.6
 
@@ -142,11 +409,11 @@ class MountSpec(Spec):
         Resolution to which the workshop grinds a shim, in metres.
     """
 
-    holes: Annotated[tuple[Vector3, ...], Field(min_length=3)]
+    holes: Annotated[tuple[unit_fields.Vector3, ...], Field(min_length=3)]
     tilt: Tilt = 0.0
-    clearance: PositiveLength
-    thickness: PositiveLength
-    step: PositiveLength
+    clearance: unit_fields.PositiveLength
+    thickness: unit_fields.PositiveLength
+    step: unit_fields.PositiveLength
 
 
 class MissetSpec(Spec):
@@ -164,9 +431,9 @@ class MissetSpec(Spec):
         Height error of each line CCD relative to the assembly, which no shim can correct, in metres.
     """
 
-    rotate: AngleSigmas
+    rotate: unit_fields.AngleSigmas
     shift: LengthSigmas
-    chips: LengthSigma = 0.0
+    chips: unit_fields.LengthSigma = 0.0
 
 
 class FocusTestSpec(CameraUnderTestSpec):
@@ -212,12 +479,12 @@ class FocusTestSpec(CameraUnderTestSpec):
     scan: ScanSpec
     misset: MissetSpec
     mount: MountSpec
-    level: AngleSigma
+    level: unit_fields.AngleSigma
     rounds: Annotated[Whole, Field(ge=1, le=10)] = 1
     seed: Seed = 1
 
     @model_validator(mode="after")
-    def _scan_has_steps(self) -> "FocusTestSpec":
+    def _scan_has_steps(self) -> FocusTestSpec:
         if 2.0 * self.scan.reach < 5.0 * self.scan.step:
             found = f"{format_quantity(self.scan.step, LENGTH)} over +-{format_quantity(self.scan.reach, LENGTH)}"
             raise Problem("fewer than six positions through focus", found, "a smaller step", within=("scan", "step"))
@@ -270,7 +537,7 @@ class DistortionTestSpec(CameraUnderTestSpec):
     description: Text = ""
     collimator: CollimatorSpec
     turntable: Ref
-    pinhole: PositiveLength
+    pinhole: unit_fields.PositiveLength
     band: Name
     points: Annotated[Whole, Field(ge=3, le=1001)]
     reach: Annotated[Number, Field(ge=0.05, lt=1.0)]
@@ -278,9 +545,9 @@ class DistortionTestSpec(CameraUnderTestSpec):
     light: Light
     frames: Frames = 4
     window: Annotated[Whole, Field(ge=24, le=128)] = 32
-    zero: AngleSigma
-    axis_tilt: AngleSigma
-    setting: AngleSigma = 0.0
+    zero: unit_fields.AngleSigma
+    axis_tilt: unit_fields.AngleSigma
+    setting: unit_fields.AngleSigma = 0.0
     seed: Seed = 1
 
 
@@ -299,7 +566,7 @@ class LineSpec(Spec):
         Column of the line's centre, from which positions are counted; the centre of the first pixel is 0.
     """
 
-    pitch: PositiveLength
+    pitch: unit_fields.PositiveLength
     middle: Annotated[Number, Field(ge=0.0, le=1e7)]
 
 
@@ -328,10 +595,10 @@ class DistortionFiles(Spec):
     line: LineSpec | None = None
     reversed: bool = False
     turntable: TurntableFiles | None = None
-    angle_sigma: AngleSigma | None = None
+    angle_sigma: unit_fields.AngleSigma | None = None
 
     @model_validator(mode="after")
-    def _one_source_of_sigmas(self) -> "DistortionFiles":
+    def _one_source_of_sigmas(self) -> DistortionFiles:
         problem = "the accuracy of the angles must be given in exactly one way"
         require_one(self, ("turntable", "angle_sigma"), problem, "turntable: or angle_sigma:")
         return self
@@ -350,7 +617,7 @@ class MeasuredDistortionSpec(TitledSpec):
         Seed, without effect: nothing in this evaluation is random.
     """
 
-    principal_distance: PositiveLength
+    principal_distance: unit_fields.PositiveLength
     measured: DistortionFiles
     seed: Seed = 1
 
@@ -396,8 +663,8 @@ class LevelSpec(Spec):
         Standard deviation of this angle, in radians.
     """
 
-    angle: Angle
-    sigma: AngleSigma
+    angle: unit_fields.Angle
+    sigma: unit_fields.AngleSigma
 
 
 class FocusFiles(Spec):
@@ -431,7 +698,7 @@ class FocusFiles(Spec):
     level: LevelSpec | None = None
 
     @model_validator(mode="after")
-    def _one_table(self) -> "FocusFiles":
+    def _one_table(self) -> FocusFiles:
         require_one(self, ("mtf", "images"), "one table is needed", "mtf: or images:")
         if self.noise and self.images is None:
             problem = "sigmas of MTF values are given in their table"
@@ -464,14 +731,266 @@ class MeasuredFocusSpec(TitledSpec):
 
     measured: FocusFiles
     mount: MountSpec
-    shims: tuple[PositiveLength, ...] | None = None
-    vertex_error: LengthSigma = 0.5e-6
-    vertex_trend: LengthSigma = 0.15e-6
+    shims: tuple[unit_fields.PositiveLength, ...] | None = None
+    vertex_error: unit_fields.LengthSigma = 0.5e-6
+    vertex_trend: unit_fields.LengthSigma = 0.15e-6
     seed: Seed = 1
 
     @model_validator(mode="after")
-    def _shim_for_each_hole(self) -> "MeasuredFocusSpec":
+    def _shim_for_each_hole(self) -> MeasuredFocusSpec:
         if self.shims is not None and len(self.shims) != len(self.mount.holes):
             found, allowed = f"{len(self.shims)} of them", f"{len(self.mount.holes)}, one for each hole"
             raise Problem("the number of shims differs from the number of holes", found, allowed, within=("shims",))
         return self
+
+
+HalfAngle = Annotated[float, unit_fields.Quantity(ANGLE, above_zero=True, largest="44 deg")]
+Step = Annotated[float, unit_fields.Quantity(ANGLE, above_zero=True, largest="1 deg")]
+ScaleSigma = Annotated[float, unit_fields.Quantity(SCALE, smallest="0 ppm", largest="1 percent")]
+SMALLEST_WINDOW, LARGEST_WINDOW = 48, 512
+
+
+class LensSpec(Spec):
+    """Lens of the collimator: one element with a conic front surface.
+
+    A radius is positive if its centre of curvature lies on the side of the focal plane.
+
+    Attributes
+    ----------
+    front_radius : float
+        Radius of curvature of the surface toward the mirrors, in metres.
+    front_conic : float
+        Conic constant of the front surface.
+    back_radius : float
+        Radius of curvature of the surface toward the focal plane, in metres.
+    thickness : float
+        Thickness of the lens on its axis, in metres.
+    glass : str
+        Name of the lens's glass in the catalogue.
+    diameter : float
+        Clear aperture of both surfaces, in metres.
+    focal_distance : float
+        Distance from the back vertex to the focal plane, in metres.
+    """
+
+    front_radius: unit_fields.Length
+    front_conic: Number
+    back_radius: unit_fields.Length
+    thickness: unit_fields.PositiveLength
+    glass: GlassName
+    diameter: unit_fields.PositiveLength
+    focal_distance: unit_fields.PositiveLength
+
+    @model_validator(mode="after")
+    def _is_curved(self) -> LensSpec:
+        for name in ("front_radius", "back_radius"):
+            radius = getattr(self, name)
+            if 2.0 * abs(radius) <= self.diameter:
+                found, allowed = format_quantity(radius, LENGTH), "a length above half the diameter in size"
+                raise Problem("the surface is too strongly curved for its diameter", found, allowed, within=(name,))
+        return self
+
+
+class AutocollimatorSpec(Spec):
+    """Digital autocollimator; both of the test are identical.
+
+    The pinhole and the area CCD are side by side, symmetric about the lens's axis, so that a mirror perpendicular to
+    the axis sends the pinhole's image to the centre of the CCD.
+
+    Attributes
+    ----------
+    wavelength : float
+        Wavelength of the source, in metres.
+    lens : LensSpec
+        Lens of the collimator.
+    reticle : ReticleSpec
+        Light source: an illuminated pinhole in the focal plane.
+    area_ccd : AreaCcdSpec
+        Detector; its offset counts from the pinhole to the centre of the pixel grid along the system's Y (horizontal)
+        and X (up), in metres.
+    window : int
+        Side of the square region around the spot that is read out, in pixels.
+    distance : float
+        Distance from the lens's front vertex to the turntable's centre, in metres.
+    frames : int
+        Number of frames averaged in a reading.
+    """
+
+    wavelength: unit_fields.Wavelength
+    lens: LensSpec
+    reticle: ReticleSpec
+    area_ccd: AreaCcdSpec
+    window: Annotated[Whole, Field(ge=SMALLEST_WINDOW, le=LARGEST_WINDOW)] = 64
+    distance: unit_fields.PositiveLength
+    frames: Frames = 9
+
+    @model_validator(mode="after")
+    def _window_fits(self) -> AutocollimatorSpec:
+        side = min(self.area_ccd.rows, self.area_ccd.columns)
+        if self.window > side:
+            raise Problem("larger than the area CCD", str(self.window), f"at most {side}", within=("window",))
+        half = [0.5 * n * self.area_ccd.pitch for n in (self.area_ccd.columns, self.area_ccd.rows)]
+        room = 0.5 * self.reticle.pinhole
+        if all(abs(o) < h + room for o, h in zip(self.area_ccd.offset, half, strict=True)):
+            least = format_quantity(max(half) + room, LENGTH)
+            raise Problem(
+                "the pinhole lies on the area CCD",
+                ", ".join(format_quantity(o, LENGTH) for o in self.area_ccd.offset),
+                f"{least} or more along one of the axes",
+                within=("area_ccd", "offset"),
+            )
+        return self
+
+
+class MirrorsSpec(Spec):
+    """Two plane mirrors on the turntable.
+
+    Attributes
+    ----------
+    aperture : float
+        Diameter of each mirror, in metres; it limits the beam.
+    radius : float
+        Distance of the mirrors' centres from the turntable's centre, in metres.
+    """
+
+    aperture: unit_fields.PositiveLength
+    radius: unit_fields.PositiveLength
+
+
+class StandSpec(Spec):
+    """Half of the angle between the two mirrors on the turntable in the main series, by axis of rotation.
+
+    Attributes
+    ----------
+    X : float
+        Half of the angle between the mirrors for rotations of the turntable about X, in radians.
+    Y : float
+        Half of the angle between the mirrors for rotations of the turntable about Y, in radians.
+    Z : float
+        Half of the angle between the mirrors for rotations of the turntable about Z, in radians.
+    """
+
+    X: HalfAngle
+    Y: HalfAngle
+    Z: HalfAngle
+
+
+class ProgrammeSpec(Spec):
+    """Programme of rotations of the turntable, between which the autocollimators take readings.
+
+    Attributes
+    ----------
+    steps : int
+        Number of steps after the first reading at zero.
+    small : float
+        Step of the turntable in a series with smaller steps than the main series, in radians.
+    table : float
+        Step of the turntable in the main series, in radians.
+    large : float
+        Step of the turntable in a series with larger steps than the main series, in radians.
+    narrow : float
+        Half of the angle between the mirrors in the narrow arrangement, in radians.
+    wide : float
+        Half of the angle between the mirrors in the wide arrangement, in radians.
+    stands : StandSpec
+        Half of the angle between the mirrors in the main series about each axis.
+    """
+
+    steps: Annotated[Whole, Field(ge=1, le=100)]
+    small: Step
+    table: Step
+    large: Step
+    narrow: HalfAngle
+    wide: HalfAngle
+    stands: StandSpec
+
+
+class BenchErrorsSpec(Spec):
+    """Standard deviations of the errors of the test set-up.
+
+    All errors are independent and normally distributed, and are drawn from the seed.
+
+    Attributes
+    ----------
+    focal_length : float
+        Relative error of an autocollimator's focal length against its calibration.
+    ccd_rotation : float
+        Rotation of an area CCD in its focal plane, in radians.
+    reading : float
+        Instability of an autocollimator about its X and Y from one reading to the next, in radians.
+    turntable_step : float
+        Error of each position of the turntable, in radians.
+    axis_tilt : float
+        Tilt of each axis of the turntable toward the two others, in radians.
+    mirror_mount : float
+        Mounting error of each mirror about its X and Y, in radians.
+    """
+
+    focal_length: ScaleSigma
+    ccd_rotation: unit_fields.AngleSigma
+    reading: unit_fields.AngleSigma
+    turntable_step: unit_fields.AngleSigma
+    axis_tilt: unit_fields.AngleSigma
+    mirror_mount: unit_fields.AngleSigma
+
+
+class AutocollimatorTestSpec(TitledSpec):
+    """Test with two autocollimators.
+
+    Attributes
+    ----------
+    autocollimator : AutocollimatorSpec
+        Properties of the autocollimators; both are identical.
+    mirrors : MirrorsSpec
+        Mirrors on the turntable.
+    programme : ProgrammeSpec
+        Programme of rotations.
+    errors : BenchErrorsSpec
+        Errors of the test set-up.
+    """
+
+    autocollimator: AutocollimatorSpec
+    mirrors: MirrorsSpec
+    programme: ProgrammeSpec
+    errors: BenchErrorsSpec
+
+    @model_validator(mode="after")
+    def _mirrors_fit(self) -> AutocollimatorTestSpec:
+        least = min(self.programme.narrow, *self._pose_angles())
+        # neighbouring rims touch where the mirrors' planes intersect: at radius tan(theta) from either centre
+        from_middle = self.mirrors.radius * math.tan(least)
+        if 0.5 * self.mirrors.aperture >= from_middle:
+            raise Problem(
+                "the mirrors overlap",
+                format_quantity(self.mirrors.aperture, LENGTH),
+                f"below {format_quantity(round(2.0 * from_middle, 6), LENGTH)} at this radius and angle",
+                within=("mirrors", "aperture"),
+            )
+        if self.mirrors.radius >= self.autocollimator.distance:
+            raise Problem(
+                "the mirrors are behind the autocollimator's lens",
+                format_quantity(self.mirrors.radius, LENGTH),
+                f"less than the distance, {format_quantity(self.autocollimator.distance, LENGTH)}",
+                within=("mirrors", "radius"),
+            )
+        return self
+
+    def _pose_angles(self) -> tuple[float, float, float]:
+        angles = self.programme.stands
+        return angles.X, angles.Y, angles.Z
+
+
+@dataclass(frozen=True)
+class AutocollimatorSetup:
+    """Test with two autocollimators and the data sheet to which it refers.
+
+    Attributes
+    ----------
+    spec : AutocollimatorTestSpec
+        The test.
+    detector : DetectorSpec
+        Data sheet of the area CCDs.
+    """
+
+    spec: AutocollimatorTestSpec
+    detector: DetectorSpec

@@ -16,23 +16,10 @@ from pydantic import AfterValidator, BeforeValidator, Field, PlainSerializer, mo
 from optics.numerics.number_tree import FrozenMap
 from scenes.specs.course import Term, moment
 from scenes.specs.instrument import Frames, InstrumentSpec, Tilt
-from scenes.specs.motion_text import motion_of
-from scenes.yaml import units
+from scenes.specs.perturbation import motion_of
+from scenes.yaml import spec, units
 from scenes.yaml.csv_table import rows_of
 from scenes.yaml.errors import InputError, Issue, KeyPath, Problem, names_text, shown, unknown
-from scenes.yaml.spec import (
-    Name,
-    Named,
-    NothingIsEmpty,
-    Number,
-    Ref,
-    Reference,
-    Spec,
-    Text,
-    TitledSpec,
-    Whole,
-    short_for,
-)
 from scenes.yaml.unit_fields import Quantity, Vector
 
 NONE = "none"
@@ -60,14 +47,14 @@ GradientSigma = Annotated[
 IndexSigma = Annotated[tuple[float, float, float], Vector(_spread(units.PER_LENGTH, "1e-2 1/m"), alike=True)]
 ScaleSigma = Annotated[float, _spread(units.SCALE, "1 percent")]
 RadiusSigma = Annotated[float, _spread(units.SCALE, "1 percent")]
-ConicSigma = Annotated[Number, Field(ge=0.0, le=1.0)]
+ConicSigma = Annotated[spec.Number, Field(ge=0.0, le=1.0)]
 FigureSigma = Annotated[float, _spread(units.LENGTH, "100 um")]
 Span = Annotated[float, Quantity(units.MOMENT, above_zero=True, largest="1000000 h")]
 Moment = Annotated[float, Quantity(units.MOMENT, smallest="-1000000 h", largest="1000000 h")]
-Correlation = Annotated[Number, Field(ge=-1.0, le=1.0)]
+Correlation = Annotated[spec.Number, Field(ge=-1.0, le=1.0)]
 
 
-class TemperatureSigmaSpec(Spec):
+class TemperatureSigmaSpec(spec.Spec):
     """Standard deviations of a body's temperature field. The thermal model computes their effect on the light.
 
     Attributes
@@ -82,7 +69,7 @@ class TemperatureSigmaSpec(Spec):
     gradient: GradientSigma = (0.0, 0.0, 0.0)
 
 
-class TimeLawSpec(Spec):
+class TimeLawSpec(spec.Spec):
     """Time law of a disturbance in a series of measurements: how its values at different times are related.
 
     Laws of random processes, by the correlation of the values at two times t and t':
@@ -166,11 +153,13 @@ _LAWS = (
 )
 BodyPattern = Annotated[str, Field(strict=True, min_length=1, max_length=200)]
 BodyPatterns = Annotated[
-    tuple[BodyPattern, ...], Field(min_length=1), short_for(None, str, schema=BodyPattern | tuple[BodyPattern, ...])
+    tuple[BodyPattern, ...],
+    Field(min_length=1),
+    spec.short_for(None, str, schema=BodyPattern | tuple[BodyPattern, ...]),
 ]
-Reason = Annotated[Text, Field(min_length=1)]
+Reason = Annotated[spec.Text, Field(min_length=1)]
 FigureSigmas = Annotated[dict[Term, FigureSigma], AfterValidator(FrozenMap)]
-TimeLaw = Annotated[TimeLawSpec, short_for("kind", str, schema=Literal["white", "constant", "jump"] | TimeLawSpec)]
+TimeLaw = Annotated[TimeLawSpec, spec.short_for("kind", str, schema=Literal["white", "constant", "jump"] | TimeLawSpec)]
 MOVES = ("shift", "rotate", "scale", "figure", "radius", "conic", "temperature", "index_gradient")
 """Keys of a cause that hold standard deviations of motions and changes."""
 
@@ -190,7 +179,7 @@ def _check_matrix(rows: tuple[tuple[float, ...], ...], count: int, within: KeyPa
                 raise Problem("a correlation matrix is symmetric", found, "equal", within=(*within, i, j))
 
 
-class CorrelationSpec(Spec):
+class CorrelationSpec(spec.Spec):
     """Correlated components of a cause.
 
     Attributes
@@ -332,7 +321,7 @@ JointSigmas = Annotated[
 ]
 
 
-class JointSpec(Spec):
+class JointSpec(spec.Spec):
     """Components of bodies with a joint distribution: a standard deviation for each and one correlation matrix.
 
     An example is the remaining uncertainty of an estimate of an instrument's state.
@@ -355,7 +344,7 @@ class JointSpec(Spec):
 
     components: JointSigmas
     correlation: tuple[tuple[Correlation, ...], ...] | None = None
-    correlation_file: Reference | None = None
+    correlation_file: spec.Reference | None = None
     time: TimeLaw = TimeLawSpec.model_construct(kind="constant")
     reason: Reason
 
@@ -422,7 +411,7 @@ class JointSpec(Spec):
         return out
 
 
-class _CauseKeys(Spec):
+class _CauseKeys(spec.Spec):
     """Keys that a cause in a disturbances file may have, all optional."""
 
     bodies: Annotated[BodyPatterns | None, NOT_EMPTY] = None
@@ -434,7 +423,7 @@ class _CauseKeys(Spec):
     conic: Annotated[ConicSigma | None, NOT_EMPTY] = None
     temperature: Annotated[TemperatureSigmaSpec | None, NOT_EMPTY] = None
     index_gradient: Annotated[IndexSigma | None, NOT_EMPTY] = None
-    pivot: Annotated[Name | None, NOT_EMPTY] = None
+    pivot: Annotated[spec.Name | None, NOT_EMPTY] = None
     together: Annotated[Correlation | None, NOT_EMPTY] = None
     correlations: Annotated[tuple[CorrelationSpec, ...] | None, NOT_EMPTY] = None
     time: Annotated[TimeLaw | None, NOT_EMPTY] = None
@@ -523,7 +512,7 @@ class CauseChangeSpec(_CauseKeys):
         return cause.model_copy(update=update)
 
 
-class DisturbancesSpec(TitledSpec):
+class DisturbancesSpec(spec.TitledSpec):
     """Disturbances: changes that are expected between the nominal measurement and a later one.
 
     Attributes
@@ -540,10 +529,10 @@ class DisturbancesSpec(TitledSpec):
         law is `jump`; 0.001 by default.
     """
 
-    sigmas: Annotated[Number, Field(gt=0.0, le=10.0)] = 1.0
-    causes: Named[CauseSpec] = Field(default_factory=FrozenMap)
+    sigmas: Annotated[spec.Number, Field(gt=0.0, le=10.0)] = 1.0
+    causes: spec.Named[CauseSpec] = Field(default_factory=FrozenMap)
     joint: JointSpec | None = None
-    jump_false_alarm: Annotated[Number, Field(gt=0.0, le=0.5)] | None = None
+    jump_false_alarm: Annotated[spec.Number, Field(gt=0.0, le=0.5)] | None = None
 
     @model_validator(mode="after")
     def _states_something(self) -> "DisturbancesSpec":
@@ -596,7 +585,7 @@ class DisturbancesSpec(TitledSpec):
         return self.model_copy(update={"causes": FrozenMap(causes)})
 
 
-class JobDisturbancesSpec(Spec):
+class JobDisturbancesSpec(spec.Spec):
     """Disturbances on which a job's sigmas are based.
 
     Attributes
@@ -610,9 +599,9 @@ class JobDisturbancesSpec(Spec):
         Names of the file's causes that are excluded.
     """
 
-    file: Ref | None = None
-    causes: Named[CauseChangeSpec] = Field(default_factory=FrozenMap)
-    without: tuple[Name, ...] = ()
+    file: spec.Ref | None = None
+    causes: spec.Named[CauseChangeSpec] = Field(default_factory=FrozenMap)
+    without: tuple[spec.Name, ...] = ()
 
     @model_validator(mode="after")
     def _each_once(self) -> "JobDisturbancesSpec":
@@ -632,7 +621,7 @@ def _as_file(value: Any) -> Any:
 
 JobDisturbances = Annotated[
     JobDisturbancesSpec,
-    BeforeValidator(_as_file, json_schema_input_type=Reference | JobDisturbancesSpec | DisturbancesSpec),
+    BeforeValidator(_as_file, json_schema_input_type=spec.Reference | JobDisturbancesSpec | DisturbancesSpec),
 ]
 """Disturbances as a mapping with its keys, the file's name alone, as `disturbances: orbit`, or the content of such a
 file.
@@ -640,11 +629,13 @@ file.
 
 
 AngleErrors = Annotated[
-    dict[Name, Annotated[dict[Name, Tilt], AfterValidator(FrozenMap)]], NothingIsEmpty, AfterValidator(FrozenMap)
+    dict[spec.Name, Annotated[dict[spec.Name, Tilt], AfterValidator(FrozenMap)]],
+    spec.NothingIsEmpty,
+    AfterValidator(FrozenMap),
 ]
 
 
-class ErrorBudgetSpec(Spec):
+class ErrorBudgetSpec(spec.Spec):
     """Error budget of a monitor, which lists the error that each cause of disturbance contributes.
 
     Attributes
@@ -667,14 +658,14 @@ class ErrorBudgetSpec(Spec):
         File of disturbances: one of scenes/library/disturbances or the path of your file. Each of its causes is a line.
     """
 
-    description: Text = ""
-    instrument: Ref
-    photons_per_frame: Annotated[Number, Field(gt=0.0, le=1e12)]
+    description: spec.Text = ""
+    instrument: spec.Ref
+    photons_per_frame: Annotated[spec.Number, Field(gt=0.0, le=1e12)]
     frames: Frames = 9
-    trials: Annotated[Whole, Field(ge=20, le=100_000)] = 100
-    all_together: Annotated[Whole, Field(ge=20, le=100_000)] = 300
+    trials: Annotated[spec.Whole, Field(ge=20, le=100_000)] = 100
+    all_together: Annotated[spec.Whole, Field(ge=20, le=100_000)] = 300
     angle_errors: AngleErrors
-    disturbances: Ref
+    disturbances: spec.Ref
 
     def applied_to(self, instrument: InstrumentSpec) -> InstrumentSpec:
         """Return the instrument with this budget's angle errors and light."""

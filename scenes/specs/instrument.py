@@ -654,18 +654,13 @@ class InstrumentSpec(TitledSpec):
             assert mounted.pupil_offset is not None
             pair = zip(SIDES, (monitor.field, -monitor.field), strict=True)
             specs = {name: ChannelSpec.model_construct(field=f, pupil_offset=mounted.pupil_offset) for name, f in pair}
-        return {
-            name: ChannelParts(
-                spec.field,
-                spec.pupil_offset,
-                spec.return_face or monitor.return_face,
-                spec.spread or prism.spread,
-                spec.photons_per_frame or monitor.reticle.photons_per_frame,
-                spec.prism_180 or monitor.prism_180,
-                spec.prism_0 or monitor.prism_0,
-            )
-            for name, spec in specs.items()
-        }
+        out = {}
+        for name, spec in specs.items():
+            face, spread = spec.return_face or monitor.return_face, spec.spread or prism.spread
+            photons = spec.photons_per_frame or monitor.reticle.photons_per_frame
+            prisms = (spec.prism_180 or monitor.prism_180, spec.prism_0 or monitor.prism_0)
+            out[name] = ChannelParts(spec.field, spec.pupil_offset, face, spread, photons, *prisms)
+        return out
 
 
 DESIGN = "design"

@@ -10,19 +10,10 @@ from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 from optics.numerics.number_tree import FrozenMap
 from optics.targets.target_shapes import TARGETS
 from optics.thermal.heat import Temperature
-from scenes.specs import job_tables
+from scenes.specs import job_tables, perturbation
 from scenes.specs.course import CourseSpec, read_course
 from scenes.specs.disturbances import JobDisturbances
 from scenes.specs.instrument import Frames
-from scenes.specs.perturbation import (
-    IN_WORDS,
-    NodeInfo,
-    PlainPerturbationSpec,
-    no_such_node,
-    not_allowed,
-    perturbation_issues,
-    with_full_paths,
-)
 from scenes.yaml.errors import InputError, Issue, KeyPath, Problem, shown
 from scenes.yaml.named import Named
 from scenes.yaml.spec import Flag, NothingIsEmpty, OneOf, Paths, Ref, Seed, Spec, Whole
@@ -61,7 +52,7 @@ class TargetsSpec(Spec):
     frames: Frames | None = None
 
 
-class PerturbationSpec(PlainPerturbationSpec):
+class PerturbationSpec(perturbation.PlainPerturbationSpec):
     """Perturbation of one body of a job's instrument.
 
     Besides the motions it may have temperatures at nodes and, for a mirror or a prism's face, displaced nodes of a
@@ -85,21 +76,14 @@ class PerturbationSpec(PlainPerturbationSpec):
         return job_tables.TableTemperatureSpec() if self.temperature is None else self.temperature
 
     @classmethod
-    def of(cls, perturb: Mapping[str, PlainPerturbationSpec]) -> "FrozenMap[str, PerturbationSpec]":
+    def of(cls, perturb: Mapping[str, perturbation.PlainPerturbationSpec]) -> "FrozenMap[str, PerturbationSpec]":
         """Return the perturbations of another file in the form of a job."""
-        return FrozenMap(
-            {
-                path: cls.model_construct(
-                    **{
-                        **dict(what),
-                        "temperature": None
-                        if what.temperature is None
-                        else job_tables.TableTemperatureSpec.model_construct(**dict(what.temperature)),
-                    }
-                )
-                for path, what in perturb.items()
-            }
-        )
+        out = {}
+        for path, what in perturb.items():
+            heat = what.temperature
+            with_table = None if heat is None else job_tables.TableTemperatureSpec.model_construct(**dict(heat))
+            out[path] = cls.model_construct(**{**dict(what), "temperature": with_table})
+        return FrozenMap(out)
 
     def uses(self) -> tuple[str, ...]:
         """Return the names of the changes that have an effect, such as ``shift``; ``deformation`` comes last."""
@@ -199,7 +183,7 @@ class AnalysisSpec(Spec):
 
 
 def pivot_problem(
-    perturb: Mapping[str, PlainPerturbationSpec], course: CourseSpec, within: KeyPath = ()
+    perturb: Mapping[str, perturbation.PlainPerturbationSpec], course: CourseSpec, within: KeyPath = ()
 ) -> Problem | None:
     """Return the problem of a course that rotates a node about a pivot that differs from the one in the perturbation.
 
@@ -243,7 +227,7 @@ class JobSpec(Spec):
     """
 
     instrument: Ref
-    perturb: Annotated[Paths[PerturbationSpec], IN_WORDS] = Field(default_factory=FrozenMap)
+    perturb: Annotated[Paths[PerturbationSpec], perturbation.IN_WORDS] = Field(default_factory=FrozenMap)
     course: CourseSpec | None = None
     disturbances: JobDisturbances | None = None
     render: Annotated[RenderSpec, NothingIsEmpty] = RenderSpec.model_construct()
@@ -319,7 +303,7 @@ def with_tables(job: JobSpec) -> JobSpec:
     return job.model_copy(update=whole) if whole else job
 
 
-def checked_nodes(job: JobSpec, nodes: Mapping[str, NodeInfo]) -> JobSpec:
+def checked_nodes(job: JobSpec, nodes: Mapping[str, perturbation.NodeInfo]) -> JobSpec:
     """Return the job with full paths of its nodes, after a check that each node allows its perturbation.
 
     Parameters
@@ -340,13 +324,15 @@ def checked_nodes(job: JobSpec, nodes: Mapping[str, NodeInfo]) -> JobSpec:
         A node does not exist, has no such pivot or does not allow an action; one issue for each fault, with the nearest
         valid name.
     """
-    perturb = with_full_paths(job.perturb, nodes, lambda problem, name: job.issue(problem, ("perturb", name)))
+    perturb = perturbation.with_full_paths(
+        job.perturb, nodes, lambda problem, name: job.issue(problem, ("perturb", name))
+    )
     if perturb != job.perturb:
         job = job.model_copy(update={"perturb": perturb})
     issues = [
         issue
         for path, what in job.perturb.items()
-        for issue in perturbation_issues(job, nodes, path, what, ("perturb", path))
+        for issue in perturbation.perturbation_issues(job, nodes, path, what, ("perturb", path))
     ]
     if job.course is not None:
         issues += _course_issues(job.course, nodes)
@@ -355,19 +341,19 @@ def checked_nodes(job: JobSpec, nodes: Mapping[str, NodeInfo]) -> JobSpec:
     return job
 
 
-def _course_issues(course: CourseSpec, nodes: Mapping[str, NodeInfo]) -> list[Issue]:
+def _course_issues(course: CourseSpec, nodes: Mapping[str, perturbation.NodeInfo]) -> list[Issue]:
     issues = []
     for path in course.temperature:
         key: KeyPath = ("temperature", path)
         if path not in nodes:
-            issues.append(no_such_node(course, nodes, path, key))
+            issues.append(perturbation.no_such_node(course, nodes, path, key))
         elif "temperature" not in nodes[path].allows:
-            issues.append(not_allowed(course, nodes[path], "temperature", key))
+            issues.append(perturbation.not_allowed(course, nodes[path], "temperature", key))
     for path, moves in course.motion.items():
         # a quantity that the course has counts at every time, even where it is zero
         does: dict[str, Any] = {
             name: 1.0 if name == "scale" else (1.0, 1.0, 1.0) for name, v in moves.series.items() if v is not None
         }
         whole = PerturbationSpec.model_construct(**does, pivot=moves.pivot)
-        issues += perturbation_issues(course, nodes, path, whole, ("motion", path))
+        issues += perturbation.perturbation_issues(course, nodes, path, whole, ("motion", path))
     return issues

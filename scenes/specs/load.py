@@ -9,9 +9,8 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from optics.numerics.number_tree import FrozenMap
-from scenes.specs.autocollimators import AutocollimatorSetup, AutocollimatorTestSpec
 from scenes.specs.camera import CameraSpec
-from scenes.specs.camera_tests import CameraUnderTestSpec
+from scenes.specs.camera_tests import AutocollimatorSetup, AutocollimatorTestSpec, CameraUnderTestSpec
 from scenes.specs.detector import DetectorSpec
 from scenes.specs.disturbances import NONE, DisturbancesSpec, ErrorBudgetSpec
 from scenes.specs.instrument import BASE, DESIGN, AsBuiltInstrumentSpec, InstrumentSpec

@@ -27,17 +27,8 @@ EVENTS: tuple[str, ...] = get_args(Event)
 """Names of the events that a record of operation may contain, besides readings."""
 
 
-ENDINGS: Mapping[str, tuple[Kind, str]] = FrozenMap(
-    {
-        "arcsec": (ANGLE, "arcsec"),
-        "um": (LENGTH, "um"),
-        "mm": (LENGTH, "mm"),
-        "m": (LENGTH, "m"),
-        "nm": (LENGTH, "nm"),
-        "ppm": (SCALE, "ppm"),
-        "percent": (SCALE, "percent"),
-    }
-)
+_UNITS = ((ANGLE, ("arcsec",)), (LENGTH, ("um", "mm", "m", "nm")), (SCALE, ("ppm", "percent")))
+ENDINGS: Mapping[str, tuple[Kind, str]] = FrozenMap({unit: (kind, unit) for kind, units in _UNITS for unit in units})
 """Suffix of a quantity's key, such as `arcsec` -> kind of quantity and its unit."""
 MOST_REQUIREMENTS, MOST_CAUSES = 100, 100
 Span = Annotated[float, Quantity(MOMENT, above_zero=True, largest="1000000 h")]

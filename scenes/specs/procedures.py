@@ -5,10 +5,8 @@ test is imported on first use: help and messages about files do not wait for num
 wait for plotting modules.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -122,6 +120,14 @@ def studied_commands() -> tuple[str, ...]:
 SENSORS = ("ties", "control", "monitor", "laser", "terrain", "tracker_angles")
 """Sensors that the adjustment of a block can exclude; the command's help lists them."""
 
+
+def _with_help(tests: Mapping[str, Procedure]) -> dict[str, Procedure]:
+    """Return the tests with the texts of ``--help``, each a section of the file beside this module."""
+    text = Path(__file__).with_suffix(".md").read_text("utf-8")
+    about = dict(section.split("\n", 1) for section in text.split("\n## ")[1:])
+    return {name: replace(test, about=about.get(name, "").strip()) for name, test in tests.items()}
+
+
 _PROCEDURES: dict[str, Procedure] = {
     "lab focus": Procedure(
         "focus",
@@ -132,15 +138,6 @@ _PROCEDURES: dict[str, Procedure] = {
         report="twin.laboratory.focus_report:focus_report",
         export="twin.laboratory.export:export_focus",
         varied=True,
-        about="""
-    Align a misaligned focal plane: through-focus MTF of a slanted edge in every field and band, a weighted plane fit,
-    shims, and a repetition as a check.
-
-    focus.json holds, for every round, the confocal error, the line's level, MTF at Nyquist by band and the shims,
-    and under `truth` the values of the exact ray trace.
-
-    Example: `python -m twin.lab focus scenes/lab/focus.yaml`
-    """,
     ),
     "lab distortion": Procedure(
         "distortion",
@@ -151,16 +148,6 @@ _PROCEDURES: dict[str, Procedure] = {
         report="twin.laboratory.distortion_report:distortion_report",
         export="twin.laboratory.export:export_distortion",
         varied=True,
-        about="""
-    Measure principal distance, principal point and distortion: a pinhole's spots on the line CCD while a turntable
-    rotates the camera, with raw and with compensated angles.
-
-    distortion.json: `rms_raw_um` and `rms_compensated_um` are the scatter of the points about a smooth curve, which a
-    laboratory can measure; the true errors of the distortion are under `truth`, `error_rms_raw_um` and
-    `error_rms_compensated_um`.
-
-    Example: `python -m twin.lab distortion scenes/lab/distortion.yaml`
-    """,
     ),
     "lab turntable": Procedure(
         "turntable",
@@ -171,11 +158,6 @@ _PROCEDURES: dict[str, Procedure] = {
         report="twin.laboratory.turntable_report:turntable_report",
         export="twin.laboratory.export:export_turntable",
         varied=True,
-        about="""
-    Calibrate a turntable's dividing error by regional comparison and compare five fits of it on held-out angles.
-
-    Example: `python -m twin.lab turntable scenes/lab/turntable.yaml --seed 2`
-    """,
     ),
     "orbit adjust": Procedure(
         "block",
@@ -186,20 +168,6 @@ _PROCEDURES: dict[str, Procedure] = {
         report="twin.orbit.block.block_report:block_report",
         export="twin.orbit.block.block_files:exported",
         varied=True,
-        about="""
-    Adjust all scenes of a block together: image points, control, the cameras' monitor, star trackers and their
-    angles, a laser altimeter and a terrain model, with time laws for the errors of the readings.
-
-    A file with `data: DIR` runs on the measurements of that folder, as `calibrate` does; a file with `images:` adjusts
-    images that come with rational polynomials. `--export DIR` writes the adjusted points with their covariances, and
-    the corrected polynomials of such images with the joint covariance of their corrections.
-
-    block.json holds the errors in plan and height at check points, with all sensors and without each, the tests of
-    observations and laws, the parameters that the prior determines more than the observations, and the cameras'
-    changes. `--without SENSOR` excludes a sensor of the file.
-
-    Example: `python -m twin.orbit adjust scenes/orbit/adjust.yaml`
-    """,
     ),
     "orbit angle": Procedure(
         "angle",
@@ -210,19 +178,6 @@ _PROCEDURES: dict[str, Procedure] = {
         report="twin.orbit.angle.angle_report:angle_report",
         export="twin.orbit.angle.measured_angle:angle_exported",
         varied=True,
-        about="""
-    Measure intersection angles of a three-line camera by planes through the station and ground points (paper 000),
-    with space resection as the second method.
-
-    A file with `data: DIR` runs on the measurements of that folder, as `calibrate` does: the angles of every pass,
-    against those of the laboratory. `--export DIR` writes a simulation's measurements to such a folder, with a test
-    file angle.yaml.
-
-    angle.json holds the angles with sigmas, the truth, planes minus resection, and the sensitivity to errors of the
-    station and of the points.
-
-    Example: `python -m twin.orbit angle scenes/orbit/angle.yaml`
-    """,
     ),
     "orbit calibrate": Procedure(
         "calibration",
@@ -233,18 +188,6 @@ _PROCEDURES: dict[str, Procedure] = {
         report="twin.orbit.calibration.calibration_report:calibration_report",
         export="twin.orbit.calibration.calibration_run:exported",
         varied=True,
-        about="""
-    Calibrate interior orientation and attitude biases of a three-line camera over test fields, and test schemes of
-    averaged parameters on all fields without ground control (paper 003); simulated, or on measured passes.
-
-    A file with `data: DIR` runs on the measurements of that folder: orbit, attitude, line times, ground and image
-    points. `--export DIR` writes the run's measurements to such a folder, with a test file calibrate.yaml.
-
-    calibration.json holds the parameters with sigmas and truth, correlations, null vectors and gauge, and the errors in
-    plan and height of every field before calibration and by each scheme.
-
-    Example: `python -m twin.orbit calibrate scenes/orbit/calibrate.yaml`
-    """,
     ),
     "orbit check": Procedure(
         "check",
@@ -255,18 +198,6 @@ _PROCEDURES: dict[str, Procedure] = {
         export="twin.orbit.conventions.check_run:exported",
         judged=False,
         seeded=False,
-        about="""
-    Check the conventions of a pass in files: alternatives of each convention (order and sense of the quaternion,
-    frames, time scales, an offset of the line times, origins and axes of pixels and lines), singly and in pairs, are
-    compared on the ground points and ranked.
-
-    check.json holds the alternatives with residuals and likelihoods, the conventions that the points determine and
-    those that they do not, and the computed positions of the first points. Exit codes: 0 the stated conventions are
-    confirmed, 3 others fit better, 4 none explains the points. With `--export DIR` a pass with confirmed conventions is
-    written to a folder that `twin.orbit calibrate` reads.
-
-    Example: `python -m twin.orbit check scenes/orbit/measured/check.yaml`
-    """,
     ),
     "orbit jitter": Procedure(
         "jitter",
@@ -278,18 +209,6 @@ _PROCEDURES: dict[str, Procedure] = {
         export="twin.orbit.jitter.jitter_run:exported",
         varied=True,
         judged=False,
-        about="""
-    Search for jitter of the attitude in images of the same ground that two or more lines or bands took one after the
-    other: oscillations with frequency, amplitude and false-alarm rate, the frequencies at which the lines are blind,
-    and the attitude over time with its covariance.
-
-    A file with `data: DIR` runs on the points of that folder, as `match --export DIR` writes it. `--export DIR` writes
-    a simulation's measurements to such a folder, with a test file jitter.yaml.
-
-    jitter.json holds the oscillations with sigmas, blind frequencies, and detection limits.
-
-    Example: `python -m twin.orbit jitter scenes/orbit/jitter.yaml`
-    """,
     ),
     "orbit match": Procedure(
         "match",
@@ -301,17 +220,6 @@ _PROCEDURES: dict[str, Procedure] = {
         export="twin.orbit.matching.match_run:exported",
         judged=False,
         seeded=False,
-        about="""
-    Measure points in a user's line images: distinct points of an orthophoto with heights of an elevation model, and
-    tie points, are located in every image by least squares matching, as in a simulated patch.
-
-    A file with `images:` that have rational polynomials, without a camera, gives tie points between them.
-
-    match.json holds for every line the number of matched points and how they were matched. With `--export DIR` they are
-    written with orbit, attitude and line times to a folder that `twin.orbit calibrate` reads.
-
-    Example: `python -m twin.orbit match scenes/orbit/measured/match.yaml`
-    """,
     ),
     "orbit monitor": Procedure(
         "monitor",
@@ -320,18 +228,6 @@ _PROCEDURES: dict[str, Procedure] = {
         numbers="twin.orbit.monitoring.monitoring_numbers:monitor_numbers",
         report="twin.orbit.monitoring.monitoring_report:monitor_report",
         varied=True,
-        about="""
-    Compute height errors of a stereo pair along its orbit with and without on-board monitoring of its cameras (paper
-    001's monitor, heights as in papers 000 and 003). With `mechanisms:` the loop is closed: readings of rendered spots
-    control mechanisms that point and refocus, with gain, delay and steps, compared with the same orbit in open loop.
-
-    monitor.json holds the true and the monitored changes, errors in plan and height as calibrated, monitored at every
-    time and at an interval, the table of intervals, metres per arcsecond, and the sources of the remaining errors; for
-    a closed loop under `loop` the remaining errors of angle, focus and height with sigmas, gain and phase margins, and
-    unobservable modes.
-
-    Example: `python -m twin.orbit monitor scenes/orbit/monitor.yaml`
-    """,
     ),
     "orbit simulate": Procedure(
         "simulate",
@@ -340,16 +236,6 @@ _PROCEDURES: dict[str, Procedure] = {
         numbers="twin.orbit.images.simulate_run:SIMULATE",
         report="twin.orbit.images.simulate_report:simulation_report",
         export="twin.orbit.images.simulate_run:simulation_exported",
-        about="""
-    Render images of a patch of ground by every line of a camera, with an orthophoto, an elevation model and the
-    measured orbit and attitude: all inputs of an in-orbit calibration from images.
-
-    simulate.json holds for every line the position of its window, grey values, ground sample distance and MTF. The
-    true values are in artefacts/truth.json. `--export DIR` writes points, orbit and attitude as tables that `calibrate`
-    reads.
-
-    Example: `python -m twin.orbit simulate scenes/orbit/simulate.yaml`
-    """,
     ),
     "design camera": Procedure(
         "design",
@@ -358,18 +244,6 @@ _PROCEDURES: dict[str, Procedure] = {
         numbers="twin.design.design_run:DESIGN",
         report="twin.design.design_report:design_report",
         judged=False,
-        about="""
-    Optimise a camera's prescription: curvatures, conics, aspheric terms and positions vary; the wavefront error over
-    the field is minimised, with the focal length, the envelope, the anamorphism and free beams as constraints.
-    Several starts (``starts:``) show whether the optimum depends on the starting point.
-
-    Example: `python -m twin.design camera scenes/examples/design_gf7_short.yaml`
-
-    The run folder gets the new camera's file in artefacts/,
-    design.json, config.yaml and a report.
-
-    Exit codes: 0 success, 2 bad input (nothing is written), 1 anything else.
-    """,
     ),
     "design monitor": Procedure(
         "layouts",
@@ -385,17 +259,6 @@ _PROCEDURES: dict[str, Procedure] = {
         run="twin.asbuilt.asbuilt_run:run_asbuilt",
         numbers="twin.asbuilt.asbuilt_run:ASBUILT",
         report="twin.asbuilt.asbuilt_report:asbuilt_report",
-        about="""
-    Estimate the state of one instrument: all motions of its prior from all of its measurements, with the observable
-    combinations, the performance of the camera compared with that of the design, and the next alignment move.
-
-    asbuilt.json holds the motions and combinations with their sigmas, the consistency of every measurement with all
-    others, the merits with their quantiles under the prior, as built and after the next move, and that move.
-    artefacts/ gets the instrument as built, which every command accepts as its instrument, and its remaining
-    uncertainty as a disturbances file.
-
-    Example: `python -m twin.asbuilt scenes/examples/asbuilt_gf7.yaml`
-    """,
     ),
     "asbuilt check": Procedure(
         "orientation",
@@ -404,15 +267,6 @@ _PROCEDURES: dict[str, Procedure] = {
         numbers="twin.asbuilt.orientation_check:ORIENTATION",
         report="twin.asbuilt.orientation_check:check_report",
         judged=False,
-        about="""
-    Determine the orientation of measured wavefronts: eight orientations and two signs are compared with the prediction
-    from the prior and the moves; those that the data do not distinguish are listed together.
-
-    orientation.json holds all orientations with their chi-squares. Exit codes: 0 the stated orientation is confirmed, 3
-    another one fits better, 4 none explains the wavefronts.
-
-    Example: `python -m twin.asbuilt check scenes/examples/asbuilt_gf7.yaml`
-    """,
     ),
     "camera": Procedure(
         "optics",
@@ -448,5 +302,5 @@ _PROCEDURES: dict[str, Procedure] = {
         seeded=False,
     ),
 }
-PROCEDURES = ExtensionTable("procedures", _PROCEDURES, Procedure)
-"""Command without the leading ``twin.`` -> test. A new test consists of its modules and one entry here."""
+PROCEDURES = ExtensionTable("procedures", _with_help(_PROCEDURES), Procedure)
+"""Command without the leading ``twin.`` -> test. A new test consists of its modules, one entry here and its help."""

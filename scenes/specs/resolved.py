@@ -11,13 +11,20 @@ from pydantic import Field
 from optics.numerics.number_tree import FrozenMap
 from scenes.specs import load
 from scenes.specs.camera import PANCHROMATIC, CameraSpec
-from scenes.specs.camera_tests import DistortionTestSpec, FocusTestSpec, MeasuredDistortionSpec, MeasuredFocusSpec
+from scenes.specs.camera_tests import (
+    DistortionTestSpec,
+    FocusTestSpec,
+    MeasuredDistortionSpec,
+    MeasuredFocusSpec,
+    MeasuredTurntableSpec,
+    TurntableFiles,
+    TurntableTestSpec,
+)
 from scenes.specs.detector import DetectorSpec, require_detector
 from scenes.specs.disturbances import DisturbancesSpec, ErrorBudgetSpec
 from scenes.specs.instrument import InstrumentSpec
 from scenes.specs.job import JobSpec, PerturbationSpec, TargetsSpec, with_tables
 from scenes.specs.perturbation import IN_WORDS
-from scenes.specs.turntable import MeasuredTurntableSpec, TurntableFiles, TurntableTestSpec
 from scenes.yaml.errors import InputError, Issue, unknown
 from scenes.yaml.input_file import is_file
 from scenes.yaml.spec import Name, Paths, Spec, validate
@@ -144,14 +151,9 @@ def _with_instrument(job: JobSpec, instrument: InstrumentSpec) -> ResolvedJob:
     if job.render.target_images:
         line_detectors = FrozenMap({name: line_detector(camera) for name, camera in cameras.items()})
     # The parts are already validated; validating again would require quantities as text.
-    return ResolvedJob.model_construct(
-        job=job,
-        instrument=instrument,
-        cameras=cameras,
-        detector=detector,
-        line_detectors=line_detectors,
-        disturbances=load.find_disturbances(job, instrument),
-    )
+    found: dict[str, Any] = {"detector": detector, "line_detectors": line_detectors}
+    found["disturbances"] = load.find_disturbances(job, instrument)
+    return ResolvedJob.model_construct(job=job, instrument=instrument, cameras=cameras, **found)
 
 
 def resolve_budget(budget: ErrorBudgetSpec) -> ResolvedJob:

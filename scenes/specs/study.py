@@ -15,23 +15,10 @@ import numpy as np
 from pydantic import AfterValidator, Field, model_validator
 
 from optics.numerics.extension_table import ExtensionTable
-from scenes.specs.motion_text import key_below, motion_of
+from scenes.specs.perturbation import key_below, motion_of
 from scenes.specs.procedures import studied_commands
+from scenes.yaml import spec
 from scenes.yaml.errors import KeyPath, Problem, key_text, shown, unknown
-from scenes.yaml.spec import (
-    Flag,
-    Name,
-    Named,
-    NothingIsEmpty,
-    Number,
-    OneOf,
-    Reference,
-    Seed,
-    Spec,
-    Text,
-    TitledSpec,
-    Whole,
-)
 from scenes.yaml.units import split_quantity, unit_ratio
 
 GRID = "grid"
@@ -127,15 +114,15 @@ Scalar = (
     | Annotated[str, Field(strict=True, max_length=1000)]
 )
 """Value as written in the file of the base job or test: a quantity with its unit, a number, a name, true or false."""
-Key = Annotated[tuple[Annotated[str, Field(strict=True)] | Whole, ...], Field(min_length=1)]
+Key = Annotated[tuple[Annotated[str, Field(strict=True)] | spec.Whole, ...], Field(min_length=1)]
 """Key path in a file or a result: keys and list indices from the root on."""
 MOST_RUNS = 10_000_000
-Count = Annotated[Whole, Field(ge=2, le=MOST_RUNS)]
+Count = Annotated[spec.Whole, Field(ge=2, le=MOST_RUNS)]
 KINDS = ("values", "range", "uniform", "normal", "truncated", "table")
 CONTINUOUS = ("range", "uniform", "normal", "truncated")
 
 
-class NormalSpec(Spec):
+class NormalSpec(spec.Spec):
     """Normal distribution of a factor.
 
     Attributes
@@ -150,7 +137,7 @@ class NormalSpec(Spec):
     sigma: Scalar
 
 
-class TruncatedSpec(Spec):
+class TruncatedSpec(spec.Spec):
     """Truncated normal distribution of a factor.
 
     Attributes
@@ -168,7 +155,7 @@ class TruncatedSpec(Spec):
     limits: tuple[Scalar, Scalar]
 
 
-class TableSpec(Spec):
+class TableSpec(spec.Spec):
     """Column of a table. Columns of one file are varied together, row by row.
 
     Attributes
@@ -181,12 +168,12 @@ class TableSpec(Spec):
         Values of the column, filled in by the program in a study's config.yaml, which then needs no other file.
     """
 
-    file: Reference
-    column: Text
+    file: spec.Reference
+    column: spec.Text
     values: tuple[Scalar, ...] | None = None
 
 
-class ScaleSpec(Spec):
+class ScaleSpec(spec.Spec):
     """Number in the base that is multiplied by a power of the ratio of a factor to its base value.
 
     The number is that of the base, or the one set by another factor. Several factors may scale one number.
@@ -200,10 +187,10 @@ class ScaleSpec(Spec):
     """
 
     key: Key
-    power: Number = 1.0
+    power: spec.Number = 1.0
 
 
-class FactorSpec(Spec):
+class FactorSpec(spec.Spec):
     """Factor of a study: a number or text of the base that varies, and the values that it takes.
 
     It has one of key, motion and keys, or scales alone, and exactly one of values, range, uniform, normal, truncated
@@ -236,7 +223,7 @@ class FactorSpec(Spec):
     """
 
     key: Key | None = None
-    motion: Text | None = None
+    motion: spec.Text | None = None
     keys: Annotated[tuple[Key, ...], Field(min_length=1)] | None = None
     scales: tuple[ScaleSpec, ...] = ()
     values: tuple[Scalar, ...] | None = None
@@ -347,29 +334,26 @@ class FactorSpec(Spec):
                 raise Problem("the range is empty", found, "the smaller value first", within=within)
 
 
-class Numbers(tuple[float, ...]):
+@dataclass(frozen=True)
+class Numbers:
     """Values of a factor as numbers.
 
     Attributes
     ----------
+    values : tuple of float
+        The numbers in the common unit.
     numeric : bool
         True if the values are numbers, with or without a unit.
     unit : str | None
         Unit of all of them; None without unit.
-    values
-        The numbers in that unit.
     whole : bool
         True if all are written as whole numbers.
     """
 
+    values: tuple[float, ...]
     numeric: bool
     unit: str | None
     whole: bool
-
-    @property
-    def values(self) -> tuple[float, ...]:
-        """The numbers as a tuple, in the common unit."""
-        return tuple(self)
 
     @classmethod
     def of(cls, scalars: tuple[Any, ...], kind: str) -> Numbers:
@@ -383,10 +367,8 @@ class Numbers(tuple[float, ...]):
         parts = [split_quantity(scalar) for scalar in scalars]
         plain = [isinstance(s, int | float) and not isinstance(s, bool) for s in scalars]
         if not any(part is not None for part in parts):
-            out = cls(float(s) for s in scalars) if all(plain) else cls()
-            out.numeric, out.unit = all(plain) and bool(scalars), None
-            out.whole = all(isinstance(s, int) for s in scalars)
-            return out
+            whole = all(isinstance(s, int) for s in scalars)
+            return cls(tuple(map(float, scalars)) if all(plain) else (), all(plain) and bool(scalars), None, whole)
         first = next(part for part in parts if part is not None)[1]
         numbers = []
         for scalar, part in zip(scalars, parts, strict=True):
@@ -399,12 +381,10 @@ class Numbers(tuple[float, ...]):
                 numbers.append(number if unit == first else number / unit_ratio(first, unit))
             except Problem as problem:
                 raise Problem(problem.problem, problem.found, problem.allowed, within=(kind,)) from None
-        out = cls(numbers)
-        out.numeric, out.unit, out.whole = True, first, False
-        return out
+        return cls(tuple(numbers), True, first, False)
 
 
-class DesignSpec(Spec):
+class DesignSpec(spec.Spec):
     """Design of experiments: the combinations of the factors' values that are run.
 
     Attributes
@@ -418,9 +398,9 @@ class DesignSpec(Spec):
         Seed of the random values of the factors, and of the noise of every run.
     """
 
-    kind: Annotated[str, OneOf(lambda: (GRID, *SAMPLERS))] = GRID
-    runs: Annotated[Whole, Field(ge=1, le=MOST_RUNS)] | None = None
-    seed: Seed = 0
+    kind: Annotated[str, spec.OneOf(lambda: (GRID, *SAMPLERS))] = GRID
+    runs: Annotated[spec.Whole, Field(ge=1, le=MOST_RUNS)] | None = None
+    seed: spec.Seed = 0
 
     @model_validator(mode="after")
     def _has_runs(self) -> DesignSpec:
@@ -441,7 +421,7 @@ def _amount(text: str) -> str:
     return text
 
 
-class LimitsSpec(Spec):
+class LimitsSpec(spec.Spec):
     """Limits on the resources of a study.
 
     Attributes
@@ -452,7 +432,7 @@ class LimitsSpec(Spec):
         Memory of all processes together, with the unit MB or GB.
     """
 
-    runs: Annotated[Whole, Field(ge=1, le=MOST_RUNS)] = 20_000
+    runs: Annotated[spec.Whole, Field(ge=1, le=MOST_RUNS)] = 20_000
     memory: Annotated[str, Field(strict=True), AfterValidator(_amount)] = "4 GB"
 
     @property
@@ -472,7 +452,7 @@ UNITS = {
 """Last word of a result's key, such as `um` in `d_f_um` -> unit."""
 
 
-class BaseSpec(Spec):
+class BaseSpec(spec.Spec):
     """Base of a study: the job or test that every run changes.
 
     Attributes
@@ -484,15 +464,15 @@ class BaseSpec(Spec):
         also a name in the library.
     """
 
-    command: Annotated[str, OneOf(studied_commands)]
-    file: Reference
+    command: Annotated[str, spec.OneOf(studied_commands)]
+    file: spec.Reference
 
 
 TOTAL, NOISE = "_sigma", "_sigma_noise"
 """Suffixes of the keys and columns of standard deviations: the total one, and the one due to image noise alone."""
 
 
-class ResponseSpec(Spec):
+class ResponseSpec(spec.Spec):
     """Response: a number that is stored for every run.
 
     Attributes
@@ -512,7 +492,7 @@ class ResponseSpec(Spec):
     """
 
     key: Key
-    unit: Text | None = None
+    unit: spec.Text | None = None
     sigma: Key | None = None
     noise: Key | None = None
     minus: Key | None = None
@@ -537,7 +517,7 @@ class ResponseSpec(Spec):
         return {ending: key for ending, key in sigmas.items() if key is not None}
 
 
-class ThresholdSpec(Spec):
+class ThresholdSpec(spec.Spec):
     """Requirement on a response, in the response's unit.
 
     The report gives the fraction of runs that meet it.
@@ -554,10 +534,10 @@ class ThresholdSpec(Spec):
         True to judge the absolute value of the response.
     """
 
-    response: Name
-    at_most: Number | None = None
-    at_least: Number | None = None
-    magnitude: Flag = False
+    response: spec.Name
+    at_most: spec.Number | None = None
+    at_least: spec.Number | None = None
+    magnitude: spec.Flag = False
 
     @model_validator(mode="after")
     def _asks_something(self) -> ThresholdSpec:
@@ -566,7 +546,7 @@ class ThresholdSpec(Spec):
         return self
 
 
-class ParetoSpec(Spec):
+class ParetoSpec(spec.Spec):
     """Pareto front of two competing responses, or of a factor and a response.
 
     Attributes
@@ -581,13 +561,13 @@ class ParetoSpec(Spec):
         Direction of improvement of y: `min` if smaller is better, `max` if larger is better.
     """
 
-    x: Name
-    y: Name
+    x: spec.Name
+    y: spec.Name
     best_x: Literal["min", "max"] = "min"
     best_y: Literal["min", "max"] = "min"
 
 
-class StudyReportSpec(Spec):
+class StudyReportSpec(spec.Spec):
     """Content of the report beside the table of the responses.
 
     Attributes
@@ -604,11 +584,11 @@ class StudyReportSpec(Spec):
         Name -> requirement on a response.
     """
 
-    histograms: tuple[Name, ...] | None = None
-    scatter: tuple[tuple[Name, Name], ...] = ()
+    histograms: tuple[spec.Name, ...] | None = None
+    scatter: tuple[tuple[spec.Name, spec.Name], ...] = ()
     pareto: tuple[ParetoSpec, ...] = ()
-    sobol: Flag = False
-    thresholds: Named[ThresholdSpec] = Field(default_factory=dict, validate_default=True)
+    sobol: spec.Flag = False
+    thresholds: spec.Named[ThresholdSpec] = Field(default_factory=dict, validate_default=True)
 
     def names(self) -> list[tuple[KeyPath, str, bool]]:
         """Return (key path, name, whether it must be a response) for every factor or response that the report names."""
@@ -621,7 +601,7 @@ class StudyReportSpec(Spec):
         return out + [(("thresholds", key, "response"), t.response, True) for key, t in self.thresholds.items()]
 
 
-class StudySpec(TitledSpec):
+class StudySpec(spec.TitledSpec):
     """Trade study: a job or a test repeated with factors that vary.
 
     Attributes
@@ -643,12 +623,12 @@ class StudySpec(TitledSpec):
     """
 
     base: BaseSpec
-    factors: Annotated[Named[FactorSpec], Field(min_length=1)]
-    design: Annotated[DesignSpec, NothingIsEmpty] = DesignSpec.model_construct()
+    factors: Annotated[spec.Named[FactorSpec], Field(min_length=1)]
+    design: Annotated[DesignSpec, spec.NothingIsEmpty] = DesignSpec.model_construct()
     noise: Literal["own", "shared"] = "own"
-    responses: Annotated[Named[ResponseSpec], Field(min_length=1)]
-    limits: Annotated[LimitsSpec, NothingIsEmpty] = LimitsSpec.model_construct()
-    report: Annotated[StudyReportSpec, NothingIsEmpty] = StudyReportSpec.model_construct()
+    responses: Annotated[spec.Named[ResponseSpec], Field(min_length=1)]
+    limits: Annotated[LimitsSpec, spec.NothingIsEmpty] = LimitsSpec.model_construct()
+    report: Annotated[StudyReportSpec, spec.NothingIsEmpty] = StudyReportSpec.model_construct()
 
     @model_validator(mode="after")
     def _fits_together(self) -> StudySpec:

@@ -12,38 +12,22 @@ from optics.geometry.zernike import MAX_NOLL
 from optics.numerics.number_tree import FrozenMap
 from scenes.specs.course import noll
 from scenes.specs.disturbances import JobDisturbances
-from scenes.specs.motion_text import PURE, motion_of
+from scenes.specs.perturbation import PURE, motion_of
 from scenes.specs.resolved import ExperimentSetup, ResolvedJob, resolve_on
 from scenes.specs.study import MOST_RUNS, LimitsSpec
+from scenes.yaml import units
 from scenes.yaml.errors import Problem, shown
 from scenes.yaml.spec import Flag, Name, Named, NothingIsEmpty, Number, Ref, Seed, Spec, Text, Whole
-from scenes.yaml.units import (
-    ANGLE,
-    LENGTH,
-    SCALE,
-    TEMPERATURE_DIFFERENCE,
-    TEMPERATURE_GRADIENT,
-    Kind,
-    format_quantity,
-    parse_quantity,
-)
 
 Amount = Annotated[str, Field(strict=True, max_length=100)] | Number
 """Quantity with its unit, or a pure number if the motion has no unit."""
 Share = Annotated[Number, Field(gt=0.0, lt=1.0)]
 Cost = Annotated[Number, Field(gt=0.0)]
 
-MEASURES: Mapping[str, Kind] = FrozenMap(
-    {
-        "shift": LENGTH,
-        "rotate": ANGLE,
-        "scale": SCALE,
-        "radius": SCALE,
-        "abbe": SCALE,
-        "figure": LENGTH,
-        "temperature": TEMPERATURE_DIFFERENCE,
-        "gradient": TEMPERATURE_GRADIENT,
-    }
+MEASURES: Mapping[str, units.Kind] = FrozenMap(
+    dict.fromkeys(("shift", "figure"), units.LENGTH)
+    | dict.fromkeys(("scale", "radius", "abbe"), units.SCALE)
+    | {"rotate": units.ANGLE, "temperature": units.TEMPERATURE_DIFFERENCE, "gradient": units.TEMPERATURE_GRADIENT}
 )
 """Kind of a motion -> kind of quantity of its amounts; the other amounts are pure numbers."""
 MOST_ABBE = 0.1
@@ -95,7 +79,7 @@ class Varied(Spec):
         try:
             number = amount_si(value, kind)
         except Problem as problem:
-            raise Problem(problem.problem, problem.found, problem.allowed, problem.suggestion, within=(key,)) from None
+            raise problem.below(key) from None
         if positive and not number > 0.0:
             raise Problem("not greater than zero", shown(value), within=(key,))
         return number
@@ -107,12 +91,12 @@ def amount_si(value: Amount, kind: str) -> float:
         if isinstance(value, str):
             raise Problem(f"a change of the {kind} is a pure number", shown(value), "a number such as 1e-4")
         return float(value)
-    return parse_quantity(value, MEASURES[kind])
+    return units.parse_quantity(value, MEASURES[kind])
 
 
 def amount_text(value: float, kind: str) -> str | float:
     """Return an amount of a kind of motion as files write it: with its unit, or as a number without one."""
-    return value if kind in PURE else format_quantity(value, MEASURES[kind])
+    return value if kind in PURE else units.format_quantity(value, MEASURES[kind])
 
 
 class ToleranceSpec(Varied):
@@ -294,21 +278,16 @@ class CompensatorSpec(Varied):
 FieldShare = Annotated[Number, Field(ge=-1.0, le=1.0)]
 NINE = tuple((x, y) for x in (-1.0, 0.0, 1.0) for y in (-1.0, 0.0, 1.0))
 """Default fields of a merit: fractions of the half field along the line and along the track."""
-MERIT_UNITS: Mapping[str, Kind | None] = FrozenMap(
-    {
-        "wavefront": None,
-        "mtf": None,
-        "boresight": ANGLE,
-        "roll": ANGLE,
-        "principal_distance": LENGTH,
-        "distortion": LENGTH,
-        "chief_ray": ANGLE,
-        "obstruction": None,
-        "monitor_angle": ANGLE,
-        "monitor_focus": LENGTH,
-    }
+MERIT_UNITS: Mapping[str, units.Kind | None] = FrozenMap(
+    dict.fromkeys(("wavefront", "mtf", "obstruction"))
+    | dict.fromkeys(("boresight", "roll", "chief_ray", "monitor_angle"), units.ANGLE)
+    | dict.fromkeys(("principal_distance", "distortion", "monitor_focus"), units.LENGTH)
 )
 """Kind of a merit -> kind of quantity of its value; None for a number (waves of the design wavelength, MTF)."""
+OfOptics = Literal[
+    "wavefront", "mtf", "boresight", "roll", "principal_distance", "distortion", "chief_ray", "obstruction"
+]
+OfMonitor = Literal["monitor_angle", "monitor_focus"]
 MORE_IS_BETTER = ("mtf",)
 OF_MONITOR = ("monitor_angle", "monitor_focus")
 """Kinds of merits that are standard deviations of the monitor's readings."""
@@ -352,18 +331,7 @@ class MeritSpec(Spec):
         between design and requirement over the square root of the number of tolerances.
     """
 
-    kind: Literal[
-        "wavefront",
-        "mtf",
-        "boresight",
-        "roll",
-        "principal_distance",
-        "distortion",
-        "chief_ray",
-        "obstruction",
-        "monitor_angle",
-        "monitor_focus",
-    ]
+    kind: Literal[OfOptics, OfMonitor]
     fields: Annotated[tuple[tuple[FieldShare, FieldShare], ...], Field(min_length=1, max_length=100)] = NINE
     frequency: Annotated[Number, Field(gt=0.0, le=10_000.0)] | None = None
     direction: Literal["line", "track", "worse"] = "worse"
@@ -399,9 +367,9 @@ class MeritSpec(Spec):
                 raise Problem(f"{self.kind} is a pure number", shown(value), "a number without a unit", within=(key,))
             return float(value)
         try:
-            return parse_quantity(value, unit)
+            return units.parse_quantity(value, unit)
         except Problem as problem:
-            raise Problem(problem.problem, problem.found, problem.allowed, problem.suggestion, within=(key,)) from None
+            raise problem.below(key) from None
 
     @property
     def more_is_better(self) -> bool:

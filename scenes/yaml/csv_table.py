@@ -310,10 +310,8 @@ def _heads(
         name = "" if match is None else match["name"]
         if match is None or name not in known:
             near = nearest(name, known)
-            issue = Issue(
-                "no such column", file, line, (text[:LONGEST_SHOWN],), shown(text), allowed, near and known[near].head
-            )
-            raise InputError(issue)
+            key, meant = (text[:LONGEST_SHOWN],), near and known[near].head
+            raise InputError(Issue("no such column", file, line, key, shown(text), allowed, meant))
         column = known[name]
         if any(column is other for other, _, _ in layout):
             raise InputError(Issue("a second column with this head", file, line, (text,)))

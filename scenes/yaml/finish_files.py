@@ -32,8 +32,6 @@ Reflectance and transmittance may be given separately for s and p (Rs and Rp, Ts
 unpolarised, so that their mean is used. Columns without a unit hold fractions from 0 to 1.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -44,7 +42,7 @@ import numpy as np
 from optics.materials.fresnel_scatter import CoatingTable, ScatterTable
 from optics.numerics.number_tree import FrozenMap
 from scenes.yaml.csv_table import Column, Table, read_table
-from scenes.yaml.errors import InputError, Issue, nearest, shown
+from scenes.yaml.errors import InputError, Issue, shown, unknown
 from scenes.yaml.input_file import read_text
 from scenes.yaml.units import ANGLE, LENGTH, SCALE
 
@@ -113,12 +111,9 @@ class _Lines:
         cells = self._keyed(key)
         known = {word.lower(): word for word in WORDS[key]}
         if len(cells) != 2 or cells[1].lower() not in known:
-            text = " ".join(cells[1:])
-            near = nearest(text, WORDS[key])
-            issue = Issue(
-                "not a value of this line", self.file, self.line, (key,), shown(text), ", ".join(WORDS[key]), near
+            raise InputError(
+                unknown("not a value of this line", " ".join(cells[1:]), WORDS[key]).at(self.file, self.line, (key,))
             )
-            raise InputError(issue)
         self.at += 1
         return known[cells[1].lower()]
 
@@ -307,10 +302,8 @@ def read_coating(path: str | Path) -> MeasuredCoating:
     table = read_table(path, COLUMNS)
     reflected = _mean(table, "R")
     if reflected is None:
-        heads = InputError(
-            Issue("no reflectance", table.file, 1, found=", ".join(table.heads.values()), allowed="R, or Rs and Rp")
-        )
-        raise heads
+        heads = ", ".join(table.heads.values())
+        raise InputError(Issue("no reflectance", table.file, 1, found=heads, allowed="R, or Rs and Rp"))
     through = _mean(table, "T")
     if through is not None:
         over = reflected + through > 1.0 + OVER

@@ -1,7 +1,5 @@
 """Settings that a command makes for its own process at its start; a library must not make them for its user's."""
 
-from __future__ import annotations
-
 import atexit
 import errno
 import gc

@@ -82,13 +82,9 @@ class FileKind:
         model: type[Spec] = Named(f"scenes.specs{self.described}" if self.described[0] == "." else self.described).get()
         return model
 
-    def may_be(self, keys: set[str]) -> bool:
-        """Return whether a file with these keys can be of this kind, without importing the model."""
-        return keys >= set(self.needs.split()) and (not self.one_of or bool(keys & set(self.one_of.split())))
-
     def count_unknown(self, keys: set[str]) -> int | None:
         """Return the number of keys that this kind does not have; None if a required key is missing."""
-        if not self.may_be(keys):
+        if not keys >= set(self.needs.split()) or (self.one_of and not keys & set(self.one_of.split())):
             return None
         fields = self.model.model_fields
         needed = {name for name, item in fields.items() if item.is_required()}

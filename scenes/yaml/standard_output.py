@@ -3,8 +3,6 @@
 A command that cannot write all of its results ends with an exit code that says so.
 """
 
-from __future__ import annotations
-
 import errno
 import json
 import os

@@ -8,12 +8,12 @@
 its kind, such as 20 um for a length, would be misleading for an entrance pupil.
 """
 
-from __future__ import annotations
-
+import csv
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
+from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from pydantic import BeforeValidator, GetCoreSchemaHandler, GetJsonSchemaHandler
@@ -308,57 +308,14 @@ def _number(value: object, power: int, within: KeyPath) -> float:
     return float(value)
 
 
-EXAMPLES: Mapping[str, tuple[str, ...]] = {
-    "angle": ("5 deg",),
-    "aperture": ("50 mm",),
-    "argument": ("90 deg",),
-    "back_radius": ("-0.5 m",),
-    "camera_angle": ("26 deg",),
-    "clearance": ("5 mm",),
-    "correlation": ("500 m",),
-    "diameter": ("50 mm",),
-    "distance": ("0.5 m",),
-    "elevation": ("45 deg",),
-    "entrance_pupil": ("0.6 m",),
-    "field": ("1.2 deg",),
-    "field_bias": ("6 deg",),
-    "parcel_size": ("100 m",),
-    "focal_distance": ("0.5 m",),
-    "focal_length": ("5.5 m", "10 um"),
-    "front_radius": ("0.5 m",),
-    "height": ("60 mm",),
-    "last": ("360 deg",),
-    "latitude": ("40 deg",),
-    "light": ("80 percent",),
-    "longest": ("2 km",),
-    "longitude": ("116 deg",),
-    "look": ("26 deg",),
-    "noise": ("0.1 m",),
-    "offset": ("5 mm",),
-    "pitch": ("7 um",),
-    "position": ("0.5 m",),
-    "post": ("30 m",),
-    "prism_0.shift": ("100 mm",),
-    "pupil_offset": ("220 mm",),
-    "radius": ("-2.5 m", "0.5 m"),
-    "reach": ("0.2 mm",),
-    "roads": ("500 m",),
-    "separation": ("0.24 m",),
-    "spacing": ("10 m",),
-    "spectrum": ("650 nm",),
-    "spread": ("60 mm",),
-    "step": ("20 um", "1 deg"),
-    "thickness": ("10 mm",),
-    "track": ("20 km",),
-    "velocity": ("0.1 m/s",),
-    "wavelength": ("650 nm",),
-    "white": ("80 percent",),
-    "wide": ("5 deg",),
-    "width": ("60 mm",),
-    "x": ("1.2 deg",),
-    "y": ("0.15 deg",),
-    "z": ("-2 m",),
-}
+def _examples() -> Iterator[tuple[str, tuple[str, ...]]]:
+    """Yield the keys of the table beside this module with their examples."""
+    with Path(__file__).with_suffix(".csv").open(encoding="utf-8", newline="") as stream:
+        for key, *texts in list(csv.reader(stream))[1:]:
+            yield key, tuple(filter(None, texts))
+
+
+EXAMPLES: Mapping[str, tuple[str, ...]] = FrozenMap(_examples())
 """Key, or its last two parts -> examples of its quantity; the first one within the key's limits is shown."""
 
 

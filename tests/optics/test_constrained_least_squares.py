@@ -5,7 +5,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from optics.numerics.constrained_least_squares import Sample, constrained_least_squares, violations
+from optics.design.optimiser import Sample, constrained_least_squares, violations
 
 Functions = Callable[[np.ndarray], np.ndarray]
 ROOT = np.sqrt(7.0)

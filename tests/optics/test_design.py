@@ -5,8 +5,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from optics.design.design_variables import BIAS, POSE_QUANTITIES, SHAPE, Prescription, Variable
-from optics.design.merit_function import MeritFunction, Operands, beam_axes
+from optics.design.merit_function import (
+    BIAS,
+    POSE_QUANTITIES,
+    SHAPE,
+    MeritFunction,
+    Operands,
+    Prescription,
+    Variable,
+    beam_axes,
+)
 from optics.design.optimiser import DesignError, drawn_start, search
 from scenes.models.camera_design import beams_of, camera_of, prescription_of
 from tests.tiers import quick

@@ -2,10 +2,11 @@
 
 import pytest
 
-from optics.materials.glass import FORMULAS, FUSED_SILICA, GLASSES, N_BK7, ZERODUR, CatalogueGlass, air_index, glass
+from optics.materials.glass import FORMULAS, GLASSES, CatalogueGlass, air_index, glass
 from optics.materials.material import MATERIALS, material
 
 D_LINE, E_LINE, F_LINE, C_LINE = 587.5618e-9, 546.074e-9, 486.1327e-9, 656.2725e-9
+FUSED_SILICA, N_BK7, ZERODUR = (GLASSES[name] for name in ("fused silica", "N-BK7", "Zerodur"))
 
 
 @pytest.mark.parametrize(

@@ -20,7 +20,7 @@ from optics.numerics import quadrature
 from optics.raytrace.trace import _redirect
 from optics.thermal import elastic_mesh
 from optics.thermal.elastic_mesh import polyhedron_mesh
-from optics.thermal.nodal_temperature import NodalTemperature
+from optics.thermal.nodal_deformation import NodalTemperature
 from optics.waves import optical_transfer, pupil_shadow
 from optics.waves.diffraction import PupilField
 from optics.waves.edge_shadow import outlines_on_stop

@@ -17,7 +17,7 @@ from optics.geometry.sag_terms import XYPolynomial, ZernikeSag
 from optics.geometry.surface import GridFigure, SummedFigure, Surface, ZernikeFigure, plane
 from optics.geometry.tree import Body, Motion, RigidTree, State
 from optics.geometry.vector_shape import Disk, HalfPlane, Polygon
-from optics.materials.glass import N_BK7, Glass, ThermalDispersion
+from optics.materials.glass import GLASSES, Glass, ThermalDispersion
 from optics.materials.material import TemperatureRange
 from optics.numerics.number_tree import FrozenMap, leaves, map_leaves, with_leaf
 from optics.raytrace.assembly import Assembly, Element, Interaction
@@ -164,7 +164,7 @@ VALUES = [
     (FIGURE, ZernikeFigure(0.5)),
     (SURFACE, SURFACE.with_figure(None)),
     (Element("e", "a/b", SURFACE, Interaction.REFLECT, Circle(1.0)), Element("e", "a/b", SURFACE, Interaction.PASS)),
-    (N_BK7, dataclasses.replace(N_BK7, thermal=None)),
+    (GLASSES["N-BK7"], dataclasses.replace(GLASSES["N-BK7"], thermal=None)),
     (FrozenMap({1: 2.0}), FrozenMap({1: 3.0})),
 ]
 CLASSES = (Pose, Body, Motion, ZernikeFigure, Surface, Glass, ThermalDispersion, TemperatureRange, FrozenMap)

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from optics.camera.seidel import seidel_sums
+from optics.camera.prescription import seidel_sums
 from optics.numerics.backend import Backend
 from optics.raytrace.assembly import Interaction
 from optics.raytrace.system import assemble

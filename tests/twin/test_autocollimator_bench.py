@@ -14,7 +14,7 @@ from analysis.monitor.autocollimator import exact_reading, relation_factor
 from optics.geometry.tree import Motion
 from optics.numerics.backend import Backend
 from optics.raytrace.trace import BeamMissedError
-from scenes.specs.autocollimators import AutocollimatorSetup, BenchErrorsSpec
+from scenes.specs.camera_tests import AutocollimatorSetup, BenchErrorsSpec
 from scenes.specs.load import load_autocollimator_test
 from twin.laboratory.autocollimator_bench import (
     UNITS,

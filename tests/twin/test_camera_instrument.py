@@ -17,8 +17,7 @@ from scenes.models.instrument_builder import build_instrument
 from scenes.specs.instrument import InstrumentSpec
 from scenes.specs.job import JobSpec, checked_nodes
 from scenes.specs.load import load_camera, load_instrument
-from scenes.specs.motion_text import find_node, perturbation_in_words
-from scenes.specs.perturbation import NodeInfo
+from scenes.specs.perturbation import NodeInfo, find_node, perturbation_in_words
 from scenes.specs.resolved import resolve_camera, resolve_job
 from scenes.yaml.errors import InputError, Issue, Problem
 from scenes.yaml.spec import validate

@@ -11,8 +11,7 @@ import pytest
 from optics.geometry.surface import GridFigure
 from optics.geometry.tree import Motion, compose
 from optics.thermal.heat import Temperature
-from optics.thermal.nodal_deformation import nodal_deformation
-from optics.thermal.nodal_temperature import Coverage
+from optics.thermal.nodal_deformation import Coverage, nodal_deformation
 from scenes.models.job_state import HeatedBody, HeatedFace
 from scenes.specs.instrument import MaterialsSpec
 from scenes.specs.job import JobSpec

@@ -20,9 +20,9 @@ from optics.targets.target_image import target_image
 from optics.targets.target_shapes import pinhole
 from optics.waves.diffraction import Grid
 from optics.waves.optical_transfer import TransferTable
+from scenes.specs.camera_tests import TurntableTestSpec
 from scenes.specs.load import EXAMPLES, LAB, load_named
 from scenes.specs.resolved import DistortionSetup
-from scenes.specs.turntable import TurntableTestSpec
 from scenes.yaml.errors import InputError
 from tests.tiers import quick
 from tests.twin.study_bench import REFUSED

@@ -25,8 +25,20 @@ from scenes.models.monitor_layout import (
 from tests.twin.test_monitor_layouts import FIRST, SECOND
 from twin.design import monitor_design
 from twin.design.layout_bench import FULLEST, LayoutBench, LayoutFacts, _OutsideLimitsError
-from twin.design.layout_refinement import LayoutNumber, Slope, known_of, numbers_of, refined, slope_of
-from twin.design.layout_search import Candidate, End, SearchResult, merit, optima, spread
+from twin.design.layout_search import (
+    Candidate,
+    End,
+    LayoutNumber,
+    SearchResult,
+    Slope,
+    known_of,
+    merit,
+    numbers_of,
+    optima,
+    refined,
+    slope_of,
+    spread,
+)
 from twin.framework.procedure import BenchError
 from twin.monitor.information import Information
 
@@ -267,7 +279,7 @@ def test_ends_are_told_apart_by_two_percent(bench: LayoutBench) -> None:
     found = SearchResult(LayoutFacts((FIRST,)), (), ends, 0.0)
     assert [[one.name for one in group] for group in optima(found, bench)] == [["a", "b"], ["c"], ["d"]]
     assert found.refused == {"a": 5}
-    assert (found.beams, found.feasible, found.compared, found.built) == (5, 5, 5, 5)
+    assert [found.total(name) for name in ("tried", "feasible", "compared", "built")] == [5, 5, 5, 5]
 
 
 def test_layouts_beyond_their_limits_say_which() -> None:
@@ -295,7 +307,8 @@ def test_layouts_beyond_their_limits_say_which() -> None:
 
 
 def test_a_search_without_a_layout_that_stands_is_refused(setup: MonitorDesignSetup, monkeypatch) -> None:
-    found = SimpleNamespace(layouts=(), refused={"dark": 2, "in the way": 7}, beams=5, built=4)
+    counts = {"tried": 5, "built": 4}
+    found = SimpleNamespace(layouts=(), refused={"dark": 2, "in the way": 7}, total=counts.__getitem__)
     monkeypatch.setattr(monitor_design, "LayoutBench", lambda *_: None)
     monkeypatch.setattr(monitor_design, "_check_start", lambda *_: None)
     monkeypatch.setattr(monitor_design, "Search", lambda *_: SimpleNamespace(run=lambda: found))

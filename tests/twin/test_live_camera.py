@@ -7,7 +7,7 @@ import json
 import numpy as np
 import pytest
 
-from scenes.lens.first_design import first_camera
+from scenes.lens.prescription import first_camera
 from scenes.specs.load import LIBRARY, load_camera
 from scenes.specs.resolved import resolve_camera
 from scenes.yaml.errors import InputError

@@ -16,11 +16,11 @@ from scipy.optimize import least_squares
 from typer.testing import CliRunner
 
 from analysis.focal_plane.through_focus import QUARTIC
+from scenes.specs.camera_tests import TurntableTestSpec
 from scenes.specs.load import LAB, SCENES, load_named
 from scenes.specs.orbit.setup import load_three_line_camera
 from scenes.specs.orbit.three_line_camera import LineCameraSpec
 from scenes.specs.procedures import PROCEDURES
-from scenes.specs.turntable import TurntableTestSpec
 from scenes.yaml.errors import InputError
 from twin.lab import app
 from twin.laboratory.distortion_run import DistortionRun, measure_files

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from optics.camera.telescope_types import TELESCOPES
-from scenes.lens.first_design import first_camera
+from scenes.lens.prescription import first_camera
 from scenes.models.camera_sharpness import blur_warnings
 from scenes.models.instrument_builder import build_instrument
 from scenes.specs.asbuilt import AsBuiltSetup

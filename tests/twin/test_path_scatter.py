@@ -35,12 +35,11 @@ from tests.optics.bench import unit
 from tests.optics.test_scatter_table import lambert, of_lobe
 from tests.tiers import quick
 from tests.twin.path_bench import facing, flat_mirror, frame, glass_scene, screen, slab
-from twin.path_tracing.importance_sampling import OutgoingPaths, TableSampling, sample_bsdf
+from twin.path_tracing.kernel import OutgoingPaths, TableSampling, sample_bsdf
 from twin.path_tracing.path_families import Event, decode
 from twin.path_tracing.path_result import Family, PathResult
-from twin.path_tracing.source import DiskSource, RaySource, random_streams
 from twin.path_tracing.tables import upload_finishes
-from twin.path_tracing.tracer import PathTracer, Sampling
+from twin.path_tracing.tracer import DiskSource, PathTracer, RaySource, Sampling, random_streams
 
 FALSE_ALARM = 1e-3
 N = 1_000_000

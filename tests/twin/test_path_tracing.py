@@ -28,17 +28,18 @@ from tests.tiers import quick
 from tests.twin.path_bench import IDEAL, facing, flat_mirror, glass_scene, scene_beam, screen, slab, ways_and_search
 from twin.monitor.monitor_path import MonitorPath
 from twin.path_tracing.clear_ways import ClearSegments
-from twin.path_tracing.importance_sampling import LEAST_SURVIVAL, LearnedRoulette, PathHistory, learn_survival
+from twin.path_tracing.kernel import LEAST_SURVIVAL, LearnedRoulette, PathHistory, learn_survival
 from twin.path_tracing.path_families import Event, code, nominal_codes
 from twin.path_tracing.path_result import NOMINAL, PathResult
-from twin.path_tracing.source import DiskSource, RaySource
 from twin.path_tracing.stray_light import monitor_families, pinhole, trace_stray
 from twin.path_tracing.tracer import (
     BALANCED,
     FAINT,
     LEAST_NOMINAL,
     VARIANTS,
+    DiskSource,
     PathTracer,
+    RaySource,
     Sampling,
     VariantUnavailable,
     load_mitsuba,

@@ -297,9 +297,7 @@ def test_options_of_a_command_are_checked() -> None:
 @pytest.mark.second
 def test_another_camera_of_a_test_is_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The camera that is named is the one that is measured, not that of the file."""
-    monkeypatch.setattr(
-        "twin.scripting.procedures.performed", lambda procedure, setup, *_: pytest.fail(setup.camera.name)
-    )
+    monkeypatch.setattr("twin.scripting.results.performed", lambda procedure, setup, *_: pytest.fail(setup.camera.name))
     other = tmp_path / "other.yaml"
     other.write_text((LIBRARY / "cameras/gf7.yaml").read_text("utf-8").replace("name: gf7", "name: other"), "utf-8")
     for changes, name in (({}, "gf7"), ({"camera": str(other)}, "other")):

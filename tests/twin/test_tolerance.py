@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from scenes.lens.first_design import first_camera
+from scenes.lens.prescription import first_camera
 from scenes.specs.job import checked_nodes
 from scenes.specs.load import LIBRARY
 from scenes.specs.resolved import resolve
@@ -20,14 +20,14 @@ from scenes.yaml.yaml_file import YamlFile, dump_yaml, read_yaml
 from tests.twin.study_bench import TEXTS, budget, refusals
 from twin.camera.camera_optics import CameraOptics
 from twin.monitor.monitor_experiment import MonitorExperiment
-from twin.tolerance import allocation, instrument_warnings, merit_models, samples, tolerance_report, tolerance_run
+from twin.tolerance import allocation, merit_models, samples, tolerance_report, tolerance_run
 from twin.tolerance.allocation import CostCurve
 from twin.tolerance.merit_models import MeritModel, VarianceShares, inverse_limits, sensitivities
 from twin.tolerance.monitor_merit import Merit
 from twin.tolerance.samples import Workforce, draw_samples
 from twin.tolerance.tolerance_bench import Adjustments, ToleranceBench
 from twin.tolerance.tolerance_run import MeritResult, Yield, run_tolerance, worst_jobs
-from twin.tolerance.variations import spectrum_shares, states_of, tolerance_parameters
+from twin.tolerance.variations import ParameterMaker, spectrum_shares, states_of
 
 
 @pytest.fixture(scope="module")
@@ -339,7 +339,8 @@ def test_bad_input_is_told_with_its_key(name: str, changes: dict, key: str, word
 def test_a_body_warmed_within_what_is_known_grows_by_its_expansion(bench, tmp_path) -> None:
     setup = budget(tmp_path, tolerances={"a": {"motion": "focal_plane temperature", "limit": "5 K"}})
     thermal = bench.experiment.thermal
-    (number,) = tolerance_parameters(setup, bench.instrument, thermal)
+    maker = ParameterMaker(setup.test, bench.instrument, thermal)
+    (number,) = (n for name, entry in setup.test.tolerances.items() for n in maker.tolerance(name, entry))
     grown = {body: move.shape["expansion"] for body, move in number.moves.items()}
     assert grown.keys() == {"base/gf7/focal_plane", "base/gf7/focal_plane/line"}
     assert grown == pytest.approx({body: thermal.materials[body].expansion for body in grown})
@@ -518,11 +519,9 @@ def test_cameras_have_errors_of_their_own(backend, tmp_path, monkeypatch) -> Non
 
 def test_warnings_of_instrument_and_engine_reach_the_report(backend, tmp_path, monkeypatch) -> None:
     told: list[str] = []
-    monkeypatch.setattr(instrument_warnings, "blur_warnings", lambda setup, backend: ("the camera is blurred",))
-    monkeypatch.setattr(instrument_warnings, "unmodelled_obscuration", lambda model, way: "M2 stands in its beam")
-    monkeypatch.setattr(
-        instrument_warnings, "moved_into_beams", lambda *state: ("left: M2 has moved and would take 3 rays",)
-    )
+    monkeypatch.setattr(tolerance_run, "blur_warnings", lambda setup, backend: ("the camera is blurred",))
+    monkeypatch.setattr(tolerance_run, "unmodelled_obscuration", lambda model, way: "M2 stands in its beam")
+    monkeypatch.setattr(tolerance_run, "moved_into_beams", lambda *state: ("left: M2 has moved and would take 3 rays",))
 
     def drawn(*given: Any) -> Any:
         force: Workforce = given[5]
@@ -553,7 +552,7 @@ def test_a_camera_whose_own_parts_stand_in_its_beam_is_told(backend, tmp_path) -
     setup = budget(
         tmp_path, "few", instrument=str(file), tolerances=tolerances, compensators={}, merits={"w": wavefront}
     )
-    found = instrument_warnings.instrument_warnings(setup, ToleranceBench(setup, backend))
+    found = tolerance_run.instrument_warnings(setup, ToleranceBench(setup, backend))
     assert any("the file does not model this obscuration" in text for text in found)
 
 

@@ -20,7 +20,6 @@ from tests.twin.commands import invoke
 from tests.twin.study_bench import REFUSED, write_study
 from twin.compare.__main__ import app as compare_app
 from twin.compare.folder_difference import file_difference
-from twin.compare.folder_state import folder_state
 from twin.compare.verification import (
     DIFFERENT,
     EXCLUDED,
@@ -32,6 +31,7 @@ from twin.compare.verification import (
     CannotRepeat,
     FileState,
     file_state,
+    folder_state,
     obstacle,
     redrawn,
     repeat_block,

@@ -15,8 +15,7 @@ from optics.raytrace.system import assemble
 from optics.raytrace.trace import make_rays, trace
 from tests.optics.bench import disk_points
 from tests.twin.path_bench import glass_scene, scene_beam, slab
-from twin.path_tracing.source import RaySource
-from twin.path_tracing.tracer import FAINT, PathTracer
+from twin.path_tracing.tracer import FAINT, PathTracer, RaySource
 
 RAYS = 20_000
 

@@ -24,7 +24,7 @@ from optics.numerics.array_math import PhysicalError
 from optics.numerics.number_tree import FrozenMap
 from optics.raytrace.first_order import line_tangents
 from scenes.specs import asbuilt as specs
-from scenes.specs.motion_text import find_node
+from scenes.specs.perturbation import find_node
 from scenes.specs.tolerance import MeritSpec
 from scenes.yaml.errors import InputError, Problem
 from twin.asbuilt.wavefront_files import read_coefficients

@@ -20,9 +20,9 @@ from scenes.models.disturbances import HEAT, Component, DisturbancePrior
 from scenes.models.instrument_model import Instrument
 from scenes.models.thermal_model import ThermalModel
 from scenes.specs.asbuilt import AsBuiltSpec
-from scenes.specs.motion_text import short_name
+from scenes.specs.perturbation import short_name
 from scenes.specs.tolerance import amount_si
-from twin.tolerance.variations import BodyMove, VariedParameter, actuator_parameter, heat_moves, states_of
+from twin.tolerance.variations import BodyMove, ParameterMaker, VariedParameter, heat_moves, states_of
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,7 +81,8 @@ class Parameters:
             The body of an actuator does not exist or does not allow its motion.
         """
         actuators = tuple(
-            actuator_parameter(test, instrument, thermal, name, entry) for name, entry in test.actuators.items()
+            ParameterMaker(test, instrument, thermal).compensator(name, entry, "actuators")
+            for name, entry in test.actuators.items()
         )
         names = tuple(test.actuators)
         wanted = np.zeros((len(test.moves), len(names)))

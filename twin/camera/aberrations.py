@@ -9,9 +9,9 @@ import numpy as np
 
 from analysis.arrays import shows
 from optics.camera.ghosts import DETECTOR, PUPIL, Ghost, trace_ghosts
-from optics.camera.seidel import SeidelSums, seidel_sums
+from optics.camera.prescription import SeidelSums, seidel_sums
 from optics.numerics.backend import Backend
-from optics.waves.sampled_psf import encircled_energy, ensquared_energy
+from optics.waves.imaging import encircled_energy, ensquared_energy
 from scenes.models.camera_model import IMAGE, CameraModel, field_direction
 from twin.camera.camera_optics import CameraOptics
 from twin.camera.camera_results import Field

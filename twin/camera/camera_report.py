@@ -9,7 +9,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from optics.camera.ghosts import DETECTOR
-from optics.camera.seidel import ABERRATIONS
+from optics.camera.prescription import ABERRATIONS
 from optics.geometry import zernike
 from scenes.models.camera_design import file_with_plane
 from scenes.models.camera_sharpness import FIELDS, field_text

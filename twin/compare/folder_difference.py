@@ -5,8 +5,6 @@ excluded. `file_difference` lists every number, text and array that is not equal
 ``twin.verify`` decide which of these count.
 """
 
-from __future__ import annotations
-
 import csv
 import io
 import json
@@ -232,25 +230,19 @@ def content_difference(name: str, reference: Content, other: Content) -> FileDif
     """
     reference_numbers, other_numbers = reference.numbers, other.numbers
     scales = _scales(reference_numbers, other_numbers)
-    numbers = [
-        NumberDifference(
-            name,
-            key,
-            reference_numbers.get(key),
-            other_numbers.get(key),
-            *sigma_of(reference_numbers, other_numbers, key),
-            scales.get(_quantity_kind(key), 0.0),
-        )
-        for key in dict.fromkeys((*reference_numbers, *other_numbers))
-        if not (key in reference_numbers and key in other_numbers and _same(reference_numbers[key], other_numbers[key]))
-    ]
+    numbers = []
+    for key in dict.fromkeys((*reference_numbers, *other_numbers)):
+        here, there = reference_numbers.get(key), other_numbers.get(key)
+        if not (key in reference_numbers and key in other_numbers and _same(here, there)):
+            sigma, scale = sigma_of(reference_numbers, other_numbers, key), scales.get(_quantity_kind(key), 0.0)
+            numbers.append(NumberDifference(name, key, here, there, *sigma, scale))
     pairs = {key: (reference.arrays.get(key), other.arrays.get(key)) for key in (*reference.arrays, *other.arrays)}
     arrays = [off for key, pair in pairs.items() if (off := array_difference(name, key, *pair)) is not None]
-    here, there = reference.statements, other.statements
+    before, after = reference.statements, other.statements
     statements = [
-        NumberDifference(name, key, here.get(key), there.get(key))
-        for key in dict.fromkeys((*here, *there))
-        if here.get(key) != there.get(key)
+        NumberDifference(name, key, before.get(key), after.get(key))
+        for key in dict.fromkeys((*before, *after))
+        if before.get(key) != after.get(key)
     ]
     common = (len(reference_numbers.keys() & other_numbers.keys()), len(reference.arrays.keys() & other.arrays.keys()))
     return FileDifference(name, tuple(numbers), tuple(arrays), tuple(statements), *common, reference.drawn)

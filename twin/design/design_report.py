@@ -1,15 +1,12 @@
 """Report of an optimised camera: numbers before and after, layout, wavefront error over the field, and its new file."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from optics.design.design_variables import Prescription
-from optics.design.merit_function import Evaluation, trace_beams
+from optics.design.merit_function import Evaluation, Prescription, trace_beams
 from optics.design.optimiser import Attempt, Design, rms_error
 from scenes.models.camera_design import prescription_of
 from twin.design.design_run import DESIGN, DesignRun, difference_text, verdict
@@ -39,10 +36,7 @@ def design_report(run: DesignRun) -> Report:
         "Wavefront error by field",
         "Waves rms, piston and tilt removed; the other half of the field is the mirror image.",
         ("x [deg]", "y [deg]", "before", "after"),
-        [
-            [float(x), float(y), float(b), float(a)]
-            for (x, y), b, a in zip(fields, before.errors, after.errors, strict=True)
-        ],
+        np.column_stack([fields, before.errors, after.errors]).tolist(),
         (3, 3, 4, 4),
     )
     changed = Table(

@@ -1,27 +1,14 @@
 """Optimisation of a camera's optical prescription from several starts with exact Jacobians, and its result file."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
 
-from optics.design.design_variables import Prescription
-from optics.design.merit_function import Evaluation, MeritFunction, Operands, trace_beams
-from optics.design.optimiser import (
-    HELD,
-    ITERATIONS,
-    SAME,
-    ActiveConstraint,
-    Attempt,
-    Design,
-    DesignError,
-    Search,
-    rms_error,
-    search,
-)
+from optics.design import optimiser
+from optics.design.merit_function import Evaluation, MeritFunction, Operands, Prescription, trace_beams
 from optics.numerics.backend import Backend
 from optics.raytrace.aim import AimError
 from optics.raytrace.trace import BeamMissedError
@@ -69,12 +56,12 @@ class DesignRun:
     """
 
     setup: camera_design.CameraDesignSetup
-    searched: Search
+    searched: optimiser.Search
     text: str
     warnings: tuple[str, ...] = ()
 
     @property
-    def best(self) -> Design:
+    def best(self) -> optimiser.Design:
         """Design of smallest wavefront error among all starts, with the prescription before and after."""
         return self.searched.best
 
@@ -111,18 +98,11 @@ def run_design(
         raise camera.error(problem, ("mirrors",), allowed="a camera whose whole field gets light") from error
     operands = camera_design.operands_of(setup, first.principal_distance, first.envelope)
     try:
-        searched = search(
-            backend,
-            start,
-            camera_design.variables_of(test),
-            beams,
-            operands,
-            test.steps,
-            test.starts,
-            seed,
-            advance=lambda done, total: advance("optimise", done, total),
+        variables, show = camera_design.variables_of(test), partial(advance, "optimise")
+        searched = optimiser.search(
+            backend, start, variables, beams, operands, test.steps, test.starts, seed, advance=show
         )
-    except DesignError as error:
+    except optimiser.DesignError as error:
         key = next((_KEYS[kind] for kind in error.violated if kind in _KEYS), ("vary",))
         remedies = [_REMEDIES[kind] for kind in _REMEDIES if kind in error.violated]
         least = float(MeritFunction.of(backend, start, beams, operands).evaluate(start).clearances.min(initial=np.inf))
@@ -151,7 +131,7 @@ def run_design(
     return DesignRun(setup, searched, spec.file_text(remark), tuple(warnings))
 
 
-def _known(of: Callable[[Design], Any]) -> Callable[[Attempt], Any]:
+def _known(of: Callable[[optimiser.Design], Any]) -> Callable[[optimiser.Attempt], Any]:
     """Return a function that takes a number from the design reached from a start; None if none was reached."""
     return lambda attempt: None if attempt.design is None else of(attempt.design)
 
@@ -172,11 +152,11 @@ def _chief_rays(run: DesignRun) -> dict[str, np.ndarray]:
     return {"before": angles(design.initial), "after": angles(design.prescription)}
 
 
-def _anamorphism(held: ActiveConstraint) -> bool:
+def _anamorphism(held: optimiser.ActiveConstraint) -> bool:
     return held.name.startswith("anamorphism")
 
 
-HELD_BY: Record[ActiveConstraint] = Record(
+HELD_BY: Record[optimiser.ActiveConstraint] = Record(
     "An active constraint, which limits the camera.",
     Quantity("constraint", lambda held: held.name, "its name"),
     Quantity("limit_m", lambda held: None if _anamorphism(held) else held.limit, "its limit"),
@@ -189,11 +169,11 @@ HELD_BY: Record[ActiveConstraint] = Record(
         converted=False,
     ),
 )
-START: Record[Attempt] = Record(
+START: Record[optimiser.Attempt] = Record(
     "One start of the search and its result.",
     Quantity("drawn", lambda attempt: attempt.drawn, "true if it was drawn at random"),
     Quantity("steps", lambda attempt: attempt.steps, "steps in which the constraints were brought in"),
-    Quantity("wfe_rms_waves", _known(lambda optimised: rms_error(optimised.after)), "rms over the field"),
+    Quantity("wfe_rms_waves", _known(lambda optimised: optimiser.rms_error(optimised.after)), "rms over the field"),
     Quantity("wfe_worst_waves", _known(lambda optimised: optimised.after.errors.max()), "rms in the worst field"),
     Quantity("converged", lambda a: a.design is not None and a.design.converged, "true if the search converged"),
     Quantity("jacobians", _known(lambda optimised: optimised.evaluations), "Jacobians that were traced"),
@@ -202,7 +182,9 @@ START: Record[Attempt] = Record(
 
 
 def _unsettled(run: DesignRun) -> str:
-    return f"the search for {run.setup.test.name} had not converged when it ended, after {ITERATIONS} iterations"
+    return (
+        f"the search for {run.setup.test.name} had not converged when it ended, after {optimiser.ITERATIONS} iterations"
+    )
 
 
 DESIGN: Record[DesignRun] = Record(
@@ -236,11 +218,11 @@ def difference_text(run: DesignRun) -> str:
     failed = sum(attempt.design is None for attempt in searched.attempts)
     unheld = f", {failed} cannot hold the constraints" if failed else ""
     if not searched.local:
-        return f"All {count} starts end within {100 * SAME:g} % of the best"
+        return f"All {count} starts end within {100 * optimiser.SAME:g} % of the best"
     worst = max(attempt.error for attempt in searched.attempts if attempt.design is not None)
     return (
         f"A local optimum: of {count} starts {searched.agreeing} "
-        f"{'ends' if searched.agreeing == 1 else 'end'} within {100 * SAME:g} % of the best, others at up to "
+        f"{'ends' if searched.agreeing == 1 else 'end'} within {100 * optimiser.SAME:g} % of the best, others at up to "
         f"{worst:.4f} waves{unheld}"
     )
 
@@ -249,11 +231,12 @@ def verdict(run: DesignRun) -> str:
     """Return one or two sentences on whether the camera has improved, and which constraints limit it."""
     design, start, name = run.best, run.setup.camera.name, run.setup.test.name
     across = design.before.distance_across
-    errors = f"{rms_error(design.after):.4f} waves rms over the field ({rms_error(design.before):.4f} in {start})"
+    before, after = (f"{optimiser.rms_error(evaluation):.4f}" for evaluation in (design.before, design.after))
+    errors = f"{after} waves rms over the field ({before} in {start})"
     held = tuple(
         constraint
         for constraint in design.active
-        if 1e-3 * constraint.sensitivity > LEAST_BENEFIT * rms_error(design.after)
+        if 1e-3 * constraint.sensitivity > LEAST_BENEFIT * optimiser.rms_error(design.after)
     )
     if design.improved:
         text = f"Improved: {name} has a wavefront error of {errors}"
@@ -263,7 +246,7 @@ def verdict(run: DesignRun) -> str:
     return f"Not improved: no variable makes {start} better; {name} has a wavefront error of {errors}."
 
 
-def _held_text(held: tuple[ActiveConstraint, ...], start: str, across: float) -> str:
+def _held_text(held: tuple[optimiser.ActiveConstraint, ...], start: str, across: float) -> str:
     """Return a text on the constraints that cost most, at most three, each with its cost in wavefront error.
 
     Parameters
@@ -282,7 +265,7 @@ def _held_text(held: tuple[ActiveConstraint, ...], start: str, across: float) ->
         if _anamorphism(constraint):
             limit, step, unit = f"{100 * constraint.limit:.4g} %", 1e-2 * across, "%"
         text = f"the {constraint.name} ({limit}"
-        if constraint.start > HELD:
+        if constraint.start > optimiser.HELD:
             text += f", violated by {start} by {constraint.start / step:.3g} {unit}"
         parts.append(f"{text}; easing it by 1 {unit} reduces the error by {step * constraint.sensitivity:.2g} waves)")
     return " and ".join(parts)

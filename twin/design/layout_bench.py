@@ -7,8 +7,6 @@ so that thousands of combinations are compared without a trace. The best ones ar
 facets in one block and adjacent prisms.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property, lru_cache
@@ -297,15 +295,8 @@ class LayoutBench:
             precision.
         """
         priors = self.setup.disturbances
-        results = information_of(
-            instrument,
-            list(priors.values()),
-            self.detector(beam.area_ccd),
-            self.backend,
-            ground_of(instrument),
-            alike,
-            single,
-        )
+        detector, ground = self.detector(beam.area_ccd), ground_of(instrument)
+        results = information_of(instrument, [*priors.values()], detector, self.backend, ground, alike, single)
         return dict(zip(priors, results, strict=True))
 
     def _check_limits(self, share: float, mass: float) -> None:

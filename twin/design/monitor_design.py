@@ -3,8 +3,6 @@
 A layout's merit is its largest ratio of a standard deviation to its goal.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from math import sqrt
@@ -126,7 +124,7 @@ def run_monitor_design(
     results = Search(bench, workers, seed, journal, advance).run()
     if not results.layouts:
         most = max(results.refused.items(), key=lambda item: item[1], default=("", 0))
-        text = f"none of {results.beams} beams and {results.built} layouts is feasible"
+        text = f"none of {results.total('tried')} beams and {results.total('built')} layouts is feasible"
         raise BenchError(
             f"{text}; most frequent reason ({most[1]} times): {most[0]}",
             ("vary",),
@@ -329,10 +327,10 @@ LAYOUT: Record[_Part] = Record(
 )
 SEARCH: Record[SearchResult] = Record(
     "Extent of the search.",
-    Quantity("beams_tried", lambda search: search.beams, "beams that were evaluated alone"),
-    Quantity("beams_feasible", lambda search: search.feasible, "feasible ones of these"),
-    Quantity("layouts_compared", lambda search: search.compared, "combinations whose merit was computed"),
-    Quantity("layouts_built", lambda search: search.built, "those of these that were built as a whole"),
+    Quantity("beams_tried", lambda search: search.total("tried"), "beams that were evaluated alone"),
+    Quantity("beams_feasible", lambda search: search.total("feasible"), "feasible ones of these"),
+    Quantity("layouts_compared", lambda search: search.total("compared"), "combinations whose merit was computed"),
+    Quantity("layouts_built", lambda search: search.total("built"), "those of these that were built as a whole"),
     Quantity("layouts_feasible", lambda search: len(search.layouts), "feasible ones of these"),
     Quantity("refused", lambda search: search.refused, "reasons why others are not feasible, with their numbers"),
 )

@@ -1,7 +1,5 @@
 """Report of a search for a monitor's layout: Pareto front, limiting causes, drawings and the instruments' files."""
 
-from __future__ import annotations
-
 from math import sqrt
 
 import numpy as np
@@ -30,16 +28,9 @@ def monitor_design_report(run: MonitorDesignRun) -> Report:
     setup, results = run.setup, run.results
     start, test = setup.instrument.name, setup.test
     rows = [_row(run, start, results.start), *(_row(run, point.name, point.facts) for point in run.points)]
-    heads = (
-        "layout",
-        "beams per end",
-        *(f"{GOAL_NAMES[g]}, σ [{unit_for_reports(UNITS[g][0])}]" for g in test.goal.wanted),
-        "worst σ / goal",
-        "pupil [%]",
-        "prisms [kg]",
-        "glass path [m]",
-        "spots, σ [px]",
-    )
+    goals = (f"{GOAL_NAMES[g]}, σ [{unit_for_reports(UNITS[g][0])}]" for g in test.goal.wanted)
+    costs = ("worst σ / goal", "pupil [%]", "prisms [kg]", "glass path [m]", "spots, σ [px]")
+    heads = ("layout", "beams per end", *goals, *costs)
     goal_decimals = [
         decimals_for(min(run.worst(f, g) for _, f in _named(run)) / UNITS[g][1], 3) for g in test.goal.wanted
     ]
@@ -93,9 +84,10 @@ def _row(run: MonitorDesignRun, name: str, facts: LayoutFacts) -> list[str | int
 
 def _search_text(run: MonitorDesignRun) -> str:
     results = run.results
+    tried, feasible, compared, built = map(results.total, ("tried", "feasible", "compared", "built"))
     text = (
-        f"{results.beams} beams were evaluated alone, of which {results.feasible} are feasible; {results.compared} "
-        f"combinations were compared and {results.built} built as a whole, {len(results.layouts)} of them feasible."
+        f"{tried} beams were evaluated alone, of which {feasible} are feasible; {compared} combinations were compared "
+        f"and {built} built as a whole, {len(results.layouts)} of them feasible."
     )
     refused = sorted(results.refused.items(), key=lambda item: -item[1])[:3]
     if refused:

@@ -1,7 +1,5 @@
 """Shared parts of the commands: options, exit codes, error messages in one sentence, and a clean end on signals."""
 
-from __future__ import annotations
-
 import errno
 import math
 import signal

@@ -334,16 +334,8 @@ def tiff(frames: np.ndarray, facts: FrameFacts) -> bytes | memoryview:
     with tifffile.TiffWriter(stream) as file:
         for k, frame in enumerate(frame for _, part in parts(frames) for frame in part):
             about = json.dumps(facts.page(k))
-            file.write(
-                frame,
-                photometric="minisblack",
-                contiguous=False,
-                description=about,
-                metadata=None,
-                software=WRITER,
-                extratags=tags,
-                **scale,
-            )
+            texts = {"description": about, "metadata": None, "software": WRITER, "extratags": tags}
+            file.write(frame, photometric="minisblack", contiguous=False, **texts, **scale)
     return stream.contents() if isinstance(stream, FileBuffer) else stream.getvalue()
 
 

@@ -5,8 +5,6 @@ that must be reliable is therefore written through (``fsync``) before the name t
 folder, a folder before it is renamed, and its parent folder afterwards.
 """
 
-from __future__ import annotations
-
 import ctypes
 import errno
 import os

@@ -5,8 +5,6 @@ until they are released; the reductions here release them after every part. Sums
 depend on the parts.
 """
 
-from __future__ import annotations
-
 import io
 import math
 import mmap

@@ -3,8 +3,6 @@
 The installed packages can be compared with these lists.
 """
 
-from __future__ import annotations
-
 import importlib.metadata
 import re
 from collections.abc import Iterable

@@ -5,8 +5,6 @@ A job that can need more than 2 GiB is estimated at its start, from its numbers 
 started program, and are within a factor of 1.5 of the memory used (tests/limits).
 """
 
-from __future__ import annotations
-
 import math
 import os
 import re

@@ -6,8 +6,6 @@ it replaces) and ``.NAME.TOKEN.lock``, which the process holds locked as long as
 the lock when the process ends, however it ends; a name without a held lock therefore belongs to no process.
 """
 
-from __future__ import annotations
-
 import fcntl
 import hashlib
 import os

@@ -8,8 +8,6 @@ nothing else: no other file, network, form or script.
 can change the look of a page, but load nothing.
 """
 
-from __future__ import annotations
-
 import base64
 import hashlib
 import re

@@ -1,7 +1,5 @@
 """Independent numbered random streams of one seed: numbers drawn from one stream do not depend on the others."""
 
-from __future__ import annotations
-
 import numpy as np
 
 

@@ -8,8 +8,6 @@ The file reference_frames.json has, for every kind of file, the version of its k
 renamed or change their meaning), and quantity -> reference. A word in braces stands for one of the file's phrases.
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Mapping
 from importlib.resources import files

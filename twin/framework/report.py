@@ -1,7 +1,5 @@
 """Parts of a test's report (tables, sections with figures, images), and sections added by extensions."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace

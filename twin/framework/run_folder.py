@@ -517,7 +517,7 @@ def reason(error: OSError) -> str:
 
 
 JOURNAL = ".journal"
-"""Extension of a file with finished pieces of work, see `twin.framework.journal`."""
+"""Extension of a file with finished pieces of work, see `twin.framework.durable`."""
 _KEPT = re.compile(rf"{re.escape(owned_files.KEPT_LOCK)}|[^/]+{re.escape(JOURNAL)}|{PARTIAL_NAME}")
 """Pattern of the names of files that commands keep in a folder of intermediate results."""
 

@@ -51,7 +51,7 @@ from optics.raytrace.system import SystemBatch, assemble
 from optics.raytrace.trace import BeamMissedError, Traced, make_rays, require_rays, trace
 from optics.waves.diffraction import Grid, PixelResponse, PupilField, UnsampledImageError, image
 from optics.waves.imaging import eikonal
-from scenes.specs.autocollimators import AutocollimatorSetup, AutocollimatorTestSpec, LensSpec
+from scenes.specs.camera_tests import AutocollimatorSetup, AutocollimatorTestSpec, LensSpec
 from twin.sensors.area_detector import EmvaDetector, FixedPattern
 
 BENCH = "bench"

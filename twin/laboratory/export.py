@@ -14,7 +14,7 @@ import numpy as np
 from analysis.turntable.dividing_error import CalibrationSeries
 from optics.numerics.number_tree import FrozenMap
 from scenes.specs import camera_tests
-from scenes.specs.turntable import MeasuredTurntableSpec, TurntableFiles, TurntableTestSpec
+from scenes.specs.camera_tests import MeasuredTurntableSpec, TurntableFiles, TurntableTestSpec
 from scenes.yaml.spec import Spec
 from scenes.yaml.yaml_file import dump_yaml
 from twin.framework.data_files import FrameFacts, csv_table, tiff

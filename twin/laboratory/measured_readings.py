@@ -16,8 +16,7 @@ from analysis.arrays import Array
 from analysis.orientation.interior import CALIBRATED, Spots
 from analysis.turntable.dividing_error import CalibrationSeries, covered, gaps
 from optics.numerics.number_tree import FrozenMap
-from scenes.specs.camera_tests import DistortionFiles
-from scenes.specs.turntable import TurntableFiles
+from scenes.specs.camera_tests import DistortionFiles, TurntableFiles
 from scenes.yaml.csv_table import Column, Table, read_table
 from scenes.yaml.errors import InputError, Issue
 from scenes.yaml.input_file import digest_of

@@ -11,7 +11,7 @@ from scipy.stats import chi2
 
 from analysis.arrays import ARCSEC
 from analysis.turntable.dividing_error import covered, gaps
-from scenes.specs.turntable import MeasuredTurntableSpec
+from scenes.specs.camera_tests import MeasuredTurntableSpec
 from scenes.yaml.units import ANGLE, format_quantity
 from twin.framework import svg
 from twin.framework.artefact import Artefact, DecimalNumber, SvgFigure, Table

@@ -40,8 +40,8 @@ from analysis.turntable.dividing_error import (
 )
 from optics.numerics.backend import Backend, one_blas_thread
 from optics.numerics.number_tree import FrozenMap
+from scenes.specs.camera_tests import DividingErrorSpec, MeasuredTurntableSpec, TurntableFiles, TurntableTestSpec
 from scenes.specs.resolved import ExperimentSetup
-from scenes.specs.turntable import DividingErrorSpec, MeasuredTurntableSpec, TurntableFiles, TurntableTestSpec
 from twin.framework.procedure import Advance, silent
 from twin.framework.random_streams import stream
 from twin.framework.record import Quantity, Record

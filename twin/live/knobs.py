@@ -325,7 +325,7 @@ def _fixed(factor: FactorSpec, scalar: Any) -> FactorSpec:
 def _factor(name: str, factor: FactorSpec, setup: StudySetup) -> FactorKnob | None:
     """Return the knob for a factor of a study; None if the factor is not numeric."""
     numbers = factor.numbers()
-    if not numbers.numeric or not len(numbers):
+    if not numbers.numeric or not numbers.values:
         return None
     unit = numbers.unit or ""
     values = list(numbers.values)

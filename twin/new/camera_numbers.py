@@ -1,7 +1,5 @@
 """Numbers that a new file takes from its camera: bodies, diffraction limit, depth of focus, room for a monitor."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -10,7 +8,7 @@ from math import atan, copysign, degrees, isfinite, sqrt, tan
 
 import numpy as np
 
-from optics.camera.seidel import paraxial_ray
+from optics.camera.prescription import paraxial_ray
 from optics.numerics.number_tree import FrozenMap
 from scenes.specs.camera import CameraSpec, MirrorSpec
 from scenes.yaml.errors import InputError, Issue
@@ -119,24 +117,9 @@ class CameraNumbers:
         return tuple(out)
 
     @property
-    def single(self) -> bool:
-        """True if the camera has one element only."""
-        return len(self.elements) == 1
-
-    @property
     def moved(self) -> tuple[OpticalElement, ...]:
         """Elements whose rigid motions count: all but the first, which is the datum, unless it is the only one."""
-        return self.elements[0 if self.single else 1 :]
-
-    @property
-    def moved_faces(self) -> tuple[str, ...]:
-        """Bodies of `moved`."""
-        return tuple(name for one in self.moved for name in one.bodies)
-
-    @property
-    def face_names(self) -> tuple[str, ...]:
-        """Bodies of all faces."""
-        return tuple(face.name for face in self.faces)
+        return self.elements[0 if len(self.elements) == 1 else 1 :]
 
     @staticmethod
     def shift_key(element: OpticalElement, axis: int) -> str:
@@ -146,14 +129,10 @@ class CameraNumbers:
         keys = (f"[job, perturb, {name}, shift, {axis}]" for name in element.bodies)
         return f"keys: [{', '.join(keys)}]"
 
-    def bodies(self, names: Iterable[str]) -> str:
-        """Return the whole paths of bodies as a list in a file."""
-        return f"[{', '.join(f'base/{self.mounted}/{name.removeprefix(self.prefix)}' for name in names)}]"
-
-    @property
-    def worst_text(self) -> str:
-        """Wavefront error of the design, with three digits."""
-        return f"{self.worst:.3g}"
+    def bodies(self, elements: Iterable[OpticalElement]) -> str:
+        """Return the whole paths of the bodies of elements as a list in a file."""
+        names = (name.removeprefix(self.prefix) for element in elements for name in element.bodies)
+        return f"[{', '.join(f'base/{self.mounted}/{name}' for name in names)}]"
 
     @property
     def requirement(self) -> str:
@@ -168,16 +147,6 @@ class CameraNumbers:
     def figure(self) -> str:
         """Figure tolerance of a hundredth of a wave rms, about a twentieth peak to valley."""
         return _rounded(0.01 * self.camera.wavelength)
-
-    @property
-    def radius_limit(self) -> str:
-        """Tolerance `RADIUS` of a radius."""
-        return f"{1e6 * RADIUS:g} ppm"
-
-    @property
-    def index_limit(self) -> str:
-        """Tolerance `INDEX` of a refractive index."""
-        return f"{INDEX:.1e}"
 
     @property
     def _depth(self) -> float:

@@ -1,7 +1,5 @@
 """Text of a new file: its template, filled with the numbers of a camera and checked by the model of its kind."""
 
-from __future__ import annotations
-
 import json
 import os
 import re
@@ -21,7 +19,7 @@ from scenes.yaml.errors import InputError, Issue, Problem
 from scenes.yaml.spec import validate
 from scenes.yaml.units import split_quantity
 from scenes.yaml.yaml_file import parse_yaml
-from twin.new.camera_numbers import CameraNumbers
+from twin.new.camera_numbers import INDEX, RADIUS, CameraNumbers
 
 
 def numbers_of(reference: str, folder: Path) -> CameraNumbers:
@@ -37,16 +35,9 @@ def numbers_of(reference: str, folder: Path) -> CameraNumbers:
     mounted, site = next(iter(instrument.cameras.items()))
     camera = resolved.cameras[site.camera]
     alone = len(instrument.cameras) == 1
-    return CameraNumbers(
-        camera,
-        reference_from(reference, folder),
-        instrument.name,
-        mounted,
-        "" if alone else f"{mounted}/",
-        instrument.monitor is not None,
-        sharpness(camera, backend).worst,
-        bool(derive_camera(camera, backend).first_order.scale[0, 0, 0] < 0.0),
-    )
+    names = (reference_from(reference, folder), instrument.name, mounted, "" if alone else f"{mounted}/")
+    upright = bool(derive_camera(camera, backend).first_order.scale[0, 0, 0] < 0.0)
+    return CameraNumbers(camera, *names, instrument.monitor is not None, sharpness(camera, backend).worst, upright)
 
 
 def reference_from(reference: str, folder: Path) -> str:
@@ -81,7 +72,7 @@ def checked_text(kind: str, numbers: CameraNumbers, values: Mapping[str, str]) -
     environment.filters["times"] = _times
     template = environment.get_template(f"{kind}.yaml.j2")
     try:
-        text = template.render(n=numbers, nested=kind == "operation", **values)
+        text = template.render(n=numbers, index=INDEX, radius=RADIUS, nested=kind == "operation", **values)
     except Problem as problem:  # an option that is no quantity
         raise InputError(Issue(problem.problem, found=problem.found, allowed=problem.allowed)) from None
     model = next(file_kind for file_kind in file_kinds() if file_kind.name == kind).model

@@ -12,6 +12,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
+from operator import itemgetter
 
 import numpy as np
 from scipy.spatial import ConvexHull
@@ -221,17 +222,12 @@ def _shortest(choices: Sequence[Sequence[Patch]]) -> list[Patch]:
         return []
     lines: list[tuple[float, list[Patch]]] = [(0.0, [patch]) for patch in choices[0]]
     for patches in choices[1:]:
-        lines = [
-            min(
-                (
-                    (length + float(np.linalg.norm(patch.middle - line[-1].middle)), [*line, patch])
-                    for length, line in lines
-                ),
-                key=lambda one: one[0],
-            )
-            for patch in patches
-        ]
-    return min(lines, key=lambda one: one[0])[1]
+        longer = (
+            [(length + float(np.linalg.norm(end.middle - line[-1].middle)), [*line, end]) for length, line in lines]
+            for end in patches
+        )
+        lines = [min(candidates, key=itemgetter(0)) for candidates in longer]
+    return min(lines, key=itemgetter(0))[1]
 
 
 def _faces(patch: Patch, other: Patch, side: float) -> bool:

@@ -1,7 +1,5 @@
 """Events of a path at surfaces, and families of paths that met the same surfaces in the same order."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from dataclasses import dataclass
 from enum import IntEnum

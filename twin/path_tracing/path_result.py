@@ -3,8 +3,6 @@
 The module also has the arrays that the kernel writes to, and the sum over the launches of a run.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any

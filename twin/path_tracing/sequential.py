@@ -20,13 +20,12 @@ from optics.geometry.surface import SurfaceNumbers
 from optics.materials.fresnel_scatter import Finish
 from optics.numerics.backend import Backend
 from scenes.models.scenery import Scenery
+from twin.path_tracing import kernel
 from twin.path_tracing import tables as layout
 from twin.path_tracing.clear_ways import Patch
-from twin.path_tracing.importance_sampling import LearnedRoulette, sample_scattering
-from twin.path_tracing.kernel import Features, Launch, Limits, PreparedScene, choose, shares
+from twin.path_tracing.kernel import LearnedRoulette, sample_scattering
 from twin.path_tracing.path_families import Event, code, decode, signature
 from twin.path_tracing.path_result import Accumulators, Arrival, record
-from twin.path_tracing.surface_intersection import Flight, Intersection, locate
 
 GROUP = 4
 """Number of consecutive surfaces between two tests of whether any path processed together is still active."""
@@ -191,7 +190,7 @@ class NominalPart:
         Number of steps of the random generator still to be taken, by the surfaces passed.
     """
 
-    launch: Launch
+    launch: kernel.Launch
     passed: Any
     reason: Any
     draws: tuple[int, ...]
@@ -204,10 +203,10 @@ class NominalPart:
 
 
 def trace_nominal(
-    prepared: PreparedScene,
-    features: Features,
-    limits: Limits,
-    launch: Launch,
+    prepared: kernel.PreparedScene,
+    features: kernel.Features,
+    limits: kernel.Limits,
+    launch: kernel.Launch,
     accumulators: Accumulators,
     steps: Sequence[Step],
 ) -> NominalPart:
@@ -249,9 +248,9 @@ def trace_nominal(
 class _NominalTracer:
     """Scene, limits and accumulators that the trace along the nominal path needs at every surface."""
 
-    prepared: PreparedScene
-    features: Features
-    limits: Limits
+    prepared: kernel.PreparedScene
+    features: kernel.Features
+    limits: kernel.Limits
     path: Any
     accumulators: Accumulators
     steps: Sequence[Step]
@@ -287,7 +286,7 @@ class _NominalTracer:
         q, longer = dr.fma(d, at.distance, p), dr.fma(at.distance, before, length)
         step_features = replace(features, bare=step.finish.bare and not step.total, measured=False)
         inside = backend.Bool(step.body > 0)
-        shared = shares(scene, step_features, backend.UInt(step.row), arrives, at, inside, before)
+        shared = kernel.shares(scene, step_features, backend.UInt(step.row), arrives, at, inside, before)
         generator = type(rng)(rng)
         generator.state = rng_state
         new_weight, as_nominal = weight * shared.continuing, backend.Bool(True)
@@ -295,7 +294,7 @@ class _NominalTracer:
         if features.branching:
             if step.chooses:
                 generator.state, pending = advanced(generator.state, rng.inc, pending), 0
-                chosen = choose(shared, weight, self.limits.floors[0], generator, arrives)
+                chosen = kernel.choose(shared, weight, self.limits.floors[0], generator, arrives)
                 new_weight, usual = chosen.weight, ~chosen.unlikely
                 as_nominal = chosen.through if step.event == Event.TRANSMIT else chosen.reflecting
             else:
@@ -326,16 +325,8 @@ class _NominalTracer:
         # the loop handles paths that do not follow nominal light
         reason = dr.select(on & ~continues & ~(arrives & ~as_nominal), MISSED, reason)
         if step.ends:
-            return (
-                p,
-                d,
-                weight,
-                length,
-                rng_state,
-                passed,
-                dr.select(continues, ENDED, reason),
-                continues & False,
-            ), pending
+            ended = dr.select(continues, ENDED, reason)
+            return (p, d, weight, length, rng_state, passed, ended, continues & False), pending
         turned = dr.fma(at.normal, -2.0 * at.cosine, d)
         if step.event == Event.TRANSMIT:
             bent = dr.copysign(shared.bent, at.cosine)
@@ -346,7 +337,7 @@ class _NominalTracer:
         )
         return (*new, reason, continues), pending
 
-    def _meet(self, number: int, numbers: Any, p: Any, d: Any, on: Any) -> tuple[Intersection, Any]:
+    def _meet(self, number: int, numbers: Any, p: Any, d: Any, on: Any) -> tuple[kernel.Intersection, Any]:
         """Return the intersection of paths with a step's surface, and the mask of those that follow nominal light."""
         import drjit as dr
 
@@ -361,8 +352,8 @@ class _NominalTracer:
             intersection = prepared.scene.ray_intersect_preliminary(ray, coherent=True, active=on)
             near = backend.Float(intersection.t) + ahead
             met = on & intersection.is_valid() & (backend.UInt(intersection.shape_index) == step.surface)
-        flight = Flight(p, d, None, None, on, None, None, False)
-        at = locate(backend, numbers, step.form, flight, near, backend.UInt(step.surface))
+        flight = kernel.Flight(p, d, None, None, on, None, None, False)
+        at = kernel.locate(backend, numbers, step.form, flight, near, backend.UInt(step.surface))
         # a path in the open skips surfaces closer than the start of its search
         least = backend.Float(0.0) if step.body else 0.5 * ahead
         met = met & at.exact & (at.distance > least) & (at.first, at.second)[step.aperture]
@@ -388,7 +379,7 @@ def _jump(steps: int) -> tuple[int, int]:
 class OneSurface:
     """Numbers of a single surface that all paths meet, with the interface of ``tables.SceneTables``."""
 
-    prepared: PreparedScene
+    prepared: kernel.PreparedScene
     step: Step
     measured: None = None
 
@@ -502,7 +493,7 @@ class Departures:
         return cls(passed, turned, chosen, probabilities[chosen])
 
 
-def continue_paths(backend: Backend, steps: Sequence[Step], stretch: NominalPart, left: Departures) -> Launch:
+def continue_paths(backend: Backend, steps: Sequence[Step], stretch: NominalPart, left: Departures) -> kernel.Launch:
     """Return the chosen paths at the point where they have left the nominal path."""
     import drjit as dr
 
@@ -520,7 +511,7 @@ def continue_paths(backend: Backend, steps: Sequence[Step], stretch: NominalPart
     factor, shift = (by_place(UInt64, [jump[k] for jump in jumps]) for k in range(2))
     rng = dr.gather(type(launch.rng), launch.rng, chosen)
     rng.state = rng.state * factor + rng.inc * shift
-    return Launch(
+    return kernel.Launch(
         dr.gather(backend.Vector3, launch.position, chosen),
         dr.gather(backend.Vector3, launch.direction, chosen),
         dr.gather(Float, launch.weight, chosen) / backend.opaque(left.probabilities),

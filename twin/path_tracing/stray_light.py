@@ -30,8 +30,7 @@ from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.monitor.monitor_path import MonitorPath
 from twin.path_tracing.path_families import Event, SurfaceEvent, family_name, nominal_codes
 from twin.path_tracing.path_result import NOMINAL, Balance, Family, PathResult
-from twin.path_tracing.source import DiskSource
-from twin.path_tracing.tracer import CHUNK, FAINT, PathTracer, Progress, Sampling
+from twin.path_tracing.tracer import CHUNK, FAINT, DiskSource, PathTracer, Progress, Sampling
 
 CONE_MARGIN = 1.25
 """Half-angle of the cone into which a pinhole emits, relative to that of the pupil seen from the focal plane."""

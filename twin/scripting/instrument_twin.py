@@ -32,8 +32,16 @@ from scenes.specs.course import noll
 from scenes.specs.job import JobSpec, PerturbationSpec, checked_nodes, with_tables
 from scenes.specs.load import INSTRUMENTS, find_disturbances, is_path, library_names
 from scenes.specs.load import load_camera as read_camera
-from scenes.specs.motion_text import AXES, FORMS, find_node, matching_nodes, motion_of, perturbation_in_words
-from scenes.specs.perturbation import NodeInfo, perturbation_text
+from scenes.specs.perturbation import (
+    AXES,
+    FORMS,
+    NodeInfo,
+    find_node,
+    matching_nodes,
+    motion_of,
+    perturbation_in_words,
+    perturbation_text,
+)
 from scenes.specs.resolved import ResolvedJob, resolve, resolve_job
 from scenes.yaml.errors import InputError, Issue, Problem, names_text, nearest, shown, unknown
 from scenes.yaml.spec import validate

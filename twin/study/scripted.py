@@ -19,7 +19,7 @@ from typing import Any, Protocol, cast
 import xarray as xr
 
 from analysis.monitor import parameters
-from scenes.specs.motion_text import find_node, motion_of, put
+from scenes.specs.perturbation import find_node, motion_of, put
 from scenes.specs.resolved import ResolvedJob
 from scenes.specs.study import NOISE, TOTAL, StudySpec
 from scenes.yaml.errors import InputError, Issue, KeyPath, Problem, shown

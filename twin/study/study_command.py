@@ -1,7 +1,5 @@
 """Implementation of ``python -m twin.study``: run a study and write its folder."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Result of a study as a data set with one dimension, ``run``, and the files of the study's folder."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial

@@ -156,15 +156,8 @@ def allocate(
     predicted = final.passing(nothing)
     advance("allocation", ROUNDS, ROUNDS)
     cost = np.stack([costs.of_each(nothing), costs.of_each(np.log(rounded))])
-    return Allocation(
-        np.exp(total),
-        rounded,
-        FrozenMap(limits),
-        cost,
-        (first, predicted),
-        predicted >= spec.target,
-        trade.passing(nothing) >= spec.target,
-    )
+    reached = predicted >= spec.target, trade.passing(nothing) >= spec.target
+    return Allocation(np.exp(total), rounded, FrozenMap(limits), cost, (first, predicted), *reached)
 
 
 class CostCurve:
@@ -352,11 +345,8 @@ class _MarginModel:
             start,
             jac=lambda step: self.costs.slope(total + step) / size,
             bounds=list(zip(low, high, strict=True)),
-            constraints={
-                "type": "ineq",
-                "fun": lambda step: -self.quantile(step)[0],
-                "jac": lambda step: -self.quantile(step)[1],
-            },
+            constraints={"type": "ineq"}
+            | {"fun": lambda s: -self.quantile(s)[0], "jac": lambda s: -self.quantile(s)[1]},
             method="SLSQP",
             options={"maxiter": _STEPS, "ftol": 1e-4},
         )

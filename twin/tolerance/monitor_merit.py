@@ -312,9 +312,7 @@ class Merit:
         """
         selected = parts[..., self.parts]
         match self.spec.kind:
-            case "wavefront":
-                return np.sqrt(np.maximum(np.max(selected, axis=-1), 0.0))
-            case "monitor_angle" | "monitor_focus":
+            case "wavefront" | "monitor_angle" | "monitor_focus":
                 return np.sqrt(np.maximum(np.max(selected, axis=-1), 0.0))
             case "mtf":
                 return np.asarray(np.min(selected, axis=-1))

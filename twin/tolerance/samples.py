@@ -3,8 +3,6 @@
 They are computed as the runs of a study (``twin.study``).
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import partial

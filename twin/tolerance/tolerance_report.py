@@ -4,8 +4,6 @@ The yield is the fraction of cameras that meet all requirements. The inverse lim
 it alone causes a merit's allowed loss.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -200,30 +198,24 @@ def _importance(run: ToleranceRun) -> dict[str, float]:
 
 
 def _further(run: ToleranceRun) -> list[str]:
-    out = []
-    allocation, judged = run.allocation, run.judged
-    if allocation is not None and judged is not None:
-        asked = run.setup.test.allocation
-        assert asked is not None
-        if allocation.reached:
-            out.append(
-                f"Limits allocated for a yield of {_percent(asked.target)} give {_interval(judged)}, at a cost of "
-                f"{allocation.cost[1]:.3g} ({allocation.cost[0]:.3g} before)"
-            )
-        else:
-            subject = "None of the graded limits" if allocation.unrounded else "No allocation within the bounds"
-            out.append(
-                f"{subject} reaches a yield of {_percent(asked.target)}: those of the table give {_interval(judged)}"
-            )
-    return out
+    allocation, judged, asked = run.allocation, run.judged, run.setup.test.allocation
+    if allocation is None or judged is None or asked is None:
+        return []
+    if allocation.reached:
+        cost = f"{allocation.cost[1]:.3g} ({allocation.cost[0]:.3g} before)"
+        return [
+            f"Limits allocated for a yield of {_percent(asked.target)} give {_interval(judged)}, at a cost of {cost}"
+        ]
+    subject = "None of the graded limits" if allocation.unrounded else "No allocation within the bounds"
+    return [f"{subject} reaches a yield of {_percent(asked.target)}: those of the table give {_interval(judged)}"]
 
 
-def _scaled(value: float, result: MeritResult, decimals: int | None = None) -> Cell:
+def _scaled(value: float, result: MeritResult) -> Cell:
     """Return a merit's value in its reporting unit, with decimals according to its standard deviation."""
     size = merit_unit(result.merit)[1]
     if not np.isfinite(value):
         return None
-    digits = decimals_for(result.deviation / size, 2, most=5) if decimals is None else decimals
+    digits = decimals_for(result.deviation / size, 2, most=5)
     return DecimalNumber(value / size, max(digits, 1) if merit_unit(result.merit)[0] else max(digits, 3))
 
 
@@ -232,17 +224,11 @@ def _summary(run: ToleranceRun) -> Table:
     for result in run.merits:
         spec = result.merit.spec
         sign = "at least" if spec.more_is_better else "at most"
+        limit = f"{plain(spec.requirement / merit_unit(result.merit)[1])} in {100 * spec.probability:.0f} %"
+        values = (result.nominal, result.mean, result.levels[1], result.quadratic[1])
+        judged = _interval(result.passing), result.passing.judged(spec.probability)
         rows.append(
-            [
-                merit_head(result.merit),
-                f"{sign} {plain(spec.requirement / merit_unit(result.merit)[1])} in {100 * spec.probability:.0f} %",
-                _scaled(result.nominal, result),
-                _scaled(result.mean, result),
-                _scaled(result.levels[1], result),
-                _scaled(result.quadratic[1], result),
-                _interval(result.passing),
-                result.passing.judged(spec.probability),
-            ]
+            [merit_head(result.merit), f"{sign} {limit}", *(_scaled(value, result) for value in values), *judged]
         )
     caption = (
         "Designed: nominal camera after adjustment. 90 %: the value that 90 % of the cameras meet, by exact traces and "
@@ -260,13 +246,8 @@ def _levels_table(run: ToleranceRun) -> Table:
             rows.append(
                 [merit_head(result.merit), f"{100 * share:.0f} %", *(_scaled(value, result) for value in values)]
             )
-        rows.append(
-            [
-                merit_head(result.merit),
-                "yield",
-                *(_percent(share) for share in (result.passing.share, *reversed(result.model_passing))),
-            ]
-        )
+        shares = result.passing.share, *reversed(result.model_passing)
+        rows.append([merit_head(result.merit), "yield", *map(_percent, shares)])
     caption = "Value of each merit that a share of the cameras meet, by exact traces of every camera and by the models."
     heads = ("merit", "share", "exact", "quadratic", "linear")
     return Table("levels", "Exact, quadratic and linear", caption, heads, rows)
@@ -358,18 +339,9 @@ def _allocation_sections(run: ToleranceRun) -> tuple[Section, ...]:
         return ()
     rows: list[list[Cell]] = []
     for e, (name, tolerance) in enumerate(run.setup.test.tolerances.items()):
-        rows.append(
-            [
-                name,
-                tolerance.words,
-                str(tolerance.limit),
-                _scaled_limit(tolerance.limit, float(allocation.scales[e])),
-                str(allocation.limits[name]),
-                float(allocation.rounded[e]),
-                float(allocation.costs[0, e]),
-                float(allocation.costs[1, e]),
-            ]
-        )
+        chosen, rounded = _scaled_limit(tolerance.limit, float(allocation.scales[e])), str(allocation.limits[name])
+        numbers = (float(allocation.rounded[e]), *allocation.costs[:, e].tolist())
+        rows.append([name, tolerance.words, str(tolerance.limit), chosen, rounded, *numbers])
     heads = ("tolerance", "motion", "limit", "chosen", "rounded", "ratio", "cost", "new cost")
     caption = "Limits as specified, at the least cost, and rounded to the grades, with their costs."
     table = Table(
@@ -444,17 +416,10 @@ def _monitor_sections(run: ToleranceRun) -> tuple[Section, ...]:
     rows: list[list[Cell]] = []
     for result in run.merits:
         if result.merit.name in run.interpolation_errors:
-            spec = result.merit.spec
-            readings = ", ".join(readings_of(spec, tuple(run.bench.instrument.cameras)))
-            rows.append(
-                [
-                    merit_head(result.merit),
-                    readings,
-                    spec.estimator,
-                    _scaled(result.nominal, result),
-                    run.interpolation_errors[result.merit.name],
-                ]
-            )
+            readings = ", ".join(readings_of(result.merit.spec, tuple(run.bench.instrument.cameras)))
+            error = run.interpolation_errors[result.merit.name]
+            names = merit_head(result.merit), readings, result.merit.spec.estimator
+            rows.append([*names, _scaled(result.nominal, result), error])
     text = (
         f"Standard deviations of the monitor's readings under the disturbances {prior_name}, with the derivatives "
         "and the noise of each camera as it is built and adjusted; its area CCDs have been set to its spots. "

@@ -2,11 +2,16 @@
 
 The yield is the fraction of random cameras that meet all requirements; the inverse limit of a tolerance is the size at
 which it alone causes a merit's allowed loss.
+
+Warnings about the instrument of a tolerance budget that other commands give too.
+
+They concern cameras that are not sharp, parts of the instrument in a beam that the file does not model as obstructions,
+coarse grey values, and bodies that move into beams of the monitor.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -17,28 +22,76 @@ from analysis.statistics import proportion_interval
 from optics.geometry.tree import State
 from optics.numerics.backend import Backend
 from optics.numerics.number_tree import FrozenMap
+from scenes.models.camera_sharpness import blur_warnings
+from scenes.models.obstruction import moved_into_beams
 from scenes.specs.job import JobSpec
 from scenes.specs.load import is_path
 from scenes.specs.tolerance import AllocationSpec, ToleranceBudgetSpec, ToleranceSetup, amount_text
 from scenes.yaml.errors import InputError
 from scenes.yaml.yaml_file import dump_yaml
+from twin.camera.first_order_data import obscuration, unmodelled_obscuration
 from twin.framework.memory import Lowered, require_memory
 from twin.framework.procedure import Advance, silent
 from twin.framework.record import Quantity, Record
+from twin.sensors.area_detector import coarse_warnings
+from twin.tolerance import merit_models
 from twin.tolerance.allocation import Allocation, allocate
-from twin.tolerance.instrument_warnings import beam_warnings, instrument_warnings, interpolation_warnings
-from twin.tolerance.merit_models import (
-    InverseLimits,
-    Sensitivities,
-    VarianceShares,
-    inverse_limits,
-    model_draws,
-    sensitivities,
-)
 from twin.tolerance.monitor_merit import Merit, merit_unit, shown_merit
 from twin.tolerance.samples import Samples, Workforce, draw_parameters, draw_samples
 from twin.tolerance.tolerance_bench import SETTLED, ToleranceBench
 from twin.tolerance.variations import states_of
+
+FAR = 1e-3
+"""Relative error of a monitor's sigma due to interpolated derivatives above which a warning is given."""
+
+
+def instrument_warnings(setup: ToleranceSetup, bench: ToleranceBench) -> tuple[str, ...]:
+    """Return the warnings about the nominal instrument, such as unsharp cameras or parts in a beam."""
+    model = bench.optics.model
+    shadow = unmodelled_obscuration(model, obscuration(model, bench.backend))
+    return (
+        *blur_warnings(setup.base, bench.backend),
+        *((f"camera {model.spec.name}: {shadow}",) if shadow else ()),
+        *(coarse_warnings(setup.base) if bench.experiment.monitored else ()),
+    )
+
+
+def beam_warnings(bench: ToleranceBench, states: Sequence[State]) -> tuple[str, ...]:
+    """Return warnings about bodies that block monitor beams in some random cameras, once for each body and beam.
+
+    Parameters
+    ----------
+    bench : ToleranceBench
+        Camera of the budget with its varied parameters, compensators and merits.
+    states : sequence of State
+        States of the worst cameras.
+    """
+    texts_by_body: dict[str, list[str]] = {}
+    for state in states:
+        for text in moved_into_beams(bench.instrument, bench.backend, state):
+            texts_by_body.setdefault(text.partition(" and would take")[0], []).append(text)
+    return tuple(
+        f"in {len(texts)} of the {len(states)} worst cameras, {texts[0]}" for _, texts in sorted(texts_by_body.items())
+    )
+
+
+def interpolation_warnings(errors: Mapping[str, float], cameras: int) -> tuple[str, ...]:
+    """Return warnings about monitor merits for which interpolated derivatives are too inaccurate.
+
+    Parameters
+    ----------
+    errors : dict
+        Name of a merit -> relative difference of its sigma from that with traced derivatives.
+    cameras : int
+        Number of cameras in which the derivatives were traced.
+    """
+    return tuple(
+        f"{name}: with derivatives traced in {cameras} cameras the sigma differs by up to {100.0 * error:.2g} % from "
+        "that with interpolated ones; use smaller limits, or twin.uncertainty on a job of one camera"
+        for name, error in errors.items()
+        if error > FAR
+    )
+
 
 CONFIDENCE = 0.95
 """Confidence level of the intervals in which the true yields lie."""
@@ -173,8 +226,8 @@ class ToleranceRun:
 
     setup: ToleranceSetup
     bench: ToleranceBench
-    sensitivity: Sensitivities
-    inverse: InverseLimits
+    sensitivity: merit_models.Sensitivities
+    inverse: merit_models.InverseLimits
     samples: Samples
     merits: tuple[MeritResult, ...]
     passing: Yield
@@ -216,9 +269,8 @@ def run_tolerance(
         runs.
     """
     test, force = setup.test, force or Workforce()
-    engine_warnings: dict[
-        str, None
-    ] = {}  # each message once, although the cameras and those that judge an allocation both give it
+    # each message once, although the cameras and those that judge an allocation both give it
+    engine_warnings: dict[str, None] = {}
 
     def warn(text: str, further: Callable[[str], None] = force.warn) -> None:
         engine_warnings[text] = None
@@ -229,14 +281,15 @@ def run_tolerance(
     _require_memory(test)
     bench = ToleranceBench(setup, backend)
     input_warnings = instrument_warnings(setup, bench)
-    sensitivity = sensitivities(bench, advance)
+    sensitivity = merit_models.sensitivities(bench, advance)
     _require_light(setup, sensitivity)
-    inverse = inverse_limits(bench, sensitivity, advance)
+    inverse = merit_models.inverse_limits(bench, sensitivity, advance)
     samples = draw_samples(setup, bench, backend, test.samples, seed, force, "cameras", advance)
     passing = bench.passing(samples.values)
-    models = ModelPredictions.of(bench, sensitivity, samples)
-    many = draw_parameters(setup, bench, model_draws(bench, sensitivity.model), seed + _MODEL)
-    shares = VarianceShares.of(bench, sensitivity.model, many)
+    orders = (sensitivity.model.linear, sensitivity.model.quadratic)
+    models = [bench.values(order(samples.x)) for order in orders]
+    many = draw_parameters(setup, bench, merit_models.model_draws(bench, sensitivity.model), seed + _MODEL)
+    shares = merit_models.VarianceShares.of(bench, sensitivity.model, many)
     merits = tuple(
         _merit_result(bench, sensitivity, samples, models, shares, m, passing[:, m]) for m in range(len(bench.merits))
     )
@@ -252,20 +305,9 @@ def run_tolerance(
         *_warnings(bench, sensitivity, samples, merits, allocation, judged, test.allocation),
         *interpolation_warnings(missed, EXACT),
     )
-    return ToleranceRun(
-        setup,
-        bench,
-        sensitivity,
-        inverse,
-        samples,
-        merits,
-        Yield.count(np.all(passing, axis=-1)),
-        allocation,
-        judged,
-        FrozenMap(worst_jobs(setup, bench, samples)),
-        warnings,
-        FrozenMap(missed),
-    )
+    computed = (sensitivity, inverse, samples, merits, Yield.count(np.all(passing, axis=-1)), allocation, judged)
+    jobs = FrozenMap(worst_jobs(setup, bench, samples))
+    return ToleranceRun(setup, bench, *computed, jobs, warnings, FrozenMap(missed))
 
 
 def _amounts(bench: ToleranceBench, samples: Samples, rows: np.ndarray) -> np.ndarray:
@@ -302,7 +344,7 @@ def _require_memory(test: ToleranceBudgetSpec) -> None:
     require_memory(Lowered(test, ("samples",), test.samples, "samples", lambda count: pairs + count * camera, 20))
 
 
-def _require_light(setup: ToleranceSetup, sensitivity: Sensitivities) -> None:
+def _require_light(setup: ToleranceSetup, sensitivity: merit_models.Sensitivities) -> None:
     if not np.all(np.isfinite(sensitivity.nominal)):
         raise setup.test.error("the designed camera has no light at these fields", ("merits",))
 
@@ -326,34 +368,12 @@ def _validated_yield(
     return Yield.count(np.all(bench.passing(drawn.values), axis=-1))
 
 
-@dataclass(frozen=True, eq=False)
-class ModelPredictions:
-    """Merits of the Monte Carlo cameras predicted by the models of first and second order.
-
-    Array dimensions: S cameras, M merits.
-
-    Attributes
-    ----------
-    linear, quadratic : (S, M) ndarray
-        Merits to the first and to the second order, SI units.
-    """
-
-    linear: np.ndarray
-    quadratic: np.ndarray
-
-    @classmethod
-    def of(cls, bench: ToleranceBench, sensitivity: Sensitivities, samples: Samples) -> ModelPredictions:
-        """Evaluate the models of first and second order at the random parameters of the cameras."""
-        model = sensitivity.model
-        return cls(bench.values(model.linear(samples.x)), bench.values(model.quadratic(samples.x)))
-
-
 def _merit_result(
     bench: ToleranceBench,
-    sensitivity: Sensitivities,
+    sensitivity: merit_models.Sensitivities,
     samples: Samples,
-    models: ModelPredictions,
-    shares: VarianceShares,
+    models: Sequence[np.ndarray],
+    shares: merit_models.VarianceShares,
     m: int,
     passing: np.ndarray,
 ) -> MeritResult:
@@ -366,7 +386,7 @@ def _merit_result(
         known = sign * column[np.isfinite(column)]
         return tuple(float(sign * np.quantile(known, share)) for share in LEVELS) if len(known) else (np.nan,) * 3
 
-    by_model = models.linear[:, m], models.quadratic[:, m]
+    by_model = [values_by_model[:, m] for values_by_model in models]
     return MeritResult(
         merit,
         float(sensitivity.nominal[m]),
@@ -384,7 +404,7 @@ def _merit_result(
 
 def _warnings(
     bench: ToleranceBench,
-    sensitivity: Sensitivities,
+    sensitivity: merit_models.Sensitivities,
     samples: Samples,
     merits: tuple[MeritResult, ...],
     allocation: Allocation | None,

@@ -4,8 +4,6 @@ Several parameters may move one body. Their rotation vectors and shifts are adde
 that the order in a file does not matter.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -22,9 +20,8 @@ from optics.thermal.heat import Temperature
 from scenes.models.instrument_model import Instrument
 from scenes.models.thermal_model import TemperatureError, ThermalModel
 from scenes.specs.course import noll
-from scenes.specs.motion_text import AXES, find_node
-from scenes.specs.perturbation import PlainPerturbationSpec, perturbation_issues
-from scenes.specs.tolerance import CompensatorSpec, ToleranceSetup, ToleranceSpec, Varied
+from scenes.specs.perturbation import AXES, PlainPerturbationSpec, find_node, perturbation_issues
+from scenes.specs.tolerance import CompensatorSpec, ToleranceSpec, Varied
 from scenes.yaml.errors import InputError, KeyPath, Problem, shown
 from scenes.yaml.spec import Spec
 
@@ -85,52 +82,8 @@ class VariedParameter:
     moves: FrozenMap[str, BodyMove]
 
 
-def tolerance_parameters(
-    setup: ToleranceSetup, instrument: Instrument, thermal: ThermalModel
-) -> tuple[VariedParameter, ...]:
-    """Return the varied parameters of all tolerances; a figure error has one for each of its Zernike terms.
-
-    Raises
-    ------
-    InputError
-        A body does not exist, or does not allow the motion of a tolerance.
-    """
-    maker = _Maker(setup.test, instrument, thermal)
-    out: list[VariedParameter] = []
-    for name, tolerance in setup.test.tolerances.items():
-        out += maker.tolerance(name, tolerance)
-    return tuple(out)
-
-
-def compensator_parameters(
-    setup: ToleranceSetup, instrument: Instrument, thermal: ThermalModel
-) -> tuple[VariedParameter, ...]:
-    """Return one varied parameter (a motion per SI unit) for each compensator of a budget.
-
-    Raises
-    ------
-    InputError
-        A body does not exist, or does not allow the motion.
-    """
-    maker = _Maker(setup.test, instrument, thermal)
-    return tuple(maker.compensator(name, compensator) for name, compensator in setup.test.compensators.items())
-
-
-def actuator_parameter(
-    test: Spec, instrument: Instrument, thermal: ThermalModel, name: str, actuator: CompensatorSpec
-) -> VariedParameter:
-    """Return the varied parameter (a motion per SI unit) of one actuator under ``actuators`` of a test.
-
-    Raises
-    ------
-    InputError
-        The body does not exist, or does not allow the motion.
-    """
-    return _Maker(test, instrument, thermal).compensator(name, actuator, "actuators")
-
-
 @dataclass(frozen=True, eq=False)
-class _Maker:
+class ParameterMaker:
     """Builder of varied parameters (motions per unit) from the entries of a budget's file."""
 
     test: Spec
@@ -138,6 +91,7 @@ class _Maker:
     thermal: ThermalModel
 
     def tolerance(self, name: str, spec: ToleranceSpec) -> list[VariedParameter]:
+        """Return the varied parameters of a tolerance: one, or one for each term of a figure error."""
         key: KeyPath = ("tolerances", name)
         kind = spec.parts[1]
         if not spec.spectrum:
@@ -152,6 +106,7 @@ class _Maker:
         ]
 
     def compensator(self, name: str, spec: CompensatorSpec, section: str = "compensators") -> VariedParameter:
+        """Return the varied parameter of a compensator or actuator, in SI units."""
         moves = self._moves(spec, (section, name), spec.range_si or 1.0)
         return VariedParameter(name, name, spec.parts[1], 1.0, moves)
 

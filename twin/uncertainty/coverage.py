@@ -3,8 +3,6 @@
 Random states are drawn from the prior on disturbances, rendered, exposed, recovered and compared with the truth.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field

@@ -1,7 +1,5 @@
 """Limits of the changes estimated by a monitor under a prior on disturbances, and the benefit of more measurements."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -258,9 +256,10 @@ def find_limits(
     rows = np.stack([quantity.row for quantity in changed])
     gains = estimator_gains(cameras, prior, noise)
     splits = {name: limits.split(rows, prior, noise, gain) for name, gain in gains.items()}
+    left = limits.posterior_sigma
     remedies = [
-        Remedy("more_frames", f"{_MORE_FRAMES} times the frames", _left(rows, prior, noise / _MORE_FRAMES)),
-        Remedy("no_noise", "images without noise", _left(rows, prior, 0.0 * noise)),
+        Remedy("more_frames", f"{_MORE_FRAMES} times the frames", left(rows, prior, noise / _MORE_FRAMES)),
+        Remedy("no_noise", "images without noise", left(rows, prior, 0.0 * noise)),
     ]
     fields = half_fields(experiment.instrument, experiment.nominal_truth.principal_distance)
     field = limits.field_covariance(FIELD, cameras, list(fields.values()))
@@ -273,14 +272,10 @@ def find_limits(
     reason = ""
     if second_monitor:
         try:
-            enlarged = limits.with_further_spots(prior, _second_monitor(experiment).spots, _individual(prior))
-            remedies.append(
-                Remedy(
-                    "second_monitor",
-                    "a second monitor on the other side of the pupil",
-                    _left(rows, enlarged, np.kron(np.eye(2), noise)),
-                )
-            )
+            individual = ["/monitor/" in body for body in prior.bodies]
+            enlarged = limits.with_further_spots(prior, _second_monitor(experiment).spots, individual)
+            sigma = left(rows, enlarged, np.kron(np.eye(2), noise))
+            remedies.append(Remedy("second_monitor", "a second monitor on the other side of the pupil", sigma))
         except (InputError, MisplacedError, *LOST) as error:
             reason = str(error)
     least_observable = tuple(limits.least_seen(row, prior, noise) for row in rows)
@@ -289,18 +284,6 @@ def find_limits(
     return MonitorLimits(
         name, prior, changed, noise, frames, splits, least_observable, tuple(remedies), outside, reason
     )
-
-
-def _left(rows: np.ndarray, prior: Disturbances, noise: np.ndarray) -> np.ndarray:
-    return limits.posterior_sigma(rows, prior, noise)
-
-
-def _individual(prior: Disturbances) -> list[bool]:
-    """Return, for each motion of the prior, True if a second monitor has a body of its own for it, as for prisms.
-
-    Cameras and the central prism are shared by both monitors.
-    """
-    return ["/monitor/" in body for body in prior.bodies]
 
 
 def _second_monitor(experiment: MonitorExperiment) -> Disturbances:

@@ -74,12 +74,10 @@ SHARE: Record[tuple[str, float]] = Record(
 )
 _SPLIT: Record[_Limited] = Record(
     "Contributions of motions to a variance.",
-    Quantity("sigma", lambda split: split.sigma, "standard deviation, whose square is divided"),
-    Quantity(
-        "lines", lambda split: split.lines[:LINES], "motions with the largest shares, largest first", record=SHARE
-    ),
-    Quantity("rest", lambda split: float(sum(share for _, share in split.lines[LINES:])), "share of all other motions"),
-    Quantity("noise", lambda split: split.noise, "share of the image noise"),
+    Quantity("sigma", lambda s: s.sigma, "standard deviation, whose square is divided"),
+    Quantity("lines", lambda s: s.lines[:LINES], "motions with the largest shares, largest first", record=SHARE),
+    Quantity("rest", lambda s: float(sum(share for _, share in s.lines[LINES:])), "share of all other motions"),
+    Quantity("noise", lambda s: s.noise, "share of the image noise"),
 )
 _AMOUNT: Record[tuple[str, float, str]] = Record(
     "A motion in a combination of motions.",
@@ -89,101 +87,80 @@ _AMOUNT: Record[tuple[str, float, str]] = Record(
 )
 _LEAST_OBSERVABLE: Record[_Limited] = Record(
     "Least observable motions that change a quantity.",
+    Quantity("change", lambda r: r.limits.least_observable[r.q].change, "change of the quantity by all of them"),
+    Quantity("motions", lambda r: r.motions, "the largest of them", record=_AMOUNT),
+    Quantity("spots_px", lambda r: r.limits.least_observable[r.q].spots, "spot shifts that they cause"),
     Quantity(
-        "change",
-        lambda limited: limited.limits.least_observable[limited.q].change,
-        "change of the quantity by all of them",
-    ),
-    Quantity("motions", lambda limited: limited.motions, "the largest of them", record=_AMOUNT),
-    Quantity(
-        "spots_px", lambda limited: limited.limits.least_observable[limited.q].spots, "spot shifts that they cause"
-    ),
-    Quantity(
-        "spots_noise_px",
-        lambda limited: limited.limits.least_observable[limited.q].noise,
-        "noise standard deviation of the shifts",
+        "spots_noise_px", lambda r: r.limits.least_observable[r.q].noise, "noise standard deviation of the shifts"
     ),
 )
 _ELASTICITY: Record[tuple[Elasticity, int]] = Record(
     "Sensitivity of the posterior's standard deviation to a number of the prior.",
-    Quantity("number", lambda entry: entry[0].number, "name of the number"),
-    Quantity("value", lambda entry: entry[0].size, "its value in the prior"),
-    Quantity("unit", lambda entry: entry[0].unit, "unit of the number"),
-    Quantity("bodies", lambda entry: len(entry[0].bodies), "number of bodies that it applies to"),
-    Quantity("elasticity", lambda entry: float(entry[0].elasticity[entry[1]]), "relative change per relative change"),
+    Quantity("number", lambda e: e[0].number, "name of the number"),
+    Quantity("value", lambda e: e[0].size, "its value in the prior"),
+    Quantity("unit", lambda e: e[0].unit, "unit of the number"),
+    Quantity("bodies", lambda e: len(e[0].bodies), "number of bodies that it applies to"),
+    Quantity("elasticity", lambda e: float(e[0].elasticity[e[1]]), "relative change per relative change"),
     Quantity(
         "doubled",
-        lambda entry: float(entry[0].doubled[entry[1]]),
+        lambda e: float(e[0].doubled[e[1]]),
         "standard deviation if the number is twice as large, and the prior is unchanged",
     ),
     Quantity(
         "doubled_in_prior",
-        lambda entry: float(entry[0].doubled_in_prior[entry[1]]),
+        lambda e: float(e[0].doubled_in_prior[e[1]]),
         "standard deviation if the number is twice as large, also in the prior",
     ),
 )
 _HEAVY_TAIL: Record[_Limited] = Record(
     "Errors of the posterior if each number of the prior is the scale of Student's t distribution.",
-    Quantity("degrees", lambda limited: limited.limits.heavy_tail.degrees, "degrees of freedom of that distribution"),
-    Quantity("rms", lambda limited: float(limited.limits.heavy_tail.rms[limited.q]), "root mean square of the error"),
-    Quantity(
-        "held_68", lambda limited: limited.held(0), "half-width of the interval that contains 68.3 % of the errors"
-    ),
-    Quantity(
-        "held_95", lambda limited: limited.held(1), "half-width of the interval that contains 95.4 % of the errors"
-    ),
-    Quantity(
-        "held_997", lambda limited: limited.held(2), "half-width of the interval that contains 99.7 % of the errors"
-    ),
+    Quantity("degrees", lambda r: r.limits.heavy_tail.degrees, "degrees of freedom of that distribution"),
+    Quantity("rms", lambda r: float(r.limits.heavy_tail.rms[r.q]), "root mean square of the error"),
+    Quantity("held_68", lambda r: r.held(0), "half-width of the interval that contains 68.3 % of the errors"),
+    Quantity("held_95", lambda r: r.held(1), "half-width of the interval that contains 95.4 % of the errors"),
+    Quantity("held_997", lambda r: r.held(2), "half-width of the interval that contains 99.7 % of the errors"),
     Quantity(
         "beyond_3_sigma",
-        lambda limited: float(limited.limits.heavy_tail.beyond[limited.q]),
+        lambda r: float(r.limits.heavy_tail.beyond[r.q]),
         "probability of an error beyond 3 sigma; 0.0027 for a normal error",
     ),
 )
 _LIMITED: Record[_Limited] = Record(
     "Limits of one quantity, in the unit at the end of its key.",
-    Quantity("before", lambda limited: limited, "variance before the measurement", record=_SPLIT),
-    Quantity("after", lambda limited: limited.after, "variance that each estimator leaves", record=_SPLIT),
-    Quantity(
-        "sigma_if_known", lambda limited: limited.sigma_if_known, "remaining standard deviation if that motion is known"
-    ),
-    Quantity("least_observable", lambda limited: limited, "least observable motions", record=_LEAST_OBSERVABLE),
+    Quantity("before", lambda r: r, "variance before the measurement", record=_SPLIT),
+    Quantity("after", lambda r: r.after, "variance that each estimator leaves", record=_SPLIT),
+    Quantity("sigma_if_known", lambda r: r.sigma_if_known, "remaining standard deviation if that motion is known"),
+    Quantity("least_observable", lambda r: r, "least observable motions", record=_LEAST_OBSERVABLE),
     Quantity(
         "from_statement",
-        lambda limited: float(limited.limits.from_prior[limited.q]),
+        lambda r: float(r.limits.from_prior[r.q]),
         "share of the posterior's variance that remains without image noise",
     ),
     Quantity(
-        "elasticities",
-        lambda limited: limited.followed,
-        "numbers of the prior with the largest elasticities",
-        record=_ELASTICITY,
+        "elasticities", lambda r: r.followed, "numbers of the prior with the largest elasticities", record=_ELASTICITY
     ),
-    Quantity("student_t", lambda limited: limited, "errors under a prior with heavy tails", record=_HEAVY_TAIL),
+    Quantity("student_t", lambda r: r, "errors under a prior with heavy tails", record=_HEAVY_TAIL),
 )
 _REMEDY: Record[tuple[Remedy, Sequence[limits.Quantity]]] = Record(
     "A further measurement.",
-    Quantity("what", lambda entry: entry[0].what, "description of the measurement"),
-    Quantity(
-        "left", lambda entry: _by_quantity(entry[1], entry[0].sigma), "remaining standard deviation of each quantity"
-    ),
+    Quantity("what", lambda e: e[0].what, "description of the measurement"),
+    Quantity("left", lambda e: _by_quantity(e[1], e[0].sigma), "remaining standard deviation of each quantity"),
 )
 LIMITS: Record[MonitorLimits] = Record(
     "uncertainty.json",
-    Quantity("name", lambda result: result.instrument, "the instrument"),
-    Quantity("disturbances", lambda result: result.disturbances.name, "name of the prior on disturbances"),
-    Quantity("frames", lambda result: result.frames, "frames of each state"),
-    Quantity("outside", lambda result: result.outside, "probability that a spot leaves its CCD"),
+    Quantity("name", lambda r: r.instrument, "the instrument"),
+    Quantity("disturbances", lambda r: r.disturbances.name, "name of the prior on disturbances"),
+    Quantity("frames", lambda r: r.frames, "frames of each state"),
+    Quantity("outside", lambda r: r.outside, "probability that a spot leaves its CCD"),
     Quantity(
         "quantities",
-        lambda result: _by_quantity(result.quantities, [_Limited(result, q) for q in range(len(result.quantities))]),
+        lambda r: _by_quantity(r.quantities, [_Limited(r, q) for q in range(len(r.quantities))]),
         "what limits each quantity",
         record=_LIMITED,
     ),
     Quantity(
         "remedies",
-        lambda result: {remedy.name: (remedy, result.quantities) for remedy in result.remedies},
+        lambda r: {remedy.name: (remedy, r.quantities) for remedy in r.remedies},
         "further measurements",
         record=_REMEDY,
     ),
@@ -210,30 +187,18 @@ class _Counted:
 
 COUNT: Record[_Counted] = Record(
     "Errors of one quantity by one estimator in random states.",
-    Quantity(
-        "rms",
-        lambda covered: float(covered.coverage.rms(covered.estimator)[covered.q]),
-        "root mean square of the errors",
-    ),
+    Quantity("rms", lambda c: float(c.coverage.rms(c.estimator)[c.q]), "root mean square of the errors"),
     Quantity(
         "rms_over_sigma",
-        lambda covered: float(covered.coverage.ratio(covered.estimator)[covered.q]),
+        lambda c: float(c.coverage.ratio(c.estimator)[c.q]),
         "root mean square of the errors over their sigmas",
     ),
-    Quantity("held_68", lambda covered: covered.held(0), "share of the 68 % intervals that contain the truth"),
-    Quantity("held_95", lambda covered: covered.held(1), "share of the 95 % intervals that contain the truth"),
-    Quantity(
-        "expected_68",
-        lambda covered: covered.expected(0),
-        "expected share of the 68 % intervals that contain the truth",
-    ),
-    Quantity(
-        "expected_95",
-        lambda covered: covered.expected(1),
-        "expected share of the 95 % intervals that contain the truth",
-    ),
-    Quantity("limits_68", lambda covered: covered.limits(0), "limits of held_68 if every sigma is right"),
-    Quantity("limits_95", lambda covered: covered.limits(1), "limits of held_95 if every sigma is right"),
+    Quantity("held_68", lambda c: c.held(0), "share of the 68 % intervals that contain the truth"),
+    Quantity("held_95", lambda c: c.held(1), "share of the 95 % intervals that contain the truth"),
+    Quantity("expected_68", lambda c: c.expected(0), "expected share of the 68 % intervals that contain the truth"),
+    Quantity("expected_95", lambda c: c.expected(1), "expected share of the 95 % intervals that contain the truth"),
+    Quantity("limits_68", lambda c: c.limits(0), "limits of held_68 if every sigma is right"),
+    Quantity("limits_95", lambda c: c.limits(1), "limits of held_95 if every sigma is right"),
 )
 _OUTLIER: Record[tuple[str, str, str, float, int]] = Record(
     "A count outside its limits.",
@@ -245,24 +210,24 @@ _OUTLIER: Record[tuple[str, str, str, float, int]] = Record(
 )
 STATES: Record[Coverage] = Record(
     "Coverage in random states.",
-    Quantity("drawn", lambda result: result.drawn, "number of states drawn"),
-    Quantity("measured", lambda result: result.measured, "number of states whose spots stay on their CCDs"),
-    Quantity("false_alarm", lambda result: FALSE, "probability that any count is outside its limits by chance"),
+    Quantity("drawn", lambda r: r.drawn, "number of states drawn"),
+    Quantity("measured", lambda r: r.measured, "number of states whose spots stay on their CCDs"),
+    Quantity("false_alarm", lambda r: FALSE, "probability that any count is outside its limits by chance"),
     Quantity(
         "estimators",
-        lambda result: {
-            name: _by_quantity(result.quantities, [_Counted(result, q, name) for q in range(len(result.quantities))])
-            for name in result.errors
+        lambda r: {
+            name: _by_quantity(r.quantities, [_Counted(r, q, name) for q in range(len(r.quantities))])
+            for name in r.errors
         },
         "errors of each quantity by each estimator",
         record=COUNT,
     ),
-    Quantity("outliers", lambda result: result.outliers, "counts outside their limits", record=_OUTLIER),
-    Quantity("chi_square_mean", lambda result: float(np.mean(result.chi_square)), "mean chi-square of the shifts"),
-    Quantity("alarms", lambda result: result.alarms, "number of states whose chi-square exceeds its limit"),
-    Quantity("alarms_limit", lambda result: result.alarm_limit, "largest number of alarms by chance"),
-    Quantity("doubted", lambda result: result.doubted, "number of states in which the measurement contradicts sigma"),
-    Quantity("sigma_holds", lambda result: result.sigma_holds, "no count outside its limits, no state doubted"),
+    Quantity("outliers", lambda r: r.outliers, "counts outside their limits", record=_OUTLIER),
+    Quantity("chi_square_mean", lambda r: float(np.mean(r.chi_square)), "mean chi-square of the shifts"),
+    Quantity("alarms", lambda r: r.alarms, "number of states whose chi-square exceeds its limit"),
+    Quantity("alarms_limit", lambda r: r.alarm_limit, "largest number of alarms by chance"),
+    Quantity("doubted", lambda r: r.doubted, "number of states in which the measurement contradicts sigma"),
+    Quantity("sigma_holds", lambda r: r.sigma_holds, "no count outside its limits, no state doubted"),
 )
 
 

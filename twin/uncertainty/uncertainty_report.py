@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -203,15 +203,8 @@ def _ledger(limits: MonitorLimits, lines: int) -> Table:
         "noise, the present one. Shares of correlated motions can be negative."
     )
     heads = ("quantity", "motion", "before [%]", "after [%]", "σ if known")
-    return Table(
-        "limits-motions",
-        f"The {lines} largest contributions to each quantity",
-        caption,
-        heads,
-        rows,
-        (None, None, 2, 2),
-        3,
-    )
+    title = f"The {lines} largest contributions to each quantity"
+    return Table("limits-motions", title, caption, heads, rows, (None, None, 2, 2), 3)
 
 
 def _before(limits: MonitorLimits) -> Section:
@@ -224,19 +217,11 @@ def _before(limits: MonitorLimits) -> Section:
         for name in ("", *(name for name in limits.splits if name != BEST)):
             first = [f"{body_text(motion)} {100 * share:.0f}%" for motion, share in limits.lines(name, q)[:FEW]]
             rows.append((quantity_text(quantity), name or "before", ", ".join(first)))
-    return Section(
-        "Before the measurement, and the other estimators",
-        ("uncertainty.json has the ten largest contributions of each.",),
-        (
-            Table(
-                "limits-others",
-                "The largest shares of the variance",
-                "Before the measurement, and after it with the estimators other than the posterior.",
-                ("quantity", "estimator", "motions"),
-                rows,
-            ),
-        ),
-    )
+    caption = "Before the measurement, and after it with the estimators other than the posterior."
+    heads = ("quantity", "estimator", "motions")
+    table = Table("limits-others", "The largest shares of the variance", caption, heads, rows)
+    text = ("uncertainty.json has the ten largest contributions of each.",)
+    return Section("Before the measurement, and the other estimators", text, (table,))
 
 
 def _prior_section(limits: MonitorLimits) -> Section:
@@ -361,18 +346,11 @@ def _states(coverage: Coverage) -> Section:
         f"The chi-square of the shifts was {mean:.2f} on average and exceeded its limit in {coverage.alarms} states; "
         f"at a false-alarm rate of {FALSE_ALARM:g}, chance allows up to {coverage.alarm_limit}."
     )
-    heads = (
-        "quantity",
-        "estimator",
-        "rms error",
-        "rms of error / sigma",
-        "in 68 % interval [%]",
-        "limits",
-        "in 95 % interval [%]",
-    )
+    heads = ("quantity", "estimator", "rms error", "rms of error / sigma")
+    intervals = ("in 68 % interval [%]", "limits", "in 95 % interval [%]", "limits of these")
     caption = "Readings minus truth in the quantity's unit, and the share of intervals that contain the truth."
     decimals = (None, None, None, 3, 1, None, 1, None)
-    table = Table("coverage", "Random states", caption, (*heads, "limits of these"), rows, decimals, 3)
+    table = Table("coverage", "Random states", caption, (*heads, *intervals), rows, decimals, 3)
     return Section("Do the sigmas hold?", tuple(text), (table,))
 
 
@@ -419,16 +397,9 @@ def _reduced(axes: Axes, limits: MonitorLimits) -> None:
     before = limits.splits[BEST].sigma_before
     for k, (name, split) in enumerate(limits.splits.items()):
         best = name == BEST
-        axes.plot(
-            split.sigma / before,
-            y,
-            MARKS[k % len(MARKS)],
-            ms=6.5 if best else 4.5,
-            color=svg.VERMILION if best else svg.GREY,
-            mfc=svg.VERMILION if best else "none",
-            zorder=3 if best else 2,
-            label=name,
-        )
+        colour, fill = (svg.VERMILION, svg.VERMILION) if best else (svg.GREY, "none")
+        look: dict[str, Any] = {"ms": 6.5, "zorder": 3} if best else {"ms": 4.5, "zorder": 2}
+        axes.plot(split.sigma / before, y, MARKS[k % len(MARKS)], color=colour, mfc=fill, label=name, **look)
     axes.axvline(1.0, color=svg.INK, lw=0.8, ls=":")
     axes.set_xscale("log")
     low, high = axes.get_xlim()
@@ -459,14 +430,8 @@ def _by_body(axes: Axes, limits: MonitorLimits) -> None:
     y = np.arange(len(total))
     up, down = np.zeros(len(total)), np.zeros(len(total))
     for name, share, colour in bars:
-        axes.barh(
-            y,
-            100.0 * share,
-            left=100.0 * np.where(share >= 0.0, up, down),
-            height=0.68,
-            color=colour,
-            label=name.replace("_", " "),
-        )
+        left, label = 100.0 * np.where(share >= 0.0, up, down), name.replace("_", " ")
+        axes.barh(y, 100.0 * share, left=left, height=0.68, color=colour, label=label)
         up, down = up + np.maximum(share, 0.0), down + np.minimum(share, 0.0)
     axes.set_xlabel("share of the posterior variance, %")
     if np.any(down < -1e-3):

@@ -20,7 +20,7 @@ from scenes.lens.prescription import SEQUENCE, Prescription, polynomial_of
 from scenes.lens.statements import glass_key, own_glasses, read_catalogue, read_catalogues
 from scenes.lens.zemax_reader import read_zemax
 from scenes.models.camera_model import derive_camera
-from scenes.specs.glass import LensGlassSpec
+from scenes.specs.camera import LensGlassSpec
 from scenes.yaml.errors import InputError
 from tests.scenes.lens.files import AGF, BATOID, CODEV, SINGLET, TMA
 from tests.tiers import quick

@@ -35,9 +35,8 @@ from optics.numerics.number_tree import FrozenMap
 from scenes.models.disturbances import drawn_motions
 from scenes.models.disturbances import states_of as amounts_as_states
 from scenes.specs.course import moment
-from scenes.specs.motion_text import AXES, find_node
 from scenes.specs.orbit.monitor import PARAMETERS, CorrectionSpec, OrbitMonitorSpec
-from scenes.specs.perturbation import not_allowed
+from scenes.specs.perturbation import AXES, find_node, not_allowed
 from scenes.yaml.errors import InputError, Problem, unknown
 from twin.framework.procedure import BenchError
 from twin.framework.random_streams import stream

@@ -4,8 +4,6 @@ The Jacobian holds the derivatives of the study's responses (result numbers) wit
 spread of a factor is the sigma of its normal distribution, otherwise half of the range of its values.
 """
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -149,23 +147,14 @@ def _response_table(gradient: Gradient) -> Table:
                 significant(worst, 3, floor=0.0) if worst is not None else "\N{EM DASH}",
             ]
         )
-    heads = (
-        "response",
-        "strongest factor",
-        "derivative",
-        "unit",
-        "change per spread",
-        "all factors together (rss)",
-        "unit of the change",
-        "entries by AD",
-        "worst AD against differences",
-    )
+    heads = ("response", "strongest factor", "derivative", "unit", "change per spread", "all factors together (rss)")
+    more = ("unit of the change", "entries by AD", "worst AD against differences")
     caption = (
         "Change per spread: when the factor changes by its sigma, or by half of its range. Together: root of the sum "
         "of squares over all factors, which is the response's standard deviation where it is linear, the spreads are "
         "sigmas and the factors independent."
     )
-    return Table("responses", "Responses", caption, heads, rows)
+    return Table("responses", "Responses", caption, (*heads, *more), rows)
 
 
 def _factor_rows(gradient: Gradient) -> Table:

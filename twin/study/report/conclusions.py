@@ -1,24 +1,14 @@
 """Conclusions of a study as sentences, formatting of its numbers, and its warnings."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Sequence
 
 from scenes.specs.study import GRID, SAMPLERS
 from twin.framework.artefact import decimals_for, fixed, significant
 from twin.framework.report import answer
+from twin.study.report import study_statistics
 from twin.study.report.sensitivity_indices import MANY_FAILED, RESAMPLES, Indices, NoIndices
 from twin.study.report.study_analysis import GOALS, Convergence, Requirement, StudyAnalysis
-from twin.study.report.study_statistics import (
-    LEAST,
-    Description,
-    Estimate,
-    Interval,
-    Response,
-    impossible_noise,
-    typeset,
-)
 
 BAD_MODEL = 0.8
 """Cross-validated R² below which the report calls the polynomial chaos model of a response poor."""
@@ -43,7 +33,7 @@ def warnings(analysis: StudyAnalysis) -> list[str]:
                 "So many runs failed that the others no longer represent the design; the statistics hold only for "
                 "feasible runs."
             )
-    wrong = impossible_noise(runs)
+    wrong = study_statistics.impossible_noise(runs)
     out += [str(issue) for issue in wrong.issues] if wrong is not None else []
     for name, part in analysis.indices.items():
         disagreeing = [index for index in part.axes if index.agrees is False] if isinstance(part, Indices) else []
@@ -65,10 +55,10 @@ def warnings(analysis: StudyAnalysis) -> list[str]:
         missing = int((~r.good & ~runs.failed).sum())
         if missing:
             out.append(f"{r.name} has no finite number in {plural(missing, 'run')} that did not fail.")
-    if runs.sampled and failed < runs.count < LEAST:
+    if runs.sampled and failed < runs.count < study_statistics.LEAST:
         out.append(
             f"{plural(runs.count, 'run')} are few: distributions, upper quantiles and sensitivity indices need at "
-            f"least {LEAST}, and intervals are wide."
+            f"least {study_statistics.LEAST}, and intervals are wide."
         )
     return out
 
@@ -228,7 +218,7 @@ def _open_range(r: Requirement) -> str:
     return f", or by {r.met} to {r.most} of all {r.runs} runs, whatever the others would have given{interval}"
 
 
-def _contributors(analysis: StudyAnalysis, response: Response) -> str:
+def _contributors(analysis: StudyAnalysis, response: study_statistics.Response) -> str:
     about = analysis.descriptions[response.name]
     name = response.name
     if about.count == 0:
@@ -253,7 +243,7 @@ def _contributors(analysis: StudyAnalysis, response: Response) -> str:
             text += f" {percent(rest, 0)} of the variance is not explained by the factors ({_rest_reason(indices)})."
         return text
     if analysis.effects[name]:
-        unit = typeset(response.unit)
+        unit = study_statistics.typeset(response.unit)
         parts = [f"{e.factor} {number(e.swing, 3)}" for e in analysis.effects[name][:3] if e.swing > 0.0]
         if parts:
             text += f" Largest main effects: {listed(parts)}{' ' + unit if unit else ''}."
@@ -263,7 +253,7 @@ def _contributors(analysis: StudyAnalysis, response: Response) -> str:
         return f"{text} {plural(about.count, 'run')} are too few to find its main factors."
     sure = [e for e in model.effects if _sure(e.swing.interval)]
     share = max(model.adjusted, 0.0)
-    if share < LINEAR and about.count >= LEAST:
+    if share < LINEAR and about.count >= study_statistics.LEAST:
         return f"{text} It is hardly linear in the factors (R² {percent(share, 0)}): see its response curves."
     if not sure:
         text += " No linear effect of a factor exceeds the scatter."
@@ -271,7 +261,7 @@ def _contributors(analysis: StudyAnalysis, response: Response) -> str:
         parts = [f"{e.factor} {with_unit(e.swing.value, response.unit)}" for e in sure[:3]]
         text += f" Largest changes over the middle 90% of a factor: {listed(parts)}."
     text += f" All factors together explain {percent(share, 0)} of its variance linearly."
-    if about.count < LEAST:
+    if about.count < study_statistics.LEAST:
         text += f" With {about.count} runs this is only a first indication."
     return text
 
@@ -315,12 +305,12 @@ def number(value: float | None, digits: int = 4) -> str:
 
 def with_unit(value: float | None, unit: str, digits: int = 3) -> str:
     """Return a number as text with its unit."""
-    sign = typeset(unit)
+    sign = study_statistics.typeset(unit)
     space = "" if sign in ("°", "") else " "
     return f"{number(value, digits)}{space}{sign}"
 
 
-def limits(interval: Interval) -> str:
+def limits(interval: study_statistics.Interval) -> str:
     """Return an interval as text, with a question mark for an end that is unknown (None)."""
     low, high = interval
     if low is None and high is None:
@@ -332,7 +322,7 @@ def limits(interval: Interval) -> str:
     return f"{'?' if low is None else number(low, 4)} … {'?' if high is None else number(high, 4)}"
 
 
-def with_limits(value: Estimate | None) -> str:
+def with_limits(value: study_statistics.Estimate | None) -> str:
     """Return an estimate with its confidence interval as text; the interval determines the number of decimals."""
     if value is None:
         return DASH
@@ -350,7 +340,7 @@ def with_limits(value: Estimate | None) -> str:
     return f"{number(value.value)} ({text})" if text else number(value.value)
 
 
-def share(value: Estimate | None) -> str:
+def share(value: study_statistics.Estimate | None) -> str:
     """Return a sensitivity index between 0 and 1 with its confidence interval as text, with three decimals."""
     if value is None:
         return DASH
@@ -386,7 +376,7 @@ def plural(count: int, noun: str) -> str:
     return f"{count} {noun}{'' if count == 1 else 's'}"
 
 
-def normality_text(response: Response, about: Description) -> str | None:
+def normality_text(response: study_statistics.Response, about: study_statistics.Description) -> str | None:
     """Return a sentence on whether a response is normally distributed; None if it was not tested."""
     if about.normality is None or about.mean is None or about.std is None:
         return None

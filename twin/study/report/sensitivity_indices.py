@@ -319,13 +319,9 @@ def _of_grid(axes: Sequence[tuple[Factor, ...]], values: np.ndarray) -> tuple[In
     for k, axis in enumerate(axes):
         cells = _cells([axis])
         others = _cells([a for j, a in enumerate(axes) if j != k])
-        out.append(
-            Index(
-                tuple(factor.name for factor in axis),
-                Estimate(_between(cells, values) / total),
-                Estimate(max(1.0 - _between(others, values) / total, 0.0) if len(axes) > 1 else 1.0),
-            )
-        )
+        first = _between(cells, values) / total
+        whole = max(1.0 - _between(others, values) / total, 0.0) if len(axes) > 1 else 1.0
+        out.append(Index(tuple(factor.name for factor in axis), Estimate(first), Estimate(whole)))
     return tuple(sorted(out, key=lambda index: -index.total.value))
 
 

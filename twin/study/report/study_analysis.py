@@ -195,38 +195,25 @@ def _is_met(spec: ThresholdSpec, values: np.ndarray) -> np.ndarray:
 
 def requirements(runs: StudyRuns) -> tuple[Requirement, ...]:
     """Return the results of all requirements of a study and, if there are several, of all together."""
-    out = []
-    everything = np.ones(runs.count, bool)
-    judged = np.ones(runs.count, bool)
+    everything, known = np.ones((2, runs.count), bool)
+    rows: list[tuple[str, str, np.ndarray, np.ndarray, statistics.Description | None, str]] = []
     for name, spec in runs.study.report.thresholds.items():
         response = runs.find(spec.response)
         assert isinstance(response, Response)
         good = _is_met(spec, response.values)
         everything &= good
-        judged &= response.good
+        known &= response.good
         values = np.abs(response.values) if spec.magnitude else response.values
-        out.append(
-            _counted(
-                runs, name, _text(spec), good, response.good, statistics.describe(values, runs.sampled), response.unit
-            )
-        )
-    if len(out) > 1:
-        out.append(_counted(runs, "", "all of them", everything, judged, None, ""))
+        description = statistics.describe(values, runs.sampled)
+        rows.append((name, _text(spec), good, response.good, description, response.unit))
+    if len(rows) > 1:
+        rows.append(("", "all of them", everything, known, None, ""))
+    out = []
+    for name, text, good, finite, judged, unit in rows:
+        met, count = int(np.sum(good & finite)), int(np.sum(finite))
+        interval = proportion_interval(met, count, statistics.CONFIDENCE) if runs.sampled and count else None
+        out.append(Requirement(name, text, met, count, runs.count, interval, judged, unit))
     return tuple(out)
-
-
-def _counted(
-    runs: StudyRuns,
-    name: str,
-    text: str,
-    good: np.ndarray,
-    known: np.ndarray,
-    judged: statistics.Description | None,
-    unit: str,
-) -> Requirement:
-    met, count = int(np.sum(good & known)), int(np.sum(known))
-    interval = proportion_interval(met, count, statistics.CONFIDENCE) if runs.sampled and count else None
-    return Requirement(name, text, met, count, runs.count, interval, judged, unit)
 
 
 def _text(spec: ThresholdSpec) -> str:
@@ -449,23 +436,19 @@ INDEX: Record[Index] = Record(
 )
 INDICES: Record[Indices] = Record(
     "Sobol indices of a response.",
-    Quantity("method", lambda analysis: analysis.method, "chaos or grid; null where there are none, with the reason"),
-    Quantity("degree", lambda analysis: analysis.degree, "of the polynomials, 0 for a grid"),
-    Quantity("terms", lambda analysis: analysis.terms, "number of polynomials, 0 for a grid"),
-    Quantity("held_out_r2", lambda analysis: analysis.held_out, "of runs that the model was not fitted to"),
-    Quantity(
-        "unexplained_share", lambda analysis: analysis.rest, "share of the variance that the model does not explain"
-    ),
-    Quantity("noise_share", lambda analysis: analysis.noise, "share of the variance that the runs report as noise"),
-    Quantity("factors", lambda analysis: {index.name: index for index in analysis.axes}, "by factor", record=INDEX),
+    Quantity("method", lambda a: a.method, "chaos or grid; null where there are none, with the reason"),
+    Quantity("degree", lambda a: a.degree, "of the polynomials, 0 for a grid"),
+    Quantity("terms", lambda a: a.terms, "number of polynomials, 0 for a grid"),
+    Quantity("held_out_r2", lambda a: a.held_out, "of runs that the model was not fitted to"),
+    Quantity("unexplained_share", lambda a: a.rest, "share of the variance that the model does not explain"),
+    Quantity("noise_share", lambda a: a.noise, "share of the variance that the runs report as noise"),
+    Quantity("factors", lambda a: {index.name: index for index in a.axes}, "by factor", record=INDEX),
 )
 CONVERGENCE: Record[Convergence] = Record(
     "Accuracy of a statistic of the runs.",
-    Quantity(
-        "relative_half_width", lambda convergence: convergence.relative, "half the interval over sigma of the response"
-    ),
-    Quantity("enough_runs", lambda convergence: convergence.enough, "true if that is below the goal"),
-    Quantity("runs_needed", lambda convergence: convergence.needed, "about how many runs would reach it"),
+    Quantity("relative_half_width", lambda c: c.relative, "half the interval over sigma of the response"),
+    Quantity("enough_runs", lambda c: c.enough, "true if that is below the goal"),
+    Quantity("runs_needed", lambda c: c.needed, "about how many runs would reach it"),
 )
 
 
@@ -554,21 +537,17 @@ FRONT: Record[ParetoFront] = Record(
 )
 STATISTICS: Record[StudyAnalysis] = Record(
     "statistics.json: numbers of a study's report; null where the runs do not determine a number.",
-    Quantity("name", lambda analysis: analysis.runs.study.name, "of the study"),
-    Quantity("design", lambda analysis: analysis.runs.kind, "kind of the design"),
-    Quantity("runs", lambda analysis: analysis.runs.count, "number of runs"),
-    Quantity("failed", lambda analysis: analysis.runs.failed.sum(), "runs that failed"),
-    Quantity("confidence", lambda analysis: statistics.CONFIDENCE, "of all intervals"),
+    Quantity("name", lambda a: a.runs.study.name, "of the study"),
+    Quantity("design", lambda a: a.runs.kind, "kind of the design"),
+    Quantity("runs", lambda a: a.runs.count, "number of runs"),
+    Quantity("failed", lambda a: a.runs.failed.sum(), "runs that failed"),
+    Quantity("confidence", lambda a: statistics.CONFIDENCE, "of all intervals"),
     Quantity(
         "responses",
-        lambda analysis: {
-            response.name: _ResponseAnalysis(analysis, response) for response in analysis.runs.everything
-        },
+        lambda a: {response.name: _ResponseAnalysis(a, response) for response in a.runs.everything},
         "responses, and the sigmas that the runs report for them",
         record=RESPONSE,
     ),
-    Quantity(
-        "requirements", lambda analysis: analysis.requirements, "in the study's order, then all", record=REQUIREMENT
-    ),
-    Quantity("pareto", lambda analysis: analysis.fronts, "of the pairs that the study asks for", record=FRONT),
+    Quantity("requirements", lambda a: a.requirements, "in the study's order, then all", record=REQUIREMENT),
+    Quantity("pareto", lambda a: a.fronts, "of the pairs that the study asks for", record=FRONT),
 )

@@ -1,7 +1,5 @@
 """Figures of a study: distributions, response curves, effects, pairs, convergence and Pareto fronts."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from typing import Any
 
@@ -309,15 +307,8 @@ def pareto_figure(analysis: StudyAnalysis) -> Figure:
     for axes, front in zip(grid, analysis.fronts, strict=True):
         x, y = analysis.runs.find(front.spec.x), analysis.runs.find(front.spec.y)
         shown = thinned(front.ranks > 0, 1000)
-        axes.plot(
-            x.values[shown],
-            y.values[shown],
-            ".",
-            color=GREY,
-            ms=dot_size(len(shown)),
-            alpha=0.7,
-            label="dominated runs",
-        )
+        size = dot_size(len(shown))
+        axes.plot(x.values[shown], y.values[shown], ".", color=GREY, ms=size, alpha=0.7, label="dominated runs")
         if len(front.runs):
             # nothing is known between two runs of the front, so it is drawn as steps
             axes.step(front.x, front.y, where="post", color=BLUE, lw=1.0)

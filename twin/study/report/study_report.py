@@ -1,7 +1,5 @@
 """Report of a study: ``report.html``, the figures and tables in ``artefacts``, and ``statistics.json``."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -161,17 +159,8 @@ MOST_FRONT = 50
 
 def sections(analysis: StudyAnalysis) -> list[Section]:
     """Return all sections of the report that have contents, in the order of the page."""
-    candidates = (
-        _requirements(analysis),
-        _distributions(analysis),
-        _influences(analysis),
-        _indices(analysis),
-        _curves(analysis),
-        _pairs(analysis),
-        _fronts(analysis),
-        _convergence(analysis),
-    )
-    return [section for section in candidates if section is not None]
+    makers = (_requirements, _distributions, _influences, _indices, _curves, _pairs, _fronts, _convergence)
+    return [section for make in makers if (section := make(analysis)) is not None]
 
 
 def _response_table(analysis: StudyAnalysis) -> Table:
@@ -237,21 +226,13 @@ def _requirements(analysis: StudyAnalysis) -> Section | None:
     )
     failed_text = f" {failed} failed runs are not counted." if failed else ""
     more = ("all runs, if none … all without a value meet it", "interval of all runs") if lacking else ()
-    return Section(
-        "Requirements",
-        (),
-        (
-            Table(
-                "requirements",
-                "Share of the runs that meet them",
-                f"Over the runs with a finite value.{failed_text} {how} The last columns are quantiles of the response "
-                "or its absolute value.",
-                ("requirement", "", "unit", "met", "of", "share", "interval", *more, "95%", "99.7%"),
-                rows,
-                within=STATISTICS,
-            ),
-        ),
+    caption = (
+        f"Over the runs with a finite value.{failed_text} {how} The last columns are quantiles of the response or its "
+        "absolute value."
     )
+    heads = ("requirement", "", "unit", "met", "of", "share", "interval", *more, "95%", "99.7%")
+    title = "Share of the runs that meet them"
+    return Section("Requirements", (), (Table("requirements", title, caption, heads, rows, within=STATISTICS),))
 
 
 def _distributions(analysis: StudyAnalysis) -> Section | None:
@@ -298,17 +279,9 @@ def _influences(analysis: StudyAnalysis) -> Section | None:
         texts.append(f"{r.name} {words.percent(model.r2)}")
         for e in model.effects:
             ends = " … ".join(end if isinstance(end, str) else words.number(end, 3) for end in e.span)
-            rows.append(
-                [
-                    r.name,
-                    e.factor,
-                    ends,
-                    words.with_limits(e.swing) if sampled else words.number(e.swing.value),
-                    typeset(r.unit),
-                    _maybe(e.coefficient, sampled),
-                    _maybe(e.rank, sampled),
-                ]
-            )
+            swing = words.with_limits(e.swing) if sampled else words.number(e.swing.value)
+            ranks = _maybe(e.coefficient, sampled), _maybe(e.rank, sampled)
+            rows.append([r.name, e.factor, ends, swing, typeset(r.unit), *ranks])
     table = Table(
         "linear-model",
         "Linear model and rank correlations",

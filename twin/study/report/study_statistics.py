@@ -310,26 +310,18 @@ def describe(values: np.ndarray, sampled: bool) -> Description:
     if n == 0:
         return Description(0)
     ordered = np.sort(good)
-    quantiles = [
+    median, p95, p997 = (
         Estimate(float(np.quantile(ordered, q)), quantile_interval(ordered, q) if sampled else (None, None))
         for q in (0.5, 0.95, 0.997)
-    ]
+    )
     std = None
     if n > 1:
         std = Estimate(float(np.std(good, ddof=1)), std_interval(good) if sampled else (None, None))
     enough = n * TAILS[0] >= 1.0
-    return Description(
-        count=n,
-        mean=Estimate(float(np.mean(good)), mean_interval(good) if sampled else (None, None)),
-        std=std,
-        median=quantiles[0],
-        p95=quantiles[1],
-        p997=quantiles[2],
-        low=float(ordered[0]),
-        high=float(ordered[-1]),
-        normality=normality(good) if sampled else None,
-        tails=(float(np.quantile(ordered, TAILS[0])), float(np.quantile(ordered, TAILS[1]))) if enough else None,
-    )
+    mean = Estimate(float(np.mean(good)), mean_interval(good) if sampled else (None, None))
+    tails = (float(np.quantile(ordered, TAILS[0])), float(np.quantile(ordered, TAILS[1]))) if enough else None
+    shape = normality(good) if sampled else None
+    return Description(n, mean, std, median, p95, p997, float(ordered[0]), float(ordered[-1]), shape, tails)
 
 
 def mean_interval(values: np.ndarray) -> Interval:

@@ -5,8 +5,6 @@ counts as finished only when it has been written to the study's journal, a file 
 continued.
 """
 
-from __future__ import annotations
-
 import os
 import threading
 import time

@@ -1,7 +1,5 @@
 """Setup of a study: its specification, the complete data of its base job, and the tables of its factors."""
 
-from __future__ import annotations
-
 import csv
 import hashlib
 import json

@@ -25,7 +25,7 @@ from analysis.arrays import ARCSEC
 from analysis.monitor import autocollimator
 from analysis.monitor.autocollimator import column_component, mean_difference, relation_factor
 from optics.numerics.quadrature import PupilNodes
-from scenes.specs.autocollimators import AutocollimatorSetup
+from scenes.specs.camera_tests import AutocollimatorSetup
 from scenes.specs.load import load_autocollimator_test
 from twin.framework.svg import BLUE, GREY, INK, LIGHT, ORANGE, VERMILION, look, to_png
 from twin.laboratory import autocollimator_bench as laboratory

@@ -17,8 +17,8 @@ from analysis.statistics import rms
 from analysis.turntable.angle_network import NotConvergedError
 from analysis.turntable.dividing_error import FITS, CalibrationSeries, fit_dividing_error, rejection_rate
 from optics.numerics.backend import one_blas_thread
+from scenes.specs.camera_tests import TurntableTestSpec
 from scenes.specs.resolved import TurntableSetup
-from scenes.specs.turntable import TurntableTestSpec
 from twin.framework.artefact import Cell
 from twin.laboratory.turntable_run import TurntableModel, run_turntable
 from twin.validation.check import CheckResult, Chosen, median_of
