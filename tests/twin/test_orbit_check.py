@@ -149,7 +149,7 @@ def test_what_is_exported_is_the_pass_that_was_read() -> None:
     from scenes.specs.orbit.setup import CheckSetup, MeasuredCalibrationSetup
     from twin.orbit.conventions.check_run import exported, measurements
     from twin.orbit.flight.platform_table import TabulatedTrajectory
-    from twin.orbit.measured.clock import Readings
+    from twin.orbit.measured.earth_orientation import Readings
     from twin.orbit.measured.measurement_tables import read_measurements
 
     folder = SCENES / "orbit/measured"

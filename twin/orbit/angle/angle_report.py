@@ -22,7 +22,7 @@ from twin.framework import svg
 from twin.framework.artefact import FAR, Cell, SvgFigure, Table, fixed
 from twin.framework.report import Report, Section, answer
 from twin.orbit.angle.angle_run import UNLIKELY, AngleRun, PassAngles, Scatter, SimulatedAngleRun, values_of
-from twin.orbit.flight.light_effects import SPEED_OF_LIGHT, LightEffects
+from twin.orbit.flight.sensor import SPEED_OF_LIGHT, LightEffects
 
 METHOD_NAMES = {
     "printed": "planes, eq. 5 as printed",

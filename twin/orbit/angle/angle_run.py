@@ -41,8 +41,8 @@ from optics.numerics.backend import one_blas_thread
 from twin.framework.procedure import Advance, BenchError, silent
 from twin.framework.record import Quantity, Record
 from twin.orbit.angle.angle_flight import AnglePass, Measurement, angle_camera, fly
-from twin.orbit.flight.light_effects import NO_EFFECTS, LightEffects
 from twin.orbit.flight.line_camera import LineAngles
+from twin.orbit.flight.sensor import NO_EFFECTS, LightEffects
 
 if TYPE_CHECKING:
     from optics.numerics.backend import Backend

@@ -31,10 +31,9 @@ from twin.framework.procedure import Advance, BenchError, silent
 from twin.orbit.angle.angle_flight import LEAST_SIGMA, Measurement, without_effects
 from twin.orbit.angle.angle_run import AngleRun, PassAngles, SimulatedAngleRun, estimate_angles, run_angle
 from twin.orbit.flight.earth import Earth
-from twin.orbit.flight.light_effects import EARTH_RATE, NO_EFFECTS, LightEffects
 from twin.orbit.flight.line_camera import LineAngles, LineCamera, LineTimes, line_cameras
 from twin.orbit.flight.platform_table import PlatformTable, TabulatedTrajectory
-from twin.orbit.flight.sensor import Sensor
+from twin.orbit.flight.sensor import EARTH_RATE, NO_EFFECTS, LightEffects, Sensor
 from twin.orbit.measured.measurement_tables import CAMERA_FILE, campaign_files, read_measurements
 from twin.orbit.measured.pass_measurements import GroundPoints, ImagePoints, PassMeasurements
 

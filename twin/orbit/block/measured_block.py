@@ -24,8 +24,8 @@ from scenes.specs.orbit.setup import MeasuredAdjustSetup
 from twin.framework.procedure import Advance, BenchError, silent
 from twin.orbit.calibration.campaign import light_effects, line_model, pass_data
 from twin.orbit.flight.earth import Earth, tai_of
-from twin.orbit.flight.light_effects import NO_EFFECTS
 from twin.orbit.flight.platform_table import TabulatedTrajectory
+from twin.orbit.flight.sensor import NO_EFFECTS
 from twin.orbit.measured.measurement_tables import read_measurements
 from twin.orbit.measured.pass_measurements import PassMeasurements
 

@@ -16,7 +16,7 @@ from analysis.orbit.three_line_model import BIAS
 from twin.framework.record import Quantity, Record
 from twin.orbit.calibration.calibration_run import CalibrationRun, FieldResult, Unknown, unit, unknowns
 from twin.orbit.calibration.campaign import Campaign, FieldImages, FieldPass, Screening, interior_names
-from twin.orbit.calibration.campaign_adjustment import LatitudeFit
+from twin.orbit.calibration.campaign_adjustment import LatitudeFit, ground_sample, intersection_fit
 from twin.orbit.calibration.influences import AttitudeDrift, ChipStep, DatumRow, LightRow, UnexpectedChange
 from twin.orbit.calibration.schemes import (
     DriftSize,
@@ -29,7 +29,6 @@ from twin.orbit.calibration.schemes import (
     Treatment,
     meets,
 )
-from twin.orbit.calibration.screening import ground_sample, intersection_fit
 from twin.orbit.images.patch import LineComparison
 from twin.orbit.images.simulate_run import MATCH_COUNTS
 

@@ -15,9 +15,9 @@ from twin.orbit.calibration import calibration_sections
 from twin.orbit.calibration.calibration_numbers import CALIBRATION
 from twin.orbit.calibration.calibration_run import CalibrationRun, unit
 from twin.orbit.calibration.campaign import any_effect, light_effects
+from twin.orbit.calibration.campaign_adjustment import intersection_fit
 from twin.orbit.calibration.influences import UNEXPECTED_SIGMAS, drift_warnings, step_warnings
 from twin.orbit.calibration.schemes import meets, values_of
-from twin.orbit.calibration.screening import intersection_fit
 from twin.orbit.images.simulate_report import changes_text
 from twin.orbit.measured.pass_measurements import duplicates, listed
 

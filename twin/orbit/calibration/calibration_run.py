@@ -32,6 +32,8 @@ from twin.orbit.calibration.campaign_adjustment import (
     gauge_of,
     latitude_fits,
     rate_priors,
+    require_correct_names,
+    screen_campaign,
     simultaneous,
     with_detected_drift,
 )
@@ -60,7 +62,6 @@ from twin.orbit.calibration.schemes import (
     scheme_errors,
     study_monitoring,
 )
-from twin.orbit.calibration.screening import require_correct_names, screen_campaign
 from twin.orbit.measured.measurement_tables import (
     CAMERA_FILE,
     LINES_SEE_POINTS,

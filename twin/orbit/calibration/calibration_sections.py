@@ -21,12 +21,12 @@ from twin.framework.report import Section
 from twin.orbit.calibration.calibration_numbers import CHIP_STEP, LATITUDE, MATCHING, SCREENED
 from twin.orbit.calibration.calibration_plots import figure_svg
 from twin.orbit.calibration.calibration_run import STEPWISE_TOLERANCE, CalibrationRun
+from twin.orbit.calibration.campaign_adjustment import ground_sample, intersection_fit
 from twin.orbit.calibration.influences import UNEXPECTED_SIGMAS, LightRow
 from twin.orbit.calibration.schemes import RMS, FieldErrors, SchemeMeans, meets, values_of
-from twin.orbit.calibration.screening import ground_sample, intersection_fit
 from twin.orbit.images.image_points import UNMODELLED_SIGMA
 from twin.orbit.images.patch import WRONG
-from twin.orbit.images.point_report import SORTS, points_png
+from twin.orbit.images.simulate_report import SORTS, points_png
 
 _SCALES = {"rad": (ARCSEC, "arcsec"), "rad/s": (1e-3 * ARCSEC, "mas/s"), "m": (1.0, "m")}
 """Unit of an unknown in result files -> unit of the tables of the report, as its size in SI units and its name."""

@@ -42,11 +42,10 @@ from twin.orbit.calibration.campaign import (
     passing_orbit,
 )
 from twin.orbit.flight.earth import Earth, east_north_up
-from twin.orbit.flight.light_effects import LightEffects
 from twin.orbit.flight.line_camera import LineTimes, changed_payload, drifted_payload, line_cameras
 from twin.orbit.flight.orbit import propagate
 from twin.orbit.flight.platform_table import PlatformTable, TabulatedTrajectory
-from twin.orbit.flight.sensor import Sensor
+from twin.orbit.flight.sensor import LightEffects, Sensor
 from twin.orbit.flight.trajectory import TERMS, Trajectory
 from twin.orbit.images.image_points import POINTS_REMEDY, MatchedPoints, PointsError, measure_points
 from twin.orbit.images.line_optics import LineOptics, optics_of

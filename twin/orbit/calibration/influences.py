@@ -24,7 +24,7 @@ from scenes.specs.orbit.measurements import MeasuredCalibrationSpec
 from twin.orbit.calibration.campaign import EFFECTS, Campaign, DetectedDrift
 from twin.orbit.calibration.campaign_adjustment import calibrated_alone, simultaneous
 from twin.orbit.calibration.schemes import FieldErrors, laboratory_errors, scheme_errors
-from twin.orbit.flight.light_effects import NO_EFFECTS
+from twin.orbit.flight.sensor import NO_EFFECTS
 
 UNEXPECTED_SIGMAS = 4.0
 """Difference of an unknown from its expected value, in units of its expected standard deviation, beyond which it is

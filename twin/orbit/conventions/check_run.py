@@ -32,9 +32,9 @@ from twin.orbit.conventions.pass_readings import (
     pixel_of,
     spread,
 )
-from twin.orbit.flight.light_effects import LightEffects
 from twin.orbit.flight.line_camera import LineTimes, line_cameras
-from twin.orbit.measured.clock import epoch_before
+from twin.orbit.flight.sensor import LightEffects
+from twin.orbit.measured.earth_orientation import epoch_before
 from twin.orbit.measured.measurement_tables import campaign_files
 from twin.orbit.measured.pass_measurements import ImagePoints, PassMeasurements
 from twin.orbit.measured.platform_files import platform_table

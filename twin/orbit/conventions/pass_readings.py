@@ -26,13 +26,11 @@ from scenes.yaml.csv_table import Column, read_table
 from scenes.yaml.errors import InputError, Problem, names_text, nearest, shown
 from scenes.yaml.units import TIME
 from twin.orbit.flight.earth import Earth, east_north_up
-from twin.orbit.flight.light_effects import LightEffects
 from twin.orbit.flight.line_camera import LineCamera, LineTimes
 from twin.orbit.flight.platform_table import TabulatedTrajectory
-from twin.orbit.flight.sensor import Sensor
-from twin.orbit.measured.clock import Readings
+from twin.orbit.flight.sensor import LightEffects, Sensor
 from twin.orbit.measured.dimap_file import is_dimap, read_dimap
-from twin.orbit.measured.earth_orientation import constant_orientation
+from twin.orbit.measured.earth_orientation import Readings, constant_orientation
 from twin.orbit.measured.ground_files import GroundFile, read_ground_points
 from twin.orbit.measured.measurement_tables import COLUMNS, image_covariance, require_known
 from twin.orbit.measured.pass_measurements import ImagePoints

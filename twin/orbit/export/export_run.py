@@ -22,8 +22,7 @@ import tifffile
 from numpy.typing import NDArray
 
 from analysis.orbit.forward_intersection import CalibratedLine
-from analysis.orbit.image_correction import ImageCorrection, Kind
-from analysis.orbit.rational_polynomial import RationalPolynomial
+from analysis.orbit.rational_polynomial import ImageCorrection, Kind, RationalPolynomial
 from optics.numerics.number_tree import FrozenMap
 from scenes.models.instrument_builder import build_instrument
 from scenes.specs.file_kinds import kind_of

@@ -12,8 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from analysis.orbit.image_correction import LEAST_POINTS
-from analysis.orbit.rational_polynomial import RationalPolynomial
+from analysis.orbit.rational_polynomial import LEAST_POINTS, RationalPolynomial
 from optics.numerics.number_tree import FrozenMap
 from scenes.yaml.errors import InputError, Issue, names_text
 from scenes.yaml.yaml_file import dump_yaml

@@ -24,8 +24,14 @@ from pathlib import Path
 import numpy as np
 
 from analysis.arrays import Array
-from analysis.orbit.image_correction import ImageCorrection, Kind, image_correction
-from analysis.orbit.rational_polynomial import TERMS, RationalPolynomial, fit_rpc
+from analysis.orbit.rational_polynomial import (
+    TERMS,
+    ImageCorrection,
+    Kind,
+    RationalPolynomial,
+    fit_rpc,
+    image_correction,
+)
 from scenes.yaml.errors import InputError, Issue, names_text, nearest, shown
 from scenes.yaml.input_file import why_unreadable
 from twin.orbit.flight.earth import Earth, curvature_radii, east_north_up

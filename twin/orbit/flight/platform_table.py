@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from analysis.arrays import Array
 from optics.numerics.array_math import UnphysicalError, in_span
-from twin.orbit.flight.light_effects import earth_rotation_velocity
+from twin.orbit.flight.sensor import earth_rotation_velocity
 from twin.orbit.flight.trajectory import Attitude, Trajectory, readings
 
 Interpolation = Literal["spline", "lagrange"]

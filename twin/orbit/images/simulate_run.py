@@ -31,11 +31,10 @@ from twin.framework.random_streams import stream
 from twin.framework.record import Quantity, Record, plain_data
 from twin.framework.reference_frames import described
 from twin.orbit.flight.earth import Earth
-from twin.orbit.flight.light_effects import LightEffects
 from twin.orbit.flight.line_camera import LineCamera, LineTimes, changed_payload, line_cameras
 from twin.orbit.flight.orbit import propagate
 from twin.orbit.flight.platform_table import PlatformTable, continuous_quaternions
-from twin.orbit.flight.sensor import Sensor
+from twin.orbit.flight.sensor import LightEffects, Sensor
 from twin.orbit.flight.trajectory import Trajectory, readings
 from twin.orbit.ground.orthophoto import Raster
 from twin.orbit.images.image_points import (

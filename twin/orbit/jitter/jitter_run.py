@@ -18,11 +18,10 @@ from twin.framework.procedure import Advance, BenchError, silent
 from twin.framework.random_streams import stream
 from twin.framework.record import Quantity, Record
 from twin.orbit.flight.earth import Earth
-from twin.orbit.flight.light_effects import NO_EFFECTS, LightEffects
 from twin.orbit.flight.line_camera import LineTimes, line_cameras
 from twin.orbit.flight.orbit import propagate
 from twin.orbit.flight.platform_table import PlatformTable
-from twin.orbit.flight.sensor import Sensor
+from twin.orbit.flight.sensor import NO_EFFECTS, LightEffects, Sensor
 from twin.orbit.flight.trajectory import Jitter, Trajectory
 from twin.orbit.jitter.sights import Sights, SightsError, sights_of
 from twin.orbit.measured.measurement_tables import CAMERA_FILE, campaign_files, read_measurements

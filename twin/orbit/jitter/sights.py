@@ -26,10 +26,9 @@ from analysis.statistics import robust_sigma
 from optics.numerics.array_math import PhysicalError, in_span
 from scenes.specs.orbit.jitter_search import AXES, JitterSearchSpec
 from twin.orbit.flight.earth import Earth, east_north_up
-from twin.orbit.flight.light_effects import LightEffects, earth_rotation_velocity
 from twin.orbit.flight.line_camera import LineCamera, LineTimes
 from twin.orbit.flight.platform_table import TabulatedTrajectory
-from twin.orbit.flight.sensor import OffsetPlatform, Sensor
+from twin.orbit.flight.sensor import LightEffects, OffsetPlatform, Sensor, earth_rotation_velocity
 from twin.orbit.flight.trajectory import Attitude
 from twin.orbit.measured.pass_measurements import PassMeasurements
 

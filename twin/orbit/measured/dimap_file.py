@@ -36,9 +36,9 @@ from analysis.arrays import Array
 from optics.numerics.array_math import in_span
 from optics.numerics.number_tree import FrozenMap
 from scenes.yaml.errors import InputError, Issue, names_text, shown
-from twin.orbit.flight.light_effects import earth_rotation_velocity
 from twin.orbit.flight.platform_table import continuous_quaternions
-from twin.orbit.measured.clock import Readings
+from twin.orbit.flight.sensor import earth_rotation_velocity
+from twin.orbit.measured.earth_orientation import Readings, readings, require_increasing
 from twin.orbit.measured.orbit_files import (
     SPEED_TOLERANCE,
     AttitudeReadings,
@@ -47,7 +47,7 @@ from twin.orbit.measured.orbit_files import (
     require_unit,
     velocity_misfit,
 )
-from twin.orbit.measured.xml_file import Element, read_xml, readings, require_increasing
+from twin.orbit.measured.xml_file import Element, read_xml
 
 PROFILES = ("PHR_SENSOR", "PNEO_SENSOR", "S6_SENSOR", "S7_SENSOR")
 """Metadata profiles of the products for which a rigorous model can be read."""

@@ -21,15 +21,22 @@ from scenes.yaml.csv_table import Column, Table, read_table
 from scenes.yaml.errors import InputError, Issue, Problem
 from scenes.yaml.units import ANGLE, DISTANCE, SPEED, TIME
 from twin.orbit.flight.earth import Earth
-from twin.orbit.flight.light_effects import NO_EFFECTS, LightEffects
 from twin.orbit.flight.line_camera import polynomial_line
 from twin.orbit.flight.platform_table import PlatformTable, TabulatedTrajectory
-from twin.orbit.flight.sensor import Sensor
+from twin.orbit.flight.sensor import NO_EFFECTS, LightEffects, Sensor
 from twin.orbit.flight.trajectory import Attitude
 from twin.orbit.measured import earth_orientation, orbit_files
-from twin.orbit.measured.clock import Instants, Readings, calendar_reading, epoch_before, tai_minus_utc
 from twin.orbit.measured.dimap_file import DimapPass, is_dimap, read_dimap
-from twin.orbit.measured.earth_orientation import EarthOrientation, TableRotation
+from twin.orbit.measured.earth_orientation import (
+    EarthOrientation,
+    Instants,
+    Readings,
+    TableRotation,
+    calendar_reading,
+    epoch_before,
+    require_increasing,
+    tai_minus_utc,
+)
 from twin.orbit.measured.orbit_files import (
     AttitudeReadings,
     OrbitReadings,
@@ -37,7 +44,7 @@ from twin.orbit.measured.orbit_files import (
     require_orbit,
     require_unit,
 )
-from twin.orbit.measured.xml_file import first_lines, require_increasing
+from twin.orbit.measured.xml_file import first_lines
 
 if TYPE_CHECKING:
     from scenes.specs.orbit.measurements import AttitudeFileSpec, LineTimesFileSpec, OrbitFileSpec, PlatformFilesSpec

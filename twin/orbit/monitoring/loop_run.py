@@ -35,9 +35,8 @@ from twin.framework.procedure import Advance, BenchError
 from twin.framework.random_streams import stream
 from twin.monitor.image_quality import image_quality
 from twin.monitor.monitor_experiment import MonitorExperiment
-from twin.orbit.flight.light_effects import NO_EFFECTS
 from twin.orbit.flight.line_camera import LineCamera, calibrated_line, corrected_line
-from twin.orbit.flight.sensor import Sensor
+from twin.orbit.flight.sensor import NO_EFFECTS, Sensor
 from twin.orbit.images.image_points import POINTS_REMEDY, PointsError, tie_points
 from twin.orbit.images.line_optics import LineOptics
 from twin.orbit.images.patch import PatchError, fly_patch, imaged_lines

@@ -23,10 +23,9 @@ from twin.framework.procedure import Advance, BenchError
 from twin.framework.random_streams import stream
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.orbit.flight.earth import Earth
-from twin.orbit.flight.light_effects import NO_EFFECTS
 from twin.orbit.flight.line_camera import LineCamera, calibrated_line, traced_line_cameras
 from twin.orbit.flight.orbit import propagate
-from twin.orbit.flight.sensor import Platform, Sensor
+from twin.orbit.flight.sensor import NO_EFFECTS, Platform, Sensor
 from twin.orbit.flight.trajectory import Trajectory
 
 if TYPE_CHECKING:
