@@ -317,9 +317,8 @@ def _check_separable(columns: Array, names: tuple[str, ...], angle: Array) -> No
     low, high = np.rad2deg(np.min(angle)), np.rad2deg(np.max(angle))
     side = ", all on one side of zero" if low * high > 0 else ""
     raise OrientationError(
-        f"interior orientation: angles from {low:.6g} to {high:.6g} deg{side}, cannot separate {', '.join(mixed)}"
-        f" (condition number {condition:.2g}); measure at more angles over both halves of the"
-        " field, or omit a term"
+        f"interior orientation: angles from {low:.6g} to {high:.6g} deg{side}, cannot separate {', '.join(mixed)} "
+        f"(condition number {condition:.2g}); measure at more angles over both halves of the field, or omit a term"
     )
 
 

@@ -252,4 +252,4 @@ def test_a_reading_that_cannot_be_says_why(files, tmp_path: Path, name: str, old
     spec = with_absolute_files(OrbitCheckSpec.model_validate(data), tmp_path)
     setup = CheckSetup.model_construct(test=spec, camera=load_three_line_camera("th1"))
     readings, stated = read_pass(spec, setup.camera, Path())
-    assert why in _tried(_bench(setup, readings, stated), stated, ()).why
+    assert why in _tried(_bench(setup, readings, stated), ()).why

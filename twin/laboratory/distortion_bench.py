@@ -516,8 +516,7 @@ def _check_table(setup: DistortionSetup, field_angle: np.ndarray) -> None:
     if field_angle[-1] > margin:
         raise BenchError(
             f"the camera's field requires +-{np.rad2deg(field_angle[-1]):.3f} deg of the turntable, but about its "
-            "camera_angle "
-            f"only +-{np.rad2deg(max(margin, 0.0)):.3f} deg are calibrated",
+            f"camera_angle only +-{np.rad2deg(max(margin, 0.0)):.3f} deg are calibrated",
             ("reach",),
             "a smaller reach, or a turntable file that is calibrated over the field",
         )

@@ -147,8 +147,7 @@ def _verdict(run: DistortionRun, data: Mapping[str, Any]) -> tuple[str, tuple[st
         f"chi-square is {data['chi_square']:.1f} for {data['degrees_of_freedom']} degrees of freedom with the "
         "specified noise",
         f"{noise['rejected']} of {int(np.sum(run.present))} spots were rejected, {expected:.0f} expected by chance: "
-        "see "
-        "the noise",
+        "see the noise",
     )
 
 
@@ -182,8 +181,7 @@ def _warnings(run: DistortionRun, data: Mapping[str, Any]) -> tuple[str, ...]:
             out.append(
                 "as-built coma that increases over the field shifts energy centroids against chief rays and f by "
                 f"{1e6 * slope:.0f} µm, which is not in the sigma of f ({1e6 * sigma:.0f} µm): measure the wavefront "
-                "at several "
-                "fields"
+                "at several fields"
             )
     if run.readings is not None:
         out += run.readings.file.doubts
@@ -199,8 +197,7 @@ def _warnings(run: DistortionRun, data: Mapping[str, Any]) -> tuple[str, ...]:
         out.append(
             f"the line's middle is imaged {run.compensated.zero / ARCSEC:.3g} arcsec from `zero`, which moves the "
             f"principal point by {1e3 * moved:.3g} mm and is not in the sigmas; zero: {np.degrees(zero):.9f} deg "
-            "removes "
-            "this shift"
+            "removes this shift"
         )
     if abs(f / run.approximate_f - 1.0) > 0.05:
         out.append(
@@ -216,8 +213,7 @@ def _warnings(run: DistortionRun, data: Mapping[str, Any]) -> tuple[str, ...]:
     if run.compensation is None:
         out.append(
             "no calibration of the turntable: a dividing error of long period is not distinguishable from distortion, "
-            "and "
-            "only `angle_sigma` covers it"
+            "and only `angle_sigma` covers it"
         )
     return tuple(out)
 
@@ -325,8 +321,7 @@ def _joint(joint: Mapping[str, Any]) -> Section:
                 "distortion-line",
                 "Joint model as a line of a payload's file",
                 "tan θ = (y − y0) (1 + k1 (y − y0)²) / f from the camera's Z, which is at the angle `axis` from the "
-                "zero of "
-                "the angles; principal_distance, principal_point: [0 mm, y0] and k1 as in a payload's file.",
+                "zero of the angles; principal_distance, principal_point: [0 mm, y0] and k1 as in a payload's file.",
                 joint["line"],
                 "",
                 line,
@@ -342,8 +337,7 @@ def _estimates(run: DistortionRun, data: Mapping[str, Any]) -> Section:
     constant_text = (
         "Equations (1) to (4) (Li et al., doi 10.3788/IRLA20200143) have no constant: W must count exactly from the "
         "direction that is imaged to the line's middle. The fitted constant places it "
-        f"{run.compensated.zero / ARCSEC:.3f} "
-        "arcsec from the specified zero"
+        f"{run.compensated.zero / ARCSEC:.3f} arcsec from the specified zero"
     )
     text, caption = [f"{constant_text}."], "All with compensated angles." if run.compensation is not None else ""
     if isinstance(run, SimulatedDistortion):
@@ -405,10 +399,8 @@ def _noise(run: DistortionRun, data: Mapping[str, Any]) -> Section:
         text.append(
             f"The table's repeatability, {format_quantity(repeatability, ANGLE)}, contributes "
             f"{1e6 * run.compensated.fit.value('principal_distance') * repeatability:.2f} µm of the scatter between "
-            "the sets; "
-            f"{data['truth']['gross_errors']} exposures had a gross error. Non-uniformity of the line's columns shifts "
-            "a "
-            f"spot by {noise['centroid_columns_um']:.3f} µm."
+            f"the sets; {data['truth']['gross_errors']} exposures had a gross error. Non-uniformity of the line's "
+            f"columns shifts a spot by {noise['centroid_columns_um']:.3f} µm."
         )
         artefacts.append(
             SvgFigure(

@@ -40,17 +40,8 @@ from scenes.yaml.errors import InputError, Issue
 from twin.framework.memory import Lowered, require_memory
 from twin.framework.procedure import Advance, BenchError, silent
 from twin.framework.record import Quantity, Record
-from twin.laboratory import turntable_run
+from twin.laboratory import measured_readings, turntable_run
 from twin.laboratory.distortion_bench import DistortionBench, DistortionRecord, DistortionTruth
-from twin.laboratory.measured_readings import (
-    Comparisons,
-    DataFile,
-    SpotReadings,
-    calibrated_text,
-    read_spots,
-    read_turntable,
-    unwrapped,
-)
 from twin.laboratory.turntable_run import TurntableModel, usable_fits
 
 CLOSED_FORMS = tuple(name for name in FITS if name != "network")
@@ -139,8 +130,8 @@ class DistortionRun:
     raw: interior.Distortion
     compensated: interior.Distortion
     specified_fit: interior.InteriorOrientation
-    readings: SpotReadings | None = None
-    tables: tuple[Comparisons, ...] = ()
+    readings: measured_readings.SpotReadings | None = None
+    tables: tuple[measured_readings.Comparisons, ...] = ()
 
     @property
     def rejected(self) -> NDArray[np.bool_]:
@@ -376,16 +367,17 @@ def measure_files(spec: MeasuredDistortionSpec, seed: int) -> DistortionRun:
         A table cannot be used, or does not determine the unknowns.
     """
     files = spec.measured
-    readings = read_spots(files)
+    readings = measured_readings.read_spots(files)
     compensation, series, zero = None, None, files.zero
-    tables: tuple[Comparisons, ...] = ()
+    tables: tuple[measured_readings.Comparisons, ...] = ()
     if files.turntable is not None:
-        tables = read_turntable(files.turntable)
+        tables = measured_readings.read_turntable(files.turntable)
         cal, *held = tables
         series = cal.series
         # whole turns between the calibration's readings and those of the test
         whole_circles = (
-            unwrapped(np.array([files.zero]), 0.5 * float(series.angle[0] + series.angle[-1]))[0] - files.zero
+            measured_readings.unwrapped(np.array([files.zero]), 0.5 * float(series.angle[0] + series.angle[-1]))[0]
+            - files.zero
         )
         zero, readings = files.zero + whole_circles, replace(readings, reading=readings.reading + whole_circles)
         _check_region(files, readings, series, zero)
@@ -405,9 +397,11 @@ def measure_files(spec: MeasuredDistortionSpec, seed: int) -> DistortionRun:
     )
 
 
-def _check_region(files: DistortionFiles, readings: SpotReadings, series: CalibrationSeries, zero: float) -> None:
+def _check_region(
+    files: DistortionFiles, readings: measured_readings.SpotReadings, series: CalibrationSeries, zero: float
+) -> None:
     """Raise InputError if a reading lies outside of the calibrated region of the turntable."""
-    allowed = f"{calibrated_text(series.angle)}, the calibrated range"
+    allowed = f"{measured_readings.calibrated_text(series.angle)}, the calibrated range"
     if not covered(series.angle, zero):
         shown = f"{np.degrees(files.zero):.9g} deg"
         raise files.error("the turntable is not calibrated at this reading", ("zero",), found=shown, allowed=allowed)
@@ -420,7 +414,7 @@ def _check_region(files: DistortionFiles, readings: SpotReadings, series: Calibr
         raise InputError(Issue(text, readings.file.file, line, (readings.head,), shown, allowed))
 
 
-def _check_angles(files: DistortionFiles, readings: SpotReadings, zero: float) -> None:
+def _check_angles(files: DistortionFiles, readings: measured_readings.SpotReadings, zero: float) -> None:
     """Raise InputError for readings far from the angle zero, which suggest a wrong zero or unit in the file."""
     distance = np.abs(readings.reading - zero) * (readings.lines > 0)
     if np.max(distance) > MAX_FIELD_ANGLE:
@@ -576,7 +570,7 @@ def _correlation(run: DistortionRun) -> float:
     return float(fit.correlation[fit.terms.index("principal_distance"), fit.terms.index("principal_point")])
 
 
-def _read(run: DistortionRun) -> SpotReadings:
+def _read(run: DistortionRun) -> measured_readings.SpotReadings:
     assert run.readings is not None
     return run.readings
 
@@ -587,7 +581,7 @@ def _across(run: DistortionRun) -> float | None:
     return None if across is None else float(np.ptp(across))
 
 
-def _files(run: DistortionRun) -> list[DataFile] | None:
+def _files(run: DistortionRun) -> list[measured_readings.DataFile] | None:
     return None if run.readings is None else [run.readings.file, *(table.file for table in run.tables)]
 
 

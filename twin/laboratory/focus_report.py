@@ -357,10 +357,8 @@ def _warnings(run: FocusRun, data: Mapping[str, Any]) -> tuple[str, ...]:
         out.append(
             f"the curves through focus scatter more than their sigmas allow, chi-square {square:.0f} for {freedom} "
             "degrees of freedom: the sigmas of the MTF are too small, or the curves have another form. The sigmas of "
-            "the "
-            f"sites are too small by a factor of about {np.sqrt(square / freedom):.1f}; those of plane and shims "
-            "include "
-            "the scatter of the sites"
+            f"the sites are too small by a factor of about {np.sqrt(square / freedom):.1f}; those of plane and shims "
+            "include the scatter of the sites"
         )
     move, noise = run.states[0].skew
     if run.readings and chi2.sf((move / noise) ** 2, 1) < DOUBTFUL:
@@ -416,10 +414,8 @@ def _shims(run: FocusRun) -> Section:
         caption = (
             "Changes of thickness under each hole. The rotation in the mounting surface of "
             f"{fixed(shimming.plan.rotation / ARCMIN, 2)} arcmin is set by hand; without it the line would deviate "
-            "from its nominal "
-            f"level by {fixed(shimming.plan.level_coupling / ARCMIN, 2)} arcmin, as the mounting surface is not "
-            "parallel "
-            "to the focal plane."
+            f"from its nominal level by {fixed(shimming.plan.level_coupling / ARCMIN, 2)} arcmin, as the mounting "
+            "surface is not parallel to the focal plane."
         )
         tables.append(focus_run.SHIMS.table(f"shims-{number}", title, caption, rows, label="hole"))
     return Section("Shims", (), tuple(tables))

@@ -10,20 +10,9 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
+from scenes.specs.orbit import flight
 from scenes.specs.orbit.angle import Relief, TerrainHeight
 from scenes.specs.orbit.calibration import CameraDriftSpec, FieldLength, MonitorReadingSpec
-from scenes.specs.orbit.flight import (
-    Altitude,
-    AngleErrors,
-    AttitudeSpec,
-    EarthSpec,
-    Frequency,
-    Interval,
-    Latitude,
-    Longitude,
-    PayloadTestSpec,
-    UtcTime,
-)
 from scenes.specs.orbit.measurements import MeasuredTestSpec
 from scenes.specs.orbit.scene import LineTime
 from scenes.specs.procedures import SENSORS
@@ -64,9 +53,9 @@ class LawSpec(Spec):
 
     law: LawKind
     shared_by: Literal["pass", "tracker", "block"] = "pass"
-    interval: Interval = 1.0
+    interval: flight.Interval = 1.0
     time: Period | None = None
-    frequency: Frequency | None = None
+    frequency: flight.Frequency | None = None
 
     @model_validator(mode="after")
     def _has_its_time(self) -> LawSpec:
@@ -164,9 +153,9 @@ class BlockPassSpec(Spec):
         Name of the star tracker that measures the attitude.
     """
 
-    epoch: UtcTime
-    longitude: Longitude | None = None
-    latitude: Latitude | None = None
+    epoch: flight.UtcTime
+    longitude: flight.Longitude | None = None
+    latitude: flight.Latitude | None = None
     direction: Literal["descending", "ascending"] = "descending"
     roll: Annotated[float, Quantity(ANGLE, largest="40 deg")] = 0.0
     tracker: Name = "tracker"
@@ -191,8 +180,8 @@ class AreaSpec(Spec):
         Size of the area from south to north, in metres.
     """
 
-    longitude: Longitude
-    latitude: Latitude
+    longitude: flight.Longitude
+    latitude: flight.Latitude
     height: TerrainHeight = 0.0
     relief: Relief = 0.0
     east: FieldLength = 20e3
@@ -319,7 +308,7 @@ def check_one_monitor(monitor: object, record: MonitorRecordSpec | None) -> None
         raise Problem("`monitor` and `monitor_record` are both given", None, "one of them", within=("monitor_record",))
 
 
-class OrbitAdjustSpec(PayloadTestSpec):
+class OrbitAdjustSpec(flight.PayloadTestSpec):
     """Bundle adjustment of a simulated block of scenes.
 
     Attributes
@@ -372,11 +361,11 @@ class OrbitAdjustSpec(PayloadTestSpec):
     """
 
     lines: tuple[Name, ...] = ("forward", "nadir", "backward")
-    earth: EarthSpec = EarthSpec.model_construct()
-    altitude: Altitude = 500e3
+    earth: flight.EarthSpec = flight.EarthSpec.model_construct()
+    altitude: flight.Altitude = 500e3
     span: Annotated[float, Quantity(MOMENT, smallest="1 s", largest="1 h")] = 60.0
     line_time: LineTime = 0.7e-3
-    attitude: AttitudeSpec = AttitudeSpec.model_construct(steering="yaw")
+    attitude: flight.AttitudeSpec = flight.AttitudeSpec.model_construct(steering="yaw")
     area: AreaSpec
     passes: Annotated[Named[BlockPassSpec], not_empty("no passes", "at least one pass")]
     points: BlockPointsSpec = BlockPointsSpec.model_construct()
@@ -458,7 +447,7 @@ class CameraReadingSpec(Spec):
         Change d_f of the principal distance, in metres.
     """
 
-    angles: AngleErrors
+    angles: flight.AngleErrors
     principal_distance: Annotated[float, Quantity(LENGTH, largest="5 mm")] = 0.0
 
 

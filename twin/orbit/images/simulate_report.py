@@ -19,39 +19,15 @@ from matplotlib.patheffects import Normal, Stroke
 
 from scenes.specs.orbit.scene import ImagePointsSpec
 from scenes.yaml.units import ANGLE, LENGTH, format_quantity
+from twin.framework import svg
 from twin.framework.artefact import Artefact, Cell, Data, PngFigure, SvgFigure, Table, rounded_down
 from twin.framework.data_files import FrameFacts, MapGeoreference, csv_table
 from twin.framework.reference_frames import described
 from twin.framework.report import Report, Section, answer
-from twin.framework.svg import (
-    BLUE,
-    GREEN,
-    INK,
-    LIGHT,
-    ORANGE,
-    SKY,
-    VERMILION,
-    YELLOW,
-    look,
-    new_figure,
-    plain_axes,
-    to_png,
-    to_svg,
-)
 from twin.orbit.ground.orthophoto import Raster
+from twin.orbit.images import simulate_run
 from twin.orbit.images.image_points import CONSENSUS, ImagedGround, LineFrame, MatchedPoints, PatchPoints, status_text
 from twin.orbit.images.patch import WRONG, LineImage, Patch, judged
-from twin.orbit.images.simulate_run import (
-    COMPARED,
-    GEOREFERENCE,
-    LINE,
-    MATCHED,
-    TRUTH,
-    Simulation,
-    camera_data,
-    georeference_data,
-    trajectory_data,
-)
 
 if TYPE_CHECKING:
     from scenes.specs.orbit.scene import InteriorChangeSpec
@@ -184,24 +160,29 @@ def flat(points: PatchPoints, below: Callable[[MatchedPoints], Mapping[str, T]])
 def found_table(points: PatchPoints) -> Table:
     """Return the table of the points that were matched, by kind and line."""
     matches = flat(points, lambda group: group.searched_lines)
-    rows = {name: MATCHED(line) for name, line in matches.items() if line.accepted.any()}
+    rows = {name: simulate_run.MATCHED(line) for name, line in matches.items() if line.accepted.any()}
     caption = (
         "Displacement from predicted to measured and sigma: medians of the accepted, px along the track and the line."
     )
     displacement = ("displacement_lines_px", "displacement_pixels_px")
     keys = ("found", "matched", "accepted", *displacement, *(f"{key}_sigma" for key in displacement))
-    return MATCHED.table("points-found", "Matching", caption, rows, keys, "points, line", digits=4)
+    return simulate_run.MATCHED.table("points-found", "Matching", caption, rows, keys, "points, line", digits=4)
 
 
 def _true(patch: Patch, points: PatchPoints) -> Table:
     """Return the table that compares the measured points with their true image positions."""
-    rows = {name: COMPARED(line) for name, line in flat(points, lambda quantity: judged(patch, quantity)).items()}
+    rows = {
+        name: simulate_run.COMPARED(line)
+        for name, line in flat(points, lambda quantity: judged(patch, quantity)).items()
+    }
     caption = (
         f"Wrong: {WRONG}; counted among all measured points, those that passed the matching, and those that passed the "
         "consensus. RMS and mean error, px, and chi-square of the right points."
     )
-    keys = [quantity.key for quantity in COMPARED][:-1]
-    return COMPARED.table("points-truth", "Comparison with the truth", caption, rows, keys, "points, line", digits=4)
+    keys = [quantity.key for quantity in simulate_run.COMPARED][:-1]
+    return simulate_run.COMPARED.table(
+        "points-truth", "Comparison with the truth", caption, rows, keys, "points, line", digits=4
+    )
 
 
 def _lost_table(points: PatchPoints) -> Table:
@@ -219,19 +200,19 @@ def _lost_table(points: PatchPoints) -> Table:
 
 def points_png(patch: ImagedGround, points: MatchedPoints) -> bytes:
     """Return a PNG of every line's frame with its points and their displacements."""
-    with look(f"points-{points.kind}"):
+    with svg.look(f"points-{points.kind}"):
         names = list(points.searched_lines)
-        figure = new_figure(4.3 if len(names) > 2 else 5.6)
+        figure = svg.new_figure(4.3 if len(names) > 2 else 5.6)
         panels = np.atleast_1d(figure.subplots(1, len(names)))
         for axes, name in zip(panels, names, strict=True):
             _panel(axes, name, patch.images[name], points)
         marks = [
-            Line2D([], [], color=YELLOW, marker=r"$\rightarrow$", ls="", ms=9, label="accepted"),
-            Line2D([], [], color=VERMILION, marker="x", ls="", label="rejected by consensus"),
-            Line2D([], [], color=SKY, marker=".", ls="", label="not matched"),
+            Line2D([], [], color=svg.YELLOW, marker=r"$\rightarrow$", ls="", ms=9, label="accepted"),
+            Line2D([], [], color=svg.VERMILION, marker="x", ls="", label="rejected by consensus"),
+            Line2D([], [], color=svg.SKY, marker=".", ls="", label="not matched"),
         ]
         figure.legend(handles=marks, loc="outside lower center", ncols=3, labelcolor="black")
-        return to_png(figure, _DPI)
+        return svg.to_png(figure, _DPI)
 
 
 def _panel(axes: Axes, name: str, image: LineFrame, points: MatchedPoints) -> None:
@@ -251,11 +232,13 @@ def _panel(axes: Axes, name: str, image: LineFrame, points: MatchedPoints) -> No
     enlarged = rounded_down(0.06 * min(rows, columns) / max(longest, 1e-3))
     arrow: dict[str, Any] = {"angles": "xy", "scale_units": "xy", "scale": 1.0 / enlarged, "width": 0.004}
     effects = [Stroke(linewidth=1.2, foreground="black"), Normal()]
-    axes.quiver(to[good, 1], to[good, 0], rest[good, 1], rest[good, 0], color=YELLOW, path_effects=effects, **arrow)
-    axes.plot(to[against, 1], to[against, 0], "x", color=VERMILION, ms=6, mew=1.6)
+    axes.quiver(to[good, 1], to[good, 0], rest[good, 1], rest[good, 0], color=svg.YELLOW, path_effects=effects, **arrow)
+    axes.plot(to[against, 1], to[against, 0], "x", color=svg.VERMILION, ms=6, mew=1.6)
     unmatched = ~good & ~against
     # Points that were not matched are drawn at their expected position.
-    axes.plot(at[unmatched, 1] + middle[1], at[unmatched, 0] + middle[0], ".", color=SKY, ms=5, mec="black", mew=0.4)
+    axes.plot(
+        at[unmatched, 1] + middle[1], at[unmatched, 0] + middle[0], ".", color=svg.SKY, ms=5, mec="black", mew=0.4
+    )
     axes.set(
         title=f"{name}: median {middle[0]:.1f} lines, {middle[1]:.1f} pixels\nresiduals enlarged {enlarged:g} ×",
         xlim=ends[:2],
@@ -264,28 +247,28 @@ def _panel(axes: Axes, name: str, image: LineFrame, points: MatchedPoints) -> No
     pixel_axes(axes)
 
 
-_PARTS = {"lens": BLUE, "pixel": GREEN, "diffusion": ORANGE, "step": SKY, "stages": VERMILION}
+_PARTS = {"lens": svg.BLUE, "pixel": svg.GREEN, "diffusion": svg.ORANGE, "step": svg.SKY, "stages": svg.VERMILION}
 
 
-def _images_png(run: Simulation) -> bytes:
+def _images_png(run: simulate_run.Simulation) -> bytes:
     """Draw the lines' images side by side, each stretched between its 0.5% and 99.5% grey values."""
-    with look("simulate-images"):
+    with svg.look("simulate-images"):
         images = run.patch.images
         columns = min(len(images), 3)
         rows = -(-len(images) // columns)
-        figure = new_figure(0.35 + 3.5 * rows)
+        figure = svg.new_figure(0.35 + 3.5 * rows)
         panels = np.atleast_1d(figure.subplots(rows, columns)).ravel()
         for axes, (name, image) in zip(panels, images.items(), strict=False):
             _show_image(axes, name, image)
         for axes in panels[len(images) :]:
             axes.set_visible(False)
-        return to_png(figure, _DPI)
+        return svg.to_png(figure, _DPI)
 
 
-def _control_png(run: Simulation) -> bytes:
+def _control_png(run: simulate_run.Simulation) -> bytes:
     """Draw orthophoto and elevation model, and return the picture as PNG."""
-    with look("simulate-control"):
-        figure = new_figure(4.6)
+    with svg.look("simulate-control"):
+        figure = svg.new_figure(4.6)
         photo, heights = figure.subplots(1, 2)
         control = run.patch.control
         _show_raster(photo, control.orthophoto, "gray")
@@ -293,7 +276,7 @@ def _control_png(run: Simulation) -> bytes:
         photo.set(title="Orthophoto", ylabel="north [km]")
         heights.set(title="Elevation model, m above the ellipsoid")
         figure.colorbar(shown, ax=heights, fraction=0.045, pad=0.02)
-        return to_png(figure, _DPI)
+        return svg.to_png(figure, _DPI)
 
 
 def _modulus(values: np.ndarray) -> np.ndarray:
@@ -301,9 +284,9 @@ def _modulus(values: np.ndarray) -> np.ndarray:
     return np.abs(values) if np.iscomplexobj(values) else values
 
 
-def _transfer_figure(run: Simulation) -> Figure:
+def _transfer_figure(run: simulate_run.Simulation) -> Figure:
     """Draw each line's modulation transfer along the line and along the track, with its factors."""
-    figure = new_figure(3.4)
+    figure = svg.new_figure(3.4)
     panels = figure.subplots(1, 2, sharey=True)
     frequency = np.linspace(0.0, 0.5, 101)
     name, image = min(run.patch.images.items(), key=lambda item: item[1].motion.advance)
@@ -315,12 +298,12 @@ def _transfer_figure(run: Simulation) -> Figure:
         for part, values in optics.factors(*frequencies, image.motion).items():
             if np.ptp(values) > 1e-6:
                 axes.plot(frequency, _modulus(values), color=_PARTS[part], lw=1.0, label=_NAMES[part])
-        axes.plot(frequency, _modulus(optics.transfer(*frequencies, image.motion)), color=INK, lw=1.8, label="all")
+        axes.plot(frequency, _modulus(optics.transfer(*frequencies, image.motion)), color=svg.INK, lw=1.8, label="all")
         step = "pixel" if direction == "line" else "line"
         axes.set(title=f"Along the {direction}, {name}", xlabel=f"cycles per {step}", ylim=(0.0, 1.03), xlim=(0.0, 0.5))
         axes.legend(loc="lower left")
-        axes.grid(color=LIGHT, lw=0.5)
-        plain_axes(axes)
+        axes.grid(color=svg.LIGHT, lw=0.5)
+        svg.plain_axes(axes)
     panels[0].set_ylabel("modulation transfer")
     return figure
 
@@ -362,14 +345,14 @@ def _show_raster(axes: Axes, raster: Raster, colours: str) -> AxesImage:
     return shown
 
 
-def sections(run: Simulation) -> tuple[Section, ...]:
+def sections(run: simulate_run.Simulation) -> tuple[Section, ...]:
     """Return the report's sections: images, control data, measured points, sharpness, data."""
     points, spec = run.points, run.spec.points
     measured = () if points is None or spec is None else (points_section(run.patch, points, spec),)
     return _images(run), _control(run), *measured, _sharpness(run), _data(run)
 
 
-def _images(run: Simulation) -> Section:
+def _images(run: simulate_run.Simulation) -> Section:
     worst = max(image.error for image in run.patch.images.values())
     text = (
         "Each line's window of the same size has the patch in its middle. Interpolation of the rigorous geometry is in "
@@ -384,13 +367,13 @@ def _images(run: Simulation) -> Section:
     return Section("Images", text, (figure, _lines(run, "windows", "Windows and grey values", caption, keys)))
 
 
-def _lines(run: Simulation, name: str, title: str, caption: str, keys: Sequence[str]) -> Table:
+def _lines(run: simulate_run.Simulation, name: str, title: str, caption: str, keys: Sequence[str]) -> Table:
     """Return the report table of the quantities `keys`, a row for each line's image."""
-    rows = {line: LINE(image) for line, image in run.patch.images.items()}
-    return LINE.table(name, title, caption, rows, keys, "line", digits=4)
+    rows = {line: simulate_run.LINE(image) for line, image in run.patch.images.items()}
+    return simulate_run.LINE.table(name, title, caption, rows, keys, "line", digits=4)
 
 
-def _control(run: Simulation) -> Section:
+def _control(run: simulate_run.Simulation) -> Section:
     spec = run.spec.control
     text = (
         f"The orthophoto has pixels of {spec.spacing:g} m and another date: another sun, and {spec.changed:.0%} of the "
@@ -404,18 +387,18 @@ def _control(run: Simulation) -> Section:
     return Section("Orthophoto and elevation model", text, (figure,))
 
 
-def _sharpness(run: Simulation) -> Section:
-    with look("simulate-transfer"):
-        drawing = to_svg(_transfer_figure(run))
+def _sharpness(run: simulate_run.Simulation) -> Section:
+    with svg.look("simulate-transfer"):
+        drawing = svg.to_svg(_transfer_figure(run))
     caption = "Up to half a cycle per sample."
     return Section("Sharpness", (), (SvgFigure("transfer", "Modulation transfer", caption, drawing),))
 
 
-def _data(run: Simulation) -> Section:
-    camera = described("camera", camera_data(run.laboratory))
-    path = described("trajectory", trajectory_data(run, run.measured))
-    rasters = described("georeference", georeference_data(run))
-    truth = described("simulate-truth", TRUTH(run))
+def _data(run: simulate_run.Simulation) -> Section:
+    camera = described("camera", simulate_run.camera_data(run.laboratory))
+    path = described("trajectory", simulate_run.trajectory_data(run, run.measured))
+    rasters = described("georeference", simulate_run.georeference_data(run))
+    truth = described("simulate-truth", simulate_run.TRUTH(run))
     parts = (
         Data("camera", "Camera", "Camera as measured in the laboratory.", camera),
         Data("trajectory", "Orbit and attitude", "Measured orbit and attitude.", path),
@@ -430,7 +413,7 @@ def _data(run: Simulation) -> Section:
     return Section("Data", text, parts)
 
 
-def simulation_report(run: Simulation) -> Report:
+def simulation_report(run: simulate_run.Simulation) -> Report:
     """Return the report of a simulated pass over a patch: images, control, measured points and sharpness."""
     patch = run.spec.patch
     longitude, latitude = np.degrees(run.position)
@@ -464,11 +447,11 @@ def simulation_report(run: Simulation) -> Report:
 
 def map_facts(raster: Raster, note: str, heights: bool = False) -> FrameFacts:
     """Return the text tags that are written into the GeoTIFF of a map."""
-    longitude, latitude, *steps = list(GEOREFERENCE(raster).values())[3:]
+    longitude, latitude, *steps = list(simulate_run.GEOREFERENCE(raster).values())[3:]
     return FrameFacts(note=note, georeference=MapGeoreference(longitude, latitude, steps[0], steps[1], heights))
 
 
-def _summary(run: Simulation) -> Table:
+def _summary(run: simulate_run.Simulation) -> Table:
     """Return the summary table of the images."""
     caption = "Distance of samples on the ground and modulation transfer at half a cycle per sample, in the middle."
     keys = ("sample_along_line_m", "sample_along_track_m", "mtf_nyquist_along_line", "mtf_nyquist_along_track")
@@ -505,7 +488,7 @@ def _facts(setup: SimulateSetup) -> tuple[tuple[str, str], ...]:
     )
 
 
-def _warnings(run: Simulation) -> tuple[str, ...]:
+def _warnings(run: simulate_run.Simulation) -> tuple[str, ...]:
     """Return warnings about saturated images."""
     full = [name for name, image in run.patch.images.items() if image.saturated]
     return (f"saturated pixels in {', '.join(full)}; lower ground.texture.mean or the line time",) if full else ()

@@ -426,9 +426,7 @@ PASS: Record[PassJitter] = Record(
     Quantity("detectable_arcsec", _detectable, "axis -> least detectable amplitude, median over frequencies"),
     Quantity("blind_hz", lambda jitter: jitter.result.before.intervals(), "first and last of blind frequencies"),
     Quantity("blind_multiples", blind_multiples, "blind frequencies of every pair alone", record=MULTIPLE),
-    Quantity(
-        "mtf_at_nyquist", lambda jitter: transfers(jitter) or None, "line -> transfer, rms of phases", where_known=True
-    ),
+    Quantity("mtf_at_nyquist", lambda j: transfers(j) or None, "line -> transfer, rms of phases", where_known=True),
 )
 JITTER: Record[JitterRun] = Record(
     "Content of jitter.json: jitter detected in points that several lines see one after the other.",

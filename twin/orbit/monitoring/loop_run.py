@@ -40,19 +40,8 @@ from twin.orbit.flight.sensor import NO_EFFECTS, Sensor
 from twin.orbit.images.image_points import POINTS_REMEDY, PointsError, tie_points
 from twin.orbit.images.line_optics import LineOptics
 from twin.orbit.images.patch import PatchError, fly_patch, imaged_lines
-from twin.orbit.monitoring import closed_loop
+from twin.orbit.monitoring import closed_loop, pair_flight
 from twin.orbit.monitoring.closed_loop import FOCUS_FIELDS, Corrector, LoopCourse, LoopModel, defocus
-from twin.orbit.monitoring.pair_flight import (
-    HALF_SPAN,
-    CaseErrors,
-    OrbitAndAttitude,
-    PairFlight,
-    fly,
-    second_view,
-    sightings,
-    traced_pair,
-    view_check_points,
-)
 
 if TYPE_CHECKING:
     from optics.numerics.backend import Backend
@@ -97,12 +86,12 @@ class ImagedPair:
 
 def imaged_pair(
     setup: MonitorSetup,
-    flight: PairFlight,
+    flight: pair_flight.PairFlight,
     moment: int,
     nominal: Mapping[str, LineCamera],
     changes: Mapping[str, np.ndarray],
     foci: Mapping[str, float],
-    flown: OrbitAndAttitude,
+    flown: pair_flight.OrbitAndAttitude,
     seed: np.random.SeedSequence,
 ) -> ImagedPair:
     """Render a pair of line images, match points in them, and intersect the points to ground coordinates.
@@ -134,7 +123,7 @@ def imaged_pair(
     spec, pair, images = setup.test, setup.pair, setup.test.loop.images
     assert images is not None
     time, lines, calibrated = spec.times[moment], flight.lines[moment], flight.calibrated
-    begin, count = time - HALF_SPAN, int(2.0 * HALF_SPAN / spec.line_time)
+    begin, count = time - pair_flight.HALF_SPAN, int(2.0 * pair_flight.HALF_SPAN / spec.line_time)
 
     def sensor(line: LineCamera, measured: bool) -> Sensor:
         trajectory = flown.measured if measured else flown.true
@@ -145,7 +134,7 @@ def imaged_pair(
     optics = {name: _optics(setup, name, foci[name]) for name in pair}
     middle = 0.5 * (spec.ground.first + spec.ground.last)
     height = images.ground.terrain.height
-    at = second_view([true[name] for name in pair], time, middle, height)
+    at = pair_flight.second_view([true[name] for name in pair], time, middle, height)
     point = true[pair[1]].ground(np.array([(at - begin) / spec.line_time]), np.array([middle]), height)
     longitude, latitude, _ = flown.earth.geodetic(point[0])
     recording = imaged_lines(true, users, optics, stream(seed, 0))
@@ -165,7 +154,7 @@ def imaged_pair(
         (calibrated[name].corrected(changes[name]), ties.lines[name].image[good]) for name in pair
     )
     first, second = (
-        sightings(users[name], users[name].trajectory, *points.T)
+        pair_flight.sightings(users[name], users[name].trajectory, *points.T)
         for name, (_, points) in zip(pair, (first_points, second_points), strict=True)
     )
     errors = check_errors(intersect_pair(first_points[0], second_points[0], first, second).ground, ground).error
@@ -243,9 +232,9 @@ class LoopOutcome:
     """
 
     course: LoopCourse
-    flight: PairFlight
+    flight: pair_flight.PairFlight
     truth: np.ndarray
-    heights: CaseErrors
+    heights: pair_flight.CaseErrors
     slopes: np.ndarray
     angle: np.ndarray
     mtf: Mapping[str, np.ndarray]
@@ -444,7 +433,7 @@ def run_loop(setup: MonitorSetup, backend: Backend, seed: int, advance: Advance)
             advance(part, done, len(states))
 
         courses.append(closed_loop.simulate_course(model, spec, states, read, still, report))
-    nominal = traced_pair(experiment, {}, pair)
+    nominal = pair_flight.traced_pair(experiment, {}, pair)
     closed, opened = (_outcome_of(setup, course, nominal, ground_seed, advance) for course in courses)
     # height and foci of the pair
     rows = np.stack([opened.slopes.mean(axis=0), *(model.unit(name, "defocus") for name in pair)])
@@ -500,10 +489,10 @@ def _outcome_of(
     """Compute the true errors of cameras, foci and heights that result from a simulated time series of states."""
     model, pair, experiment, test = course.model, setup.pair, course.model.experiment, setup.test
     axes, distance = experiment.sight.axes, experiment.nominal_truth.principal_distance
-    lines = tuple(traced_pair(experiment, state, pair) for state in course.states)
-    views = view_check_points(test, pair, lines, seed, advance)
+    lines = tuple(pair_flight.traced_pair(experiment, state, pair) for state in course.states)
+    views = pair_flight.view_check_points(test, pair, lines, seed, advance)
     calibrated = FrozenMap({name: calibrated_line(nominal[name], axes[name], distance[name]) for name in pair})
-    flight = PairFlight(pair, course.times, lines, calibrated, views)
+    flight = pair_flight.PairFlight(pair, course.times, lines, calibrated, views)
     changes = {name: np.array([model.on_ground(name, row) for row in course.positions]) for name in model.cameras}
     truth = experiment.sight.truth(list(course.states))
     advance("image quality", 0, 1)
@@ -535,7 +524,9 @@ def _outcome_of(
         assert k is not None  # the file was checked
         now = {name: values[k] for name, values in changes.items()}
         foci = {name: float(quantities[k, model.row(name, "defocus")]) for name in pair}
-        images.append(imaged_pair(setup, flight, k, nominal, now, foci, fly(test, seed), stream(seed, _IMAGES, k)))
+        images.append(
+            imaged_pair(setup, flight, k, nominal, now, foci, pair_flight.fly(test, seed), stream(seed, _IMAGES, k))
+        )
     return LoopOutcome(course, flight, quantities, flight.case(changes), slopes, angle, FrozenMap(mtf), tuple(images))
 
 
