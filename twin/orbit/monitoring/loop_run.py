@@ -150,15 +150,13 @@ def imaged_pair(
         raise BenchError(problem, ("mechanisms", "images"), POINTS_REMEDY)
     ground = patch.true_point(pair[1], *ties.lines[pair[1]].position[good].T)
     should = np.stack(true[pair[0]].image(ground), axis=1)
-    first_points, second_points = (
-        (calibrated[name].corrected(changes[name]), ties.lines[name].image[good]) for name in pair
-    )
+    points = [ties.lines[name].image[good] for name in pair]
+    a, b = (calibrated[name].corrected(changes[name]) for name in pair)
     first, second = (
-        pair_flight.sightings(users[name], users[name].trajectory, *points.T)
-        for name, (_, points) in zip(pair, (first_points, second_points), strict=True)
+        pair_flight.sightings(users[n], users[n].trajectory, *p.T) for n, p in zip(pair, points, strict=True)
     )
-    errors = check_errors(intersect_pair(first_points[0], second_points[0], first, second).ground, ground).error
-    return ImagedPair(moment, errors, first_points[1] - should, ties.lines[pair[0]].median_sigma, len(good))
+    errors = check_errors(intersect_pair(a, b, first, second).ground, ground).error
+    return ImagedPair(moment, errors, points[0] - should, ties.lines[pair[0]].median_sigma, len(good))
 
 
 _FEWEST = 8
@@ -356,12 +354,8 @@ class LoopRun:
         Angle and quantities are in rad and m, height in m; for the MTF at the Nyquist frequency the largest difference
         from 1 is given.
         """
-        open_errors, closed_errors = self._errors(self.open), self._errors(self.closed)
-        return {
-            n: (open_errors[n], v)
-            for n, v in closed_errors.items()
-            if v > max((1.0 + WORSE) * open_errors[n], _NOTHING)
-        }
+        before, after = self._errors(self.open), self._errors(self.closed)
+        return {n: (before[n], v) for n, v in after.items() if v > max((1.0 + WORSE) * before[n], _NOTHING)}
 
     def _errors(self, outcome: LoopOutcome) -> dict[str, float]:
         names = [(name, key) for name in self.model.cameras for key in (*PARAMETERS, "defocus")]
@@ -377,12 +371,10 @@ class LoopRun:
     @property
     def ratios(self) -> dict[str, float]:
         """Largest error of each quantity's posterior mean divided by its sigma, with the loop closed and open."""
-        rows = {f"defocus of {name}": self.model.unit(name, "defocus") for name in self.pair}
-        rows_of = {"angle": (self.open.angle,) * 2, "height": (self.closed.slopes, self.open.slopes)}
-        rows_of |= {name: (row, row) for name, row in rows.items()}
+        rows = {"angle": (self.open.angle,) * 2, "height": (self.closed.slopes, self.open.slopes)}
+        rows |= {f"defocus of {name}": (self.model.unit(name, "defocus"),) * 2 for name in self.pair}
         return {
-            name: max(self.closed.ratio(closed_rows), self.open.ratio(open_rows))
-            for name, (closed_rows, open_rows) in rows_of.items()
+            name: max(self.closed.ratio(closed), self.open.ratio(opened)) for name, (closed, opened) in rows.items()
         }
 
     @property
@@ -393,10 +385,8 @@ class LoopRun:
     @property
     def phase_deg(self) -> float:
         """Smallest phase margin of the control loops, in degrees; NaN where no loop has a phase margin."""
-        margins = [
-            analysis.margins.phase_deg for analysis in self.loops.values() if math.isfinite(analysis.margins.phase_deg)
-        ]
-        return min(margins, default=math.nan)
+        phases = (analysis.margins.phase_deg for analysis in self.loops.values())
+        return min(filter(math.isfinite, phases), default=math.nan)
 
 
 _SCALE = np.array([1.0, FOCUS_SCALE, FOCUS_SCALE])
@@ -443,20 +433,11 @@ def run_loop(setup: MonitorSetup, backend: Backend, seed: int, advance: Advance)
         [corrector.spec.delay for corrector in model.correctors],
         [corrector.row for corrector in model.correctors],
     )
-    return LoopRun(
-        setup,
-        seed,
-        model,
-        closed,
-        opened,
-        FrozenMap(analyses),
-        control_loop.spectral_radius(model.coupling, *loops),
-        control_loop.common_margin(model.coupling, *loops),
-        unobservable_modes(model.prior, rows, _SCALE),
-        np.stack(
-            [_floor(model, opened.slopes), *(np.full(len(states), _floor(model, row[None])[0]) for row in rows[1:])]
-        ),
-    )
+    stability = (f(model.coupling, *loops) for f in (control_loop.spectral_radius, control_loop.common_margin))
+    modes = unobservable_modes(model.prior, rows, _SCALE)
+    foci = (np.full(len(states), _floor(model, row[None])[0]) for row in rows[1:])
+    floors = np.stack([_floor(model, opened.slopes), *foci])
+    return LoopRun(setup, seed, model, closed, opened, FrozenMap(analyses), *stability, modes, floors)
 
 
 def _analyse_loop(model: LoopModel, k: int, course: LoopCourse) -> LoopAnalysis:
@@ -466,13 +447,8 @@ def _analyse_loop(model: LoopModel, k: int, course: LoopCourse) -> LoopAnalysis:
     cycle = None
     if step is not None and spec.gain:
         cycle = control_loop.limit_cycle(spec.gain, spec.delay, spec.band / abs(step * corrector.sensitivity))
-    return LoopAnalysis(
-        corrector,
-        gain,
-        control_loop.margins(gain, spec.delay),
-        cycle,
-        tuple(np.flatnonzero(course.held[:, k]).tolist()),
-    )
+    ends = tuple(np.flatnonzero(course.held[:, k]).tolist())
+    return LoopAnalysis(corrector, gain, control_loop.margins(gain, spec.delay), cycle, ends)
 
 
 def _floor(model: LoopModel, rows: np.ndarray) -> np.ndarray:
@@ -511,10 +487,8 @@ def _outcome_of(
     angle = np.zeros(quantities.shape[1])
     angle[[model.row(name, "d_alpha") for name in pair]] = [1.0, -1.0] if looks[0] > looks[1] else [-1.0, 1.0]
     mtf = {
-        name: np.stack(
-            [camera_quality.mtf_along_line.mean(axis=1), camera_quality.mtf_along_track.mean(axis=1)], axis=1
-        )
-        for name, camera_quality in quality.cameras.items()
+        name: np.stack([of.mtf_along_line.mean(axis=1), of.mtf_along_track.mean(axis=1)], axis=1)
+        for name, of in quality.cameras.items()
     }
     images = []
     times = test.loop.images.times if test.loop.images is not None else ()

@@ -252,8 +252,7 @@ class MonitorRun(pair_flight.PairFlight):
 
     def height(self, values: Mapping[str, np.ndarray]) -> np.ndarray:
         """Return the mean height errors at T times, (T,), in m, due to errors (T, 4) of each camera's parameters."""
-        heights = [np.sum(self.slopes[n] * values[n], axis=1) for n in self.pair]
-        return np.asarray(np.sum(heights, axis=0))
+        return np.asarray(np.sum([np.sum(self.slopes[n] * values[n], axis=1) for n in self.pair], axis=0))
 
     def variance(self, covariance: np.ndarray, at: int | None = None) -> np.ndarray:
         """Return the variance of the mean height due to the pair's parameters, for S covariances, (S,), in m^2.
@@ -470,10 +469,8 @@ def simulate_monitoring(setup: MonitorSetup, backend: Backend, seed: int, advanc
     spec.check_nodes(experiment.instrument.nodes)
     states = states_of(experiment, spec)
     advance("monitor", 1, parts)
-    reference, bodies = (
-        states[spec.reference_index],
-        {body.path: body for body in experiment.instrument.assembly.tree.bodies},
-    )
+    reference = states[spec.reference_index]
+    bodies = {body.path: body for body in experiment.instrument.assembly.tree.bodies}
 
     def rotated_state(camera: str) -> State:
         return compose(reference, {f"{BASE}/{camera}": Motion((0.0, ARCSEC, 0.0))}, bodies)
