@@ -345,12 +345,8 @@ def trajectory_data(run: Simulation, path: Trajectory) -> dict[str, Any]:
     describes. Quaternions are (x, y, z, w), with continuous signs so that they can be interpolated.
     """
     errors = run.spec.errors
-    fixes, looks = (
-        times[in_span(times, path.first, path.last)]
-        for times in (
-            readings(path.first, path.last, instrument.interval) for instrument in (errors.gps, errors.star_tracker)
-        )
-    )
+    times = (readings(path.first, path.last, of.interval) for of in (errors.gps, errors.star_tracker))
+    fixes, looks = (t[in_span(t, path.first, path.last)] for t in times)
     quaternion = Rotation.from_matrix(path.body_to_itrs(looks)).as_quat(canonical=False)
     data = {
         "epoch_utc": str(path.orbit.epoch),
@@ -458,11 +454,8 @@ def simulation_exported(run: Simulation) -> dict[str, str]:
     """
     spec = run.spec
     if run.points is None or run.points.control is None or spec.points is None:
-        raise spec.error(
-            "only measured points can be exported as tables",
-            ("points",),
-            allowed="`points:` with control and check points",
-        )
+        allowed = "`points:` with control and check points"
+        raise spec.error("only measured points can be exported as tables", ("points",), allowed=allowed)
     errors = spec.errors
     plain = spec.plain()
     platform = PlatformTable.sampled(run.measured, errors.gps.interval, errors.star_tracker.interval)
