@@ -59,9 +59,8 @@ def with_quality(
         windows = {n: (x.window.sensor, x.window.first_pixel, x.window.pixels) for n, x in lines.items()}
         maps = accuracy_maps(windows, uncertainty, run.heights[1])
         lines = {name: _with_errors(line, maps[name], name in control) for name, line in lines.items()}
-    return replace(
-        run, lines=FrozenMap(lines), quality=export_run.Quality(FrozenMap(maps), FrozenMap(control), products)
-    )
+    quality = export_run.Quality(FrozenMap(maps), FrozenMap(control), products)
+    return replace(run, lines=FrozenMap(lines), quality=quality)
 
 
 def _with_errors(line: export_run.ExportedLine, accuracy: AccuracyMap, is_controlled: bool) -> export_run.ExportedLine:
@@ -71,10 +70,8 @@ def _with_errors(line: export_run.ExportedLine, accuracy: AccuracyMap, is_contro
     """
     polynomial, (bias, random) = line.polynomial, accuracy.horizontal()
     if polynomial is not None and not is_controlled:
-        before = (polynomial.bias_m or 0.0, polynomial.random_m or 0.0)
-        polynomial = replace(
-            polynomial, bias_m=float(np.hypot(bias, before[0])), random_m=float(np.hypot(random, before[1]))
-        )
+        all_bias, all_random = np.hypot((bias, random), (polynomial.bias_m or 0.0, polynomial.random_m or 0.0)).tolist()
+        polynomial = replace(polynomial, bias_m=all_bias, random_m=all_random)
     worst = np.nanargmax(accuracy.ce90)
     (a, b), (_, c) = accuracy.covariance[worst, :2, :2]
     notes = (
@@ -132,9 +129,8 @@ def correct_line(
     ground = control.read.points.taken(rows[:, 0].astype(np.intp))
     spread = rows[:, 3:, None] ** 2 * np.eye(2)
     try:
-        correction = polynomial_correction(
-            polynomial, ground.itrs, ground.covariance, rows[:, 1:3], spread, control.kind
-        )
+        points = ground.itrs, ground.covariance, rows[:, 1:3], spread
+        correction = polynomial_correction(polynomial, *points, control.kind)
         return export_run.ControlledPolynomial(ground.ids, correction, corrected_polynomial(polynomial, correction))
     except ValueError as error:
         allowed = f"{LEAST_POINTS[control.kind]} points or more, spread over the image of {name}"
