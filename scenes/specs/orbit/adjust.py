@@ -24,7 +24,6 @@ from scenes.yaml.units import ANGLE, DISTANCE, LENGTH, MOMENT
 Sensor = Literal["ties", "control", "monitor", "laser", "terrain", "tracker_angles"]
 LawKind = Literal["constant", "rate", "white", "walk", "slow", "orbital", "jitter"]
 Period = Annotated[float, Quantity(MOMENT, above_zero=True, largest="100000 h")]
-Sigmas = Annotated[tuple[float, float, float], Vector(Quantity(LENGTH, smallest="0 m", largest="10 km"))]
 Positive = Annotated[float, Quantity(LENGTH, above_zero=True, largest="1 km")]
 PointCount = Annotated[Whole, Field(ge=0, le=1_000_000)]
 
@@ -94,7 +93,7 @@ class OrbitLawSpec(LawSpec):
         in a second.
     """
 
-    sigma: Sigmas
+    sigma: flight.LengthSigmas
 
 
 class ReadingLawsSpec(Spec):
@@ -277,13 +276,10 @@ class CameraChangeSpec(Spec):
     @model_validator(mode="after")
     def _may_change(self) -> CameraChangeSpec:
         both = (self.lasting, self.each_pass)
-        for k, name in enumerate(("d_alpha", "d_beta", "d_gamma")):
-            if not any(change.angles[k] for change in both):
+        for k, name in enumerate(("d_alpha", "d_beta", "d_gamma", "the principal distance")):
+            if not any((*change.angles, change.principal_distance)[k] for change in both):
                 problem = f"{name} has a prior sigma of zero, which is not realistic"
                 raise Problem(problem, None, "a sigma above zero in `lasting` or `each_pass`", within=("lasting",))
-        if not any(change.principal_distance for change in both):
-            problem = "the principal distance has a prior sigma of zero, which is not realistic"
-            raise Problem(problem, None, "a sigma above zero in `lasting` or `each_pass`", within=("lasting",))
         return self
 
 
@@ -306,6 +302,14 @@ def check_one_monitor(monitor: object, record: MonitorRecordSpec | None) -> None
     """Raise `Problem` if a file has both `monitor` and `monitor_record`, two sources of the same changes."""
     if monitor is not None and record is not None:
         raise Problem("`monitor` and `monitor_record` are both given", None, "one of them", within=("monitor_record",))
+
+
+def _require_groups(spec: OrbitAdjustSpec | MeasuredAdjustSpec, groups: tuple[str, ...]) -> None:
+    """Raise `Problem` for a component of variance that is neither among these groups nor a law of the readings."""
+    known = (*groups, *spec.errors.attitude, *spec.errors.orbit)
+    for k, name in enumerate(spec.components):
+        if name not in known:
+            raise unknown("no such group of variances", name, known, ("components", k))
 
 
 class OrbitAdjustSpec(flight.PayloadTestSpec):
@@ -407,19 +411,9 @@ class OrbitAdjustSpec(flight.PayloadTestSpec):
         ]
         if self.angles and not lasting:
             problem = "an angle between star trackers that have no constant error"
-            raise Problem(
-                problem,
-                None,
-                "an entry of errors.attitude with `law: constant` and `shared_by: tracker`",
-                within=("angles",),
-            )
-        return self._has_known_groups()
-
-    def _has_known_groups(self) -> OrbitAdjustSpec:
-        groups = ("image", "control", "laser", "terrain", *self.errors.attitude, *self.errors.orbit)
-        for k, name in enumerate(self.components):
-            if name not in groups:
-                raise unknown("no such group of variances", name, groups, ("components", k))
+            allowed = "an entry of errors.attitude with `law: constant` and `shared_by: tracker`"
+            raise Problem(problem, None, allowed, within=("angles",))
+        _require_groups(self, ("image", "control", "laser", "terrain"))
         return self
 
     @property
@@ -508,10 +502,7 @@ class MeasuredAdjustSpec(MeasuredTestSpec):
 
     @model_validator(mode="after")
     def _has_known_groups(self) -> MeasuredAdjustSpec:
-        groups = ("image", "control", *self.errors.attitude, *self.errors.orbit)
-        for k, name in enumerate(self.components):
-            if name not in groups:
-                raise unknown("no such group of variances", name, groups, ("components", k))
+        _require_groups(self, ("image", "control"))
         check_one_monitor(self.monitor, self.monitor_record)
         if "monitor" in self.without and "monitor" not in self.sensors:
             raise Problem("there is no monitor to exclude", None, "a section `monitor:`", within=("without",))
