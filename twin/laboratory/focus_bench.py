@@ -239,13 +239,8 @@ class FocusBench:
                 diffraction = _modulus(EdgeOptics.build(perfect, ccd.band, normal, _SEARCH), 0.0, f)
                 design = _modulus(designed.optics, best_focus(designed, f), f)
                 actual = _modulus(imager.optics, site.best, f)
-                parts = {k: float(v) for k, v in ccd.factors(np.array(x), np.array(y)).items()}
-                factors = {
-                    "diffraction": diffraction,
-                    "design": design / diffraction,
-                    "wavefront": actual / design,
-                    **parts,
-                }
+                factors = {"diffraction": diffraction, "design": design / diffraction, "wavefront": actual / design}
+                factors |= {k: float(v) for k, v in ccd.factors(np.array(x), np.array(y)).items()}
                 out.append(BudgetLine(name, edge, factors, imager.mtf(site.best, f)))
         return tuple(out)
 
@@ -375,32 +370,26 @@ class NyquistMtf:
     frames: Mapping[str, np.ndarray]
 
 
+@dataclass(frozen=True, eq=False)
 class Recorder:
     """Recorder of images of slanted edges, for one placement of the focal-plane assembly.
 
-    Parameters
+    Attributes
     ----------
-    bench
+    bench : FocusBench
         Bench with the camera.
-    placement
+    placement : Placement
         Placement of the assembly.
-    seed
+    seed : SeedSequence
         Seed of the noise and of the random sub-pixel position of the edge.
-    patterns
+    patterns : mapping
         Band -> gains and offsets of its columns.
     """
 
-    def __init__(
-        self,
-        bench: FocusBench,
-        placement: Placement,
-        seed: np.random.SeedSequence,
-        patterns: Mapping[str, FixedPattern],
-    ) -> None:
-        self.bench = bench
-        self.placement = placement
-        self.seed = seed
-        self.patterns = patterns
+    bench: FocusBench
+    placement: Placement
+    seed: np.random.SeedSequence
+    patterns: Mapping[str, FixedPattern]
 
     def frames(self, number: int, edge: str, shift: float, take: int) -> np.ndarray:
         """Record frames of an edge at one site, (frames, region, region), DN.
@@ -419,10 +408,8 @@ class Recorder:
         site, bench = self.bench.sites[number], self.bench
         height = self.placement.heights[site.band]
         ccd = bench.ccds[site.band]
-        direction_index = DIRECTIONS.index(edge)
-        offset_seed, frame_seed = (
-            stream(self.seed, which, number, direction_index, take) for which in (_OFFSET, _FRAMES)
-        )
+        key = number, DIRECTIONS.index(edge), take
+        offset_seed, frame_seed = (stream(self.seed, which, *key) for which in (_OFFSET, _FRAMES))
         offset = float(np.random.default_rng(offset_seed).uniform(-0.5, 0.5)) * ccd.band.pitch
         share = site.image(edge, self.placement.pose, height, shift, offset)
         photons = ccd.white_photons(bench.setup.test.white) * share
