@@ -633,11 +633,7 @@ def fit_interior_orientation(
             f"interior orientation: f = {f:.3g} +- {sigma:.2g} m; the angles span only {np.ptp(angles):.3g} rad, too"
             " little for their noise; turn the turntable over the whole field"
         )
-    if f < 0:
-        raise OrientationError(
-            f"interior orientation: the principal distance comes out as {f:.6g} m; angles and spot positions count in"
-            " opposite senses, change the sign of one of them"
-        )
+    _same_sense(values[k])
     return InteriorOrientation(
         terms=names,
         values=values,

@@ -220,14 +220,12 @@ def _estimates(
     def printed(f: Array | float, p: Array | float, angle: Array) -> Estimate:
         return Estimate(float(f), float(p), interior.distortion(position, angle, f, p))
 
-    balanced_f = interior.principal_distance(position, angles)
+    balanced_f, shifted = interior.principal_distance(position, angles), angles - zero
     out = {
         "eq2": printed(*interior.principal_distance_and_point(position, angles), angles),
         "eq3": printed(balanced_f, 0.0, angles),
         "eq4": printed(balanced_f, interior.principal_point(position, angles, balanced_f), angles),
-        "eq2_zero_from_constant": printed(
-            *interior.principal_distance_and_point(position, angles - zero), angles - zero
-        ),
+        "eq2_zero_from_constant": printed(*interior.principal_distance_and_point(position, shifted), shifted),
     }
     f, p = "principal_distance", "principal_point"
     for name, model in (("constant", fit), ("constant_radial3", smooth)):
@@ -280,9 +278,8 @@ def measure(bench: DistortionBench, seed: int, advance: Advance = silent) -> Sim
             **reduce(*args, compensation),
         )
     except interior.OrientationError as error:
-        raise BenchError(
-            str(error), ("points",), f"{len(interior.SMOOTH) + 1} or more, over the whole field"
-        ) from error
+        allowed = f"{len(interior.SMOOTH) + 1} or more, over the whole field"
+        raise BenchError(str(error), ("points",), allowed) from error
 
 
 def reduce(
@@ -334,15 +331,12 @@ def reduce(
         raw = compensated = interior.Distortion.measure(raw_angles, spots, means, common)
     else:
         corrected_angles = sense * (compensation.correct(reading) - float(compensation.correct(zero)))
-        means = interior.reduce_sets(
-            corrected_angles, spots, approximate_f, approximate_f * compensation.repeatability, present
-        )
+        single = approximate_f * compensation.repeatability
+        means = interior.reduce_sets(corrected_angles, spots, approximate_f, single, present)
         # the residuals of this test estimate the white part at more angles than the calibration did
         common = replace(compensation, white=0.0).covariance(means.mean(reading))
-        raw, compensated = (
-            interior.Distortion.measure(raw_angles, spots, means),
-            interior.Distortion.measure(corrected_angles, spots, means, common),
-        )
+        raw = interior.Distortion.measure(raw_angles, spots, means)
+        compensated = interior.Distortion.measure(corrected_angles, spots, means, common)
     fit = compensated.fit
     return {
         "reading": reading,
@@ -375,10 +369,8 @@ def measure_files(spec: MeasuredDistortionSpec, seed: int) -> DistortionRun:
         cal, *held = tables
         series = cal.series
         # whole turns between the calibration's readings and those of the test
-        whole_circles = (
-            measured_readings.unwrapped(np.array([files.zero]), 0.5 * float(series.angle[0] + series.angle[-1]))[0]
-            - files.zero
-        )
+        middle = 0.5 * float(series.angle[0] + series.angle[-1])
+        whole_circles = measured_readings.unwrapped(np.array([files.zero]), middle)[0] - files.zero
         zero, readings = files.zero + whole_circles, replace(readings, reading=readings.reading + whole_circles)
         _check_region(files, readings, series, zero)
         names, _ = usable_fits(files.turntable, cal, CLOSED_FORMS)
@@ -420,9 +412,8 @@ def _check_angles(files: DistortionFiles, readings: measured_readings.SpotReadin
     if np.max(distance) > MAX_FIELD_ANGLE:
         index = np.unravel_index(int(np.argmax(distance)), distance.shape)
         shown = f"{np.degrees(readings.reading[index]):.9g} deg, {np.degrees(distance[index]):.4g} deg from the zero"
-        allowed = (
-            f"within {np.degrees(MAX_FIELD_ANGLE):.0f} deg of `zero`, the reading at which the line's middle is imaged"
-        )
+        widest = f"{np.degrees(MAX_FIELD_ANGLE):.0f} deg"
+        allowed = f"within {widest} of `zero`, the reading at which the line's middle is imaged"
         line = int(readings.lines[index])
         raise InputError(Issue("an angle beyond any field", readings.file.file, line, (readings.head,), shown, allowed))
 
@@ -430,20 +421,12 @@ def _check_angles(files: DistortionFiles, readings: measured_readings.SpotReadin
 def _locate(bench: DistortionBench, record: DistortionRecord) -> interior.Spots:
     """Measure the spots in the recorded frames; raise BenchError if any cannot be measured."""
     try:
-        return interior.locate_spots(
-            record.frames,
-            record.column,
-            bench.middle_column,
-            bench.ccd.band.pitch,
-            bench.noise,
-            bench.radius,
-            bench.design_offset,
-        )
+        line = bench.middle_column, bench.ccd.band.pitch, bench.noise
+        return interior.locate_spots(record.frames, record.column, *line, bench.radius, bench.design_offset)
     except SpotError as error:
         reason = next(iter(error.reasons.values()))
-        problem = (
-            f"{len(error.reasons)} of {record.column.size} spots cannot be measured; reason for the first: {reason}"
-        )
+        bad = f"{len(error.reasons)} of {record.column.size} spots cannot be measured"
+        problem = f"{bad}; reason for the first: {reason}"
         remedy = "less light: 30 to 80 percent is good" if "saturated" in reason else "more light or more frames"
         raise BenchError(problem, ("light",), remedy) from error
 

@@ -482,11 +482,10 @@ def in_focus(recorder: Recorder) -> tuple[NyquistMtf, ...]:
             takes = {edge: recorder.measure(number, edge, 0.0, 9000) for edge in DIRECTIONS}
         except EdgeError as error:
             where = recorder.bench.sites[number]
-            raise BenchError(
-                f"the edge cannot be measured after the alignment in {where.band} at field {where.field:g}: {error}",
-                ("misset", "chips"),
-                "chips closer to one plane, so that all of them can be in focus together",
-            ) from error
+            there = f"in {where.band} at field {where.field:g}"
+            problem = f"the edge cannot be measured after the alignment {there}: {error}"
+            remedy = "chips closer to one plane, so that all of them can be in focus together"
+            raise BenchError(problem, ("misset", "chips"), remedy) from error
         return NyquistMtf({e: (t[0], t[1]) for e, t in takes.items()}, {e: t[2] for e, t in takes.items()})
 
     with one_blas_thread(), ThreadPoolExecutor(cores()) as pool:
@@ -538,22 +537,16 @@ def _search(recorder: Recorder, number: int, zero: float, first: int = 0) -> flo
     shift = np.linspace(-shift_range, shift_range, 2 * int(np.ceil(plan.reach / step)) + 1)
     measurements = [recorder.attempt(number, ALONG, float(s), k) for k, s in enumerate(shift, first)]
     if all(np.isinf(m[1]) for m in measurements):
-        raise BenchError(
-            f"the edge cannot be measured anywhere through focus in {site.band} at field {site.field:g}: "
-            f"{measurements[0][3]}",
-            ("edge",),
-            "another edge, region or light",
-        )
+        there = f"in {site.band} at field {site.field:g}"
+        problem = f"the edge cannot be measured anywhere through focus {there}: {measurements[0][3]}"
+        raise BenchError(problem, ("edge",), "another edge, region or light")
     mtf = np.array([m[0] for m in measurements])
     best = int(np.argmax(mtf))
     if best in (0, len(shift) - 1):
         where = "the lower" if best == 0 else "the upper"
-        raise BenchError(
-            f"best focus of {site.band} at field {site.field:g} is not inside the scan: contrast is highest at {where} "
-            "end",
-            ("scan", "reach"),
-            "a longer reach",
-        )
+        focus = f"best focus of {site.band} at field {site.field:g}"
+        problem = f"{focus} is not inside the scan: contrast is highest at {where} end"
+        raise BenchError(problem, ("scan", "reach"), "a longer reach")
     return float(shift[best])
 
 

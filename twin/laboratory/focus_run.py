@@ -376,11 +376,8 @@ def _check_light(bench: FocusBench) -> None:
     name = min(most, key=lambda n: most[n])
     white = bench.setup.test.white
     if white > most[name]:
-        raise BenchError(
-            f"the bright side of the edge, {100 * white:g}% of the full well, saturates pixels of {name}",
-            ("white",),
-            f"{np.floor(100 * most[name]):.0f} percent or less",
-        )
+        problem = f"the bright side of the edge, {100 * white:g}% of the full well, saturates pixels of {name}"
+        raise BenchError(problem, ("white",), f"{np.floor(100 * most[name]):.0f} percent or less")
 
 
 def align(bench: FocusBench, seed: int, advance: Advance = silent) -> SimulatedFocus:
@@ -491,12 +488,11 @@ def plan_shims(correction: plane_fit.RigidMotion, mount: plane_fit.Mount, presen
     except plane_fit.ShimError as error:
         if error.slides:
             slide, far = max(zip(error.slides, error.holes, strict=True))
-            raise BenchError(
-                f"the alignment would slide hole_{far + 1} by {1e3 * slide:.3g} mm in the mounting surface, "
-                f"but the screws allow {1e3 * mount.clearance:.3g} mm",
-                ("mount", "clearance"),
-                "more clearance, or a smaller misset",
-            ) from error
+            limit = f"but the screws allow {1e3 * mount.clearance:.3g} mm"
+            problem = (
+                f"the alignment would slide hole_{far + 1} by {1e3 * slide:.3g} mm in the mounting surface, {limit}"
+            )
+            raise BenchError(problem, ("mount", "clearance"), "more clearance, or a smaller misset") from error
         raise BenchError(str(error), ("mount", "thickness"), "thicker shims to begin with") from error
 
 

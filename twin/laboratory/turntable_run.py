@@ -380,12 +380,10 @@ def _check_count(spec: TurntableTestSpec, names: Sequence[str]) -> None:
     left = dividing_error.angles_left(plan.count, plan.folds)
     short = [name for name in names if left < dividing_error.fewest(name)]
     if short:
-        raise spec.error(
-            f"too few angles for the fit {short[0]!r}",
-            ("calibration", "step"),
-            found=f"{plan.count} angles, {left} of them without a fold of the cross-validation",
-            allowed=f"steps that leave {dividing_error.fewest(short[0])} or more",
-        )
+        found = f"{plan.count} angles, {left} of them without a fold of the cross-validation"
+        problem, allowed = f"too few angles for the fit {short[0]!r}", dividing_error.fewest(short[0])
+        key = ("calibration", "step")
+        raise spec.error(problem, key, found=found, allowed=f"steps that leave {allowed} or more")
 
 
 def usable_fits(

@@ -18,10 +18,10 @@ from twin.framework.report import Report, Section, answer
 from twin.orbit.calibration.calibration_numbers import CALIBRATION, MATCHING, SCREENED
 from twin.orbit.calibration.calibration_run import CalibrationRun, unit
 from twin.orbit.calibration.calibration_sections import Rows, adjustment_sections, figure_of, prior_dominated
-from twin.orbit.calibration.campaign import any_effect, light_effects
 from twin.orbit.calibration.campaign_adjustment import ground_sample, intersection_fit
 from twin.orbit.calibration.influences import UNEXPECTED_SIGMAS, drift_warnings, step_warnings
 from twin.orbit.calibration.schemes import RMS, FieldErrors, Monitoring, SchemeMeans, meets, values_of
+from twin.orbit.flight.sensor import LightEffects
 from twin.orbit.images.image_points import UNMODELLED_SIGMA
 from twin.orbit.images.patch import WRONG
 from twin.orbit.images.simulate_report import SORTS, changes_text, points_png
@@ -125,10 +125,12 @@ def _points(setup: CalibrationSetup) -> str:
 
 def _light(setup: CalibrationSetup) -> str:
     effects = setup.test.effects
-    if not any_effect(light_effects(effects)):
-        return "none"
-    on = [name.replace("_", " ") for name in ("light_time", "aberration", "refraction") if getattr(effects, name)]
-    return f"{', '.join(on)}; {'corrected' if effects.corrected else 'not corrected'} in the image points"
+    on = LightEffects.of(effects).names
+    return (
+        f"{', '.join(on)}; {'corrected' if effects.corrected else 'not corrected'} in the image points"
+        if on
+        else "none"
+    )
 
 
 def _warnings(run: CalibrationRun) -> tuple[str, ...]:
@@ -152,7 +154,7 @@ def _warnings(run: CalibrationRun) -> tuple[str, ...]:
             f"{', '.join(resting)}: determined by the priors launch.bias and launch.interior, not by the points; the "
             "sigmas are only as good as these priors. More points, or a longer and wider field, would determine them"
         )
-    if any_effect(run.campaign.effects) and not spec.effects.corrected:
+    if run.campaign.effects.names and not spec.effects.corrected:
         assumptions.append(
             "light time, aberration and refraction are left in the image points; the parameters absorb them"
         )
@@ -173,7 +175,7 @@ def _measured_facts(setup: MeasuredCalibrationSetup, run: CalibrationRun) -> tup
         quaternion = f"scalar {conventions.quaternion.scalar}, {direction}, body {', '.join(conventions.body_axes)}"
     paths = {flight.measured.interpolation for flight in run.campaign.passes}
     joined = {"spline": "cubic splines", "lagrange": "Lagrange polynomials of ten readings"}
-    light = "none" if not any_effect(run.campaign.effects) else f"{'' if test.effects.corrected else 'not '}corrected"
+    light = "none" if not run.campaign.effects.names else f"{'' if test.effects.corrected else 'not '}corrected"
     held = " and ".join(run.together.gauge.held)
     return (
         ("Camera", f"{setup.camera.name}, {setup.camera.description}"),
