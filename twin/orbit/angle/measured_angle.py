@@ -177,9 +177,9 @@ def _strip(
     sensor = Sensor.of_lines(camera, path, earth, times, NO_EFFECTS)
     height = earth.geodetic(ground)[2]
     last = (sensor.lines - 1.0, sensor.camera.pixels - 1.0)
-    low = [np.clip(v, 0.0, end) - 0.25 for v, end in zip((points.line, points.pixel), last, strict=True)]
-    ends = (sensor.ground(low[0] + 0.5 * (k == 0), low[1] + 0.5 * (k == 1), height) for k in (0, 1))
-    slope = 2.0 * (np.stack(list(ends), axis=-1) - sensor.ground(*low, height)[..., None])
+    line, pixel = (np.clip(v, 0.0, end) - 0.25 for v, end in zip((points.line, points.pixel), last, strict=True))
+    ends = (sensor.ground(line + 0.5 * (k == 0), pixel + 0.5 * (k == 1), height) for k in (0, 1))
+    slope = 2.0 * (np.stack(list(ends), axis=-1) - sensor.ground(line, pixel, height)[..., None])
     spread = spread + slope @ points.covariance @ np.swapaxes(slope, 1, 2)
     spread = spread + LEAST_SIGMA**2 * np.eye(3)
     square = np.sum(arm**2, axis=1)[:, None, None] * np.eye(3) - arm[:, :, None] * arm[:, None, :]

@@ -51,9 +51,11 @@ def adjustment_sections(run: CalibrationRun, data: Mapping[str, Any]) -> tuple[S
     return (_parameters(run, data), _fields(run), _biases(run, data), _light(run), _datum(run), _rank(run), _data(run))
 
 
-def figure_of(run: CalibrationRun, draw: Callable[[CalibrationRun], Figure], *texts: str) -> SvgFigure:
+def figure_of(
+    run: CalibrationRun, draw: Callable[[CalibrationRun], Figure], name: str, title: str, caption: str
+) -> SvgFigure:
     """Return a figure of the report from the function that draws it, its name, title and caption."""
-    return SvgFigure(*texts, svg.drawn(f"calibration-{texts[0]}", draw, run))
+    return SvgFigure(name, title, caption, svg.drawn(f"calibration-{name}", draw, run))
 
 
 def _latitude_figure(run: CalibrationRun) -> Figure:

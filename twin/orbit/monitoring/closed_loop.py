@@ -467,9 +467,10 @@ def simulate_course(
         rows.append((position, commands.held, mean + model.effects @ position, covariance, innovation.chi_square))
         moved_states.append(model.moved(state, position))
         advance(k + 1)
-    columns = (np.array(column) for column in zip(*rows, strict=True))
+    positions, held, expected, covariances, square = (np.array(column) for column in zip(*rows, strict=True))
+    measured = np.array(spec.times), positions, held, expected, covariances, square
     joined = SpotEvidence.joined(evidence) if evidence else None
-    return LoopCourse(model, np.array(spec.times), *columns, tuple(jumps), tuple(moved_states), joined)
+    return LoopCourse(model, *measured, tuple(jumps), tuple(moved_states), joined)
 
 
 @dataclass(frozen=True, eq=False)

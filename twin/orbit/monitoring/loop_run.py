@@ -433,11 +433,11 @@ def run_loop(setup: MonitorSetup, backend: Backend, seed: int, advance: Advance)
         [corrector.spec.delay for corrector in model.correctors],
         [corrector.row for corrector in model.correctors],
     )
-    stability = (f(model.coupling, *loops) for f in (control_loop.spectral_radius, control_loop.common_margin))
+    radius, margin = (f(model.coupling, *loops) for f in (control_loop.spectral_radius, control_loop.common_margin))
     modes = unobservable_modes(model.prior, rows, _SCALE)
     foci = (np.full(len(states), _floor(model, row[None])[0]) for row in rows[1:])
     floors = np.stack([_floor(model, opened.slopes), *foci])
-    return LoopRun(setup, seed, model, closed, opened, FrozenMap(analyses), *stability, modes, floors)
+    return LoopRun(setup, seed, model, closed, opened, FrozenMap(analyses), radius, margin, modes, floors)
 
 
 def _analyse_loop(model: LoopModel, k: int, course: LoopCourse) -> LoopAnalysis:
