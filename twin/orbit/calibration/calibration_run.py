@@ -200,12 +200,9 @@ def unknowns(run: CalibrationRun) -> dict[str, Unknown]:
     sigma, held = adjustment.sigma, adjustment.gauge.held
     whole = adjustment.sigma_with(dict.fromkeys(held, run.campaign.spec.launch.interior))
     truth = [None] * len(adjustment.names) if run.truth is None else run.truth.tolist()
-    return {
-        name: Unknown(name, value, sigma[name], whole[name], share, name in held, true)
-        for name, value, share, true in zip(
-            adjustment.names, adjustment.values.tolist(), adjustment.prior_share.tolist(), truth, strict=True
-        )
-    }
+    values, shares = adjustment.values.tolist(), adjustment.prior_share.tolist()
+    rows = zip(adjustment.names, values, shares, truth, strict=True)
+    return {n: Unknown(n, value, sigma[n], whole[n], share, n in held, true) for n, value, share, true in rows}
 
 
 @one_blas_thread()  # of small matrices: threads would only wait for each other
@@ -279,19 +276,13 @@ def _run(setup: AnyCalibration, seed: int, advance: Advance) -> CalibrationRun:
     advance("calibration", 2, parts)
     fields = {}
     for k, flight in enumerate(campaign.passes):
-        fields[flight.name] = FieldResult(
-            campaign_adjustment.calibrated_alone(campaign, flight), *third_differences(flight)
-        )
+        adjustment = campaign_adjustment.calibrated_alone(campaign, flight)
+        fields[flight.name] = FieldResult(adjustment, *third_differences(flight))
         advance("calibration", 3 + k, parts)
     first = campaign.spec.schemes[0][0]
     control = next(p.control for p in campaign.passes if p.name == first)
-    stepwise_result = stepwise(
-        [control],
-        campaign.laboratory,
-        campaign.noise,
-        held=campaign_adjustment.gauge_of(campaign).held,
-        tolerance=STEPWISE_TOLERANCE,
-    )
+    held, cameras = campaign_adjustment.gauge_of(campaign).held, campaign.laboratory
+    stepwise_result = stepwise([control], cameras, campaign.noise, held=held, tolerance=STEPWISE_TOLERANCE)
     alone = {name: result.adjustment for name, result in fields.items()}
     schemes = scheme_tests.scheme_errors(campaign, alone)
     advance("calibration", parts - 3, parts)

@@ -619,5 +619,5 @@ def _matched(
     if not agreed.accepted.any():
         raise PointsError(f"{name}: {agreed.text}; {match.text}")
     status[good & ~agreed.accepted] = CONSENSUS
-    first, agreement = (image.window.first_line, image.window.first_pixel), (agreed.scatter, agreed.text, agreed.field)
-    return MatchedLine(at, match.position, match.covariance, match.correlation, status, first, *agreement)
+    first, shared = (image.window.first_line, image.window.first_pixel), (agreed.scatter, agreed.text, agreed.field)
+    return MatchedLine(at, match.position, match.covariance, match.correlation, status, first, *shared)
