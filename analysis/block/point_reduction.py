@@ -32,7 +32,7 @@ from analysis.arrays import Array, Indices
 from analysis.block.block import ModelScene
 from analysis.block.error_processes import Corrections, cross, rotated, rotated_back, rotation_vector_derivatives
 from analysis.block.reweighting import standardised_packets
-from analysis.orbit.image_correction import coefficient_rows
+from analysis.orbit.rational_polynomial import coefficient_rows
 from analysis.orbit.three_line_model import LineModel, Rays
 
 

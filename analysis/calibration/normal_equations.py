@@ -85,9 +85,8 @@ class SharedNoise:
                 groups.setdefault(term.group, []).append(np.arange(column, column + support.size))
                 column += support.size
             parts[site.name] = tuple(field_parts)
-            corrections |= {
-                (site.name, line): Corrections(tuple(field_parts), np.eye(3), time) for line, time in times.items()
-            }
+            for line, time in times.items():
+                corrections[site.name, line] = Corrections(tuple(field_parts), np.eye(3), time)
             spans.append((begin, column))
         precision = sparse.csr_matrix(sparse.block_diag(blocks)) if blocks else sparse.csr_matrix((0, 0))
         return cls(parts, corrections, tuple(spans), {k: np.concatenate(v) for k, v in groups.items()}, precision)
@@ -377,11 +376,8 @@ class Equations:
         control_blocks = self.control_weight.tobsr((3, 3))
         point_blocks = self.point_covariance(covariance)[control_blocks.indices]
         control = np.sum(residuals.control**2) / factor["control"]
-        rows["control"] = (
-            np.sum(self.control_weight.diagonal() > 0),
-            np.sum(control_blocks.data * point_blocks),
-            control,
-        )
+        taken = np.sum(control_blocks.data * point_blocks)
+        rows["control"] = (np.sum(self.control_weight.diagonal() > 0), taken, control)
         determined = self.prior_weight * np.einsum("kp,pq,kq->k", self.design_prior, covariance, self.design_prior)
         square = self.prior_weight * residuals.prior**2
         for group in dict.fromkeys(p.group for p in priors):
@@ -555,7 +551,8 @@ def _reduce(
     # one (2, 3) block for each image point
     pattern = (point, rows.point_row, np.arange(len(rows.point_row) + 1))
     design_point = sparse.bsr_matrix(pattern, shape=(2 * len(rows.point_row), 3 * total)).tocsr()
-    row_weight = np.repeat(weights.image, 2) / weights.factor.get("image", 1.0)
+    image_weight = weights.image / weights.factor.get("image", 1.0)
+    row_weight = np.repeat(image_weight, 2)
     inverse = np.zeros((total, 3, 3))
     inverse[control] = np.linalg.inv(np.concatenate([f.covariance for f in fields])[control])
     departure = np.concatenate([g - f.ground for g, f in zip(state.grounds, fields, strict=True)])
@@ -564,10 +561,7 @@ def _reduce(
     full_design = sparse.hstack([rows.design, rows.design_shared]).tocsr()
     weighted = (sparse.diags(row_weight) @ full_design).tocsr()
     cross = (design_point.T @ weighted).tocsr()
-    normal_blocks = (
-        _point_blocks(point, rows.point_row, weights.image / weights.factor.get("image", 1.0), total)
-        + control_precision.data
-    )
+    normal_blocks = _point_blocks(point, rows.point_row, image_weight, total) + control_precision.data
     # rejected points have no ray with weight
     normal_blocks[exact | ~np.any(normal_blocks, axis=(1, 2))] = np.eye(3)
     point_inverse = _blocks(np.asarray(np.linalg.inv(normal_blocks), np.float64))
@@ -592,6 +586,7 @@ def _reduce(
         follow = -factor.solve(mixed) if count else np.zeros((shared.size, 0))
         reduced, right_x = reduced + mixed.T @ follow, right_x + mixed.T @ shared_start
     squares = weighted[:, :count].multiply(rows.design)
+    shared_squares = {g: float(state.shared[c] @ weighted_shared[c]) for g, c in shared.groups.items()}
     return Equations(
         design=rows.design,
         design_shared=rows.design_shared,
@@ -600,12 +595,7 @@ def _reduce(
         design_prior=design_prior,
         prior_weight=prior_weight,
         control_weight=control_precision.tocsr(),
-        residuals=Residuals(
-            rows.miss,
-            control_residual,
-            prior_residual,
-            {g: float(state.shared[c] @ weighted_shared[c]) for g, c in shared.groups.items()},
-        ),
+        residuals=Residuals(rows.miss, control_residual, prior_residual, shared_squares),
         reduced=0.5 * (reduced + reduced.T),
         right=right_x,
         length=np.sqrt(np.asarray(squares.sum(axis=0)).ravel()),

@@ -120,9 +120,8 @@ class StripAdjustment:
         """
         if rays.time is None:
             raise CalibrationError("strip adjustment: these rays have no times")
-        corrected_rays = self._shared.corrected_at(
-            _NAME, replace(rays, attitude=rays.attitude @ self._rotation), self._values
-        )
+        turned = replace(rays, attitude=rays.attitude @ self._rotation)
+        corrected_rays = self._shared.corrected_at(_NAME, turned, self._values)
         return replace(corrected_rays, attitude=corrected_rays.attitude @ self._rotation.T)
 
 

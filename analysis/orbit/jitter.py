@@ -47,6 +47,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import product
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -255,22 +256,13 @@ class Observations:
         They are relative to the variances that the present whitening assumes.
         """
         left, known, mix = (self._of_groups(v) for v in (self.rest(self.value)[:, None], self.known, self.mix))
-        by_kind = [mix[:, :, k] for k in range(mix.shape[2])]
-        spread = [m @ m.swapaxes(1, 2) for m in by_kind]
-        products = [matrix @ known for matrix in spread]
-        projected = [np.tensordot(known, matrix, ((0, 1), (0, 1))) for matrix in products]
-        square = np.array([np.sum((m.swapaxes(1, 2) @ left) ** 2) for m in by_kind])
-        normal = np.array(
-            [
-                [
-                    np.sum(spread[k] * spread[m])
-                    - 2.0 * np.sum(products[k] * products[m])
-                    + np.sum(projected[k] * projected[m].T)
-                    for m in range(len(spread))
-                ]
-                for k in range(len(spread))
-            ]
-        )
+        by_kind = np.moveaxis(mix, 2, 0)
+        spread = by_kind @ by_kind.swapaxes(-1, -2)
+        products = spread @ known
+        projected = np.einsum("gip,kgiq->kpq", known, products)
+        square = np.sum((by_kind.swapaxes(-1, -2) @ left) ** 2, axis=(1, 2, 3))
+        normal = np.einsum("kgij,mgij->km", spread, spread) - 2.0 * np.einsum("kgip,mgip->km", products, products)
+        normal += np.einsum("kpq,mqp->km", projected, projected)
         size, axes = np.linalg.eigh(normal)
         inverse = np.where(size >= _LEAST_ROWS, 1.0 / np.maximum(size, _LEAST_ROWS), 0.0)
         return np.asarray(np.maximum(1.0 + (axes * inverse) @ axes.T @ (square - normal.sum(axis=1)), _LEAST_FACTOR))
@@ -291,6 +283,16 @@ class Observations:
 
         value, weight, nuisance = (white(v) for v in (self.value, self.weight, self.nuisance))
         return replace(self, value=value, weight=weight, nuisance=nuisance, mix=white(scaled))
+
+    def sums(self, columns: Array) -> Array:
+        """Return the sums of vectors of R observations (R, ...) over each of G ground points, (G, ...)."""
+        # every group has an observation, so that reduceat sums over whole groups
+        return np.asarray(np.add.reduceat(columns, np.searchsorted(self.group, np.arange(len(self.time))), axis=0))
+
+    @property
+    def pairs(self) -> Array:
+        """Sums over each ground point of the products of weights at two times about two axes, (G, J, J, A, A)."""
+        return self.sums(self.weight[:, :, None, :, None] * self.weight[:, None, :, None, :])
 
     @cached_property
     def _row(self) -> NDArray[np.intp]:
@@ -487,13 +489,9 @@ class _Products:
 
     @classmethod
     def of(cls, observations: Observations, value: Array) -> _Products:
-        first = np.searchsorted(observations.group, np.arange(len(observations.time)))
         columns = np.concatenate([value[:, None], observations.known], axis=1)
-        # every group has an observation, so that reduceat sums over whole groups
-        by_column = np.add.reduceat(observations.weight[..., None] * columns[:, None, None, :], first, axis=0)
-        by_pair = np.add.reduceat(
-            observations.weight[:, :, None, :, None] * observations.weight[:, None, :, None, :], first, axis=0
-        )
+        by_column = observations.sums(observations.weight[..., None] * columns[:, None, None, :])
+        by_pair = observations.pairs
         groups, moments, axes = len(observations.time), observations.time.shape[1], observations.axes
         return cls(
             observations.time - observations.middle,
@@ -524,35 +522,17 @@ class _Products:
         angle = frequency[:, None, None] * t
         sine, cosine = np.sin(angle), np.cos(angle)
         # waves and slopes: sine, cosine, and t cosine, - t sine
-        single = np.stack([sine, cosine, t * cosine, -t * sine]).reshape(4, count, -1)
-        with_columns = (single @ self.columns).reshape(4, count, a, -1)
-        products = np.empty((4, 4, count, a, a))
-        waves = (sine, cosine)
-        plain: dict[tuple[int, int, str], Array] = {}
-        weights = {
-            "": self.pairs,
-            "l": self.pairs * np.broadcast_to(t[:, None, :], (*t.shape, t.shape[1])).reshape(-1, 1),
-            "jl": self.pairs * (t[:, :, None] * t[:, None, :]).reshape(-1, 1),
-        }
-        for j in (0, 1):
-            for k in (0, 1):
-                outer = (waves[j][..., :, None] * waves[k][..., None, :]).reshape(count, -1)
-                for name, weight in weights.items():
-                    plain[j, k, name] = (outer @ weight).reshape(count, a, a)
-        for j in (0, 1):
-            for k in (0, 1):
-                sign = (1.0, -1.0)
-                products[j, k] = plain[j, k, ""]
-                products[j, 2 + k] = sign[k] * plain[j, 1 - k, "l"]
-                products[2 + j, 2 + k] = sign[j] * sign[k] * plain[1 - j, 1 - k, "jl"]
+        waves = np.stack([sine, cosine, t * cosine, -t * sine])
+        with_columns = (waves.reshape(4, count, -1) @ self.columns).reshape(4, count, a, -1)
         known = with_columns[..., 1:]
         blocks = []
         for rows, others in ((0, 0), (0, 2), (2, 2)):
             block = np.empty((count, 2, a, 2, a))
-            for j in (0, 1):
-                for k in (0, 1):
-                    projection = known[rows + j] @ known[others + k].swapaxes(1, 2)
-                    block[:, j, :, k, :] = products[rows + j, others + k] - projection
+            for j, k in product((0, 1), (0, 1)):
+                first, second = rows + j, others + k
+                outer = (waves[first][..., :, None] * waves[second][..., None, :]).reshape(count, -1)
+                projection = known[first] @ known[second].swapaxes(1, 2)
+                block[:, j, :, k, :] = (outer @ self.pairs).reshape(count, a, a) - projection
             blocks.append(block.reshape(count, 2 * a, 2 * a))
         right = with_columns[:2, ..., 0].swapaxes(0, 1).reshape(count, 2 * a)
         return blocks[0], blocks[1], blocks[2], right
@@ -594,12 +574,8 @@ def peaks(observations: Observations, lowest: float, highest: float) -> tuple[Ar
     step = 1.0 / (_FINE * highest)
     count = int(np.ceil(observations.span / step)) + 2
     size = fft.next_fast_len(_PADDED * count, real=True)
-    first = np.searchsorted(observations.group, np.arange(len(observations.time)))
-    value = observations.rest(observations.value)[:, None, None]
-    sums = np.add.reduceat(observations.weight * value, first, axis=0)
-    pairs = np.add.reduceat(
-        observations.weight[:, :, None, :, None] * observations.weight[:, None, :, None, :], first, axis=0
-    )
+    sums = observations.sums(observations.weight * observations.rest(observations.value)[:, None, None])
+    pairs = observations.pairs
     # times without weight are clipped to the grid
     begin = observations.ends[0]
     at = np.clip(np.rint((observations.time - begin) / step).astype(np.intp), 0, count - 1)
@@ -712,16 +688,11 @@ class Lines:
     @property
     def amplitude_sigma(self) -> Array:
         """Standard deviations of the amplitudes of K lines about A axes, (K, A), in radians."""
-        axes = self.sine.shape[1]
-        out = np.zeros_like(self.sine)
-        for k in range(len(self.frequency)):
-            first = k * (1 + 2 * axes) + 1
-            for a in range(axes):
-                at = [first + a, first + axes + a]
-                along = np.array([self.sine[k, a], self.cosine[k, a]])
-                along = along / max(float(np.linalg.norm(along)), 1e-300)
-                out[k, a] = np.sqrt(along @ self.covariance[np.ix_(at, at)] @ along)
-        return out
+        axes, width = self.sine.shape[1], 1 + 2 * self.sine.shape[1]
+        parts = [slice(k + 1, k + width) for k in range(0, len(self.covariance), width)]
+        blocks = np.array([self.covariance[part, part] for part in parts]).reshape(-1, 2, axes, 2, axes)
+        along = np.stack([self.sine, self.cosine], axis=1) / np.maximum(self.amplitude, 1e-300)[:, None]
+        return np.sqrt(np.einsum("kia,kiaja,kja->ka", along, blocks, along))
 
     def design(self, seconds: ArrayLike) -> Array:
         """Return the derivatives of the attitude at T times with respect to frequency, sine and cosine of each line.
@@ -746,11 +717,14 @@ class Lines:
 
         Angles are (T, A) in radians, covariances (T, A, A) in rad^2, times in seconds.
         """
-        t = np.asarray(seconds, np.float64) - self.origin
-        angle = 2.0 * np.pi * t[:, None] * self.frequency
-        value = np.sin(angle) @ self.sine + np.cos(angle) @ self.cosine
         by = self.design(seconds)
-        return np.asarray(value), np.asarray(np.einsum("tap,pq,tbq->tab", by, self.covariance, by, optimize=True))
+        spread = np.einsum("tap,pq,tbq->tab", by, self.covariance, by, optimize=True)
+        return self.angles(seconds), np.asarray(spread)
+
+    def angles(self, seconds: ArrayLike) -> Array:
+        """Return the attitude angles of all lines together at T times about A axes, (T, A), in radians."""
+        angle = 2.0 * np.pi * (np.asarray(seconds, np.float64) - self.origin)[:, None] * self.frequency
+        return np.asarray(np.sin(angle) @ self.sine + np.cos(angle) @ self.cosine)
 
 
 @dataclass(frozen=True, eq=False)
@@ -836,24 +810,22 @@ def search(
         probability = float(current.p_value(current.power[best]))
         if probability > false_alarm:
             break
-        p_values_with_line = [*p_values, probability]
+        with_line = np.array([*p_values, probability])
         try:
-            fitted = _fitted(
-                used_observations, np.array([*frequency, float(current.frequency[best])]), np.array(p_values_with_line)
-            )
+            fitted = _fitted(used_observations, np.array([*frequency, current.frequency[best]]), with_line)
             fitted, alternatives = _unaliased(used_observations, lines, fitted, alias_band, false_alarm)
             good = _good(observations.rewhitened(_beside(observations.taken(used), fitted).factors()), fitted)
             used_observations = observations.taken(good).rewhitened(factors)
-            fitted = _fitted(used_observations, fitted.frequency, np.array(p_values_with_line))
+            fitted = _fitted(used_observations, fitted.frequency, with_line)
             # the factors were estimated before with the new line as noise
             used_observations = observations.taken(good)
             factors = _beside(used_observations, fitted).factors()
             used_observations = used_observations.rewhitened(factors)
-            fitted = _fitted(used_observations, fitted.frequency, np.array(p_values_with_line))
+            fitted = _fitted(used_observations, fitted.frequency, with_line)
         except JitterError:
             # the rest is not a stationary oscillation; its amplitude may change, for example
             break
-        lines, used, frequency, p_values = fitted, good, fitted.frequency.tolist(), p_values_with_line
+        lines, used, frequency, p_values = fitted, good, fitted.frequency.tolist(), with_line.tolist()
         aliases.append(alternatives)
     before = current if lines is None else periodogram(used_observations, lowest, highest)
     if lines is None:
@@ -1013,9 +985,7 @@ def _columns(observations: Observations, lines: Lines) -> Array:
 def _predicted(observations: Observations, lines: Lines) -> Array:
     out = np.zeros(len(observations.value))
     for j in range(observations.time.shape[1]):
-        angle = 2.0 * np.pi * (observations.time[:, j, None] - lines.origin) * lines.frequency
-        rotation = np.sin(angle) @ lines.sine + np.cos(angle) @ lines.cosine
-        out += np.sum(observations.weight[:, j] * rotation[observations.group], axis=1)
+        out += np.sum(observations.weight[:, j] * lines.angles(observations.time[:, j])[observations.group], axis=1)
     return out
 
 
@@ -1053,15 +1023,8 @@ def _fitted(observations: Observations, frequency: Array, p_value: Array) -> Lin
     empty = np.zeros((count * width, count * width))
     for _ in range(_ROUNDS):
         waves = observations.rest(observations.waves(f)).reshape(len(value), -1)
-        linear = np.linalg.lstsq(waves, value, rcond=None)[0].reshape(count, 2, axes)
-        lines = Lines(
-            f,
-            np.asarray(linear[:, 0], np.float64),
-            np.asarray(linear[:, 1], np.float64),
-            empty,
-            p_value,
-            observations.middle,
-        )
+        linear = np.asarray(np.linalg.lstsq(waves, value, rcond=None)[0], np.float64).reshape(count, 2, axes)
+        lines = Lines(f, linear[:, 0], linear[:, 1], empty, p_value, observations.middle)
         design = observations.rest(_columns(observations, lines))
         size = np.linalg.norm(design, axis=0)
         if not np.all(size > 0.0):

@@ -314,19 +314,11 @@ def _explicit(station: Station, strip: Strip, arm: Array, method: Method) -> Pla
         half_rotation = np.array([-1.0, -1.0, 1.0])
         fitted, gain, bias = half_rotation * normal, half_rotation[:, None] * gain, half_rotation * bias
     residual = arm @ fitted
-    return PlaneFit(
-        method=method,
-        station=station,
-        strip=strip,
-        normal=fitted,
-        # a point moves the plane by its distance from the true plane, for the printed one, too
-        point_gain=gain.T[:, :, None] * normal,
-        residual=residual,
-        chi_square=float(residual @ _DistanceNoise.of(station, strip, fitted).weighted(residual)),
-        condition=condition,
-        attenuation=float(np.max(np.linalg.eigvals(noise).real)),
-        bias=bias,
-    )
+    # a point moves the plane by its distance from the true plane, for the printed one, too
+    point_gain = gain.T[:, :, None] * normal
+    chi_square = float(residual @ _DistanceNoise.of(station, strip, fitted).weighted(residual))
+    attenuation = float(np.max(np.linalg.eigvals(noise).real))
+    return PlaneFit(method, station, strip, fitted, point_gain, residual, chi_square, condition, attenuation, bias)
 
 
 def _total(station: Station, strip: Strip, arm: Array) -> PlaneFit:
@@ -346,19 +338,9 @@ def _total(station: Station, strip: Strip, arm: Array) -> PlaneFit:
     design = arm @ basis
     matrix = design.T @ noise.weighted(design)
     gain = -basis @ np.linalg.solve(matrix, noise.weighted(design).T)
-    residual = arm @ normal
-    return PlaneFit(
-        method="tls",
-        station=station,
-        strip=strip,
-        normal=normal,
-        point_gain=gain.T[:, :, None] * normal,
-        residual=residual,
-        chi_square=float(residual @ noise.weighted(residual)),
-        condition=float(np.linalg.cond(matrix)),
-        attenuation=0.0,
-        bias=np.zeros(3),
-    )
+    point_gain, residual = gain.T[:, :, None] * normal, arm @ normal
+    quality = residual, float(residual @ noise.weighted(residual)), float(np.linalg.cond(matrix))
+    return PlaneFit("tls", station, strip, normal, point_gain, *quality, 0.0, np.zeros(3))
 
 
 def _gauss_helmert(station: Station, strip: Strip, arm: Array, normal: Array) -> Array:

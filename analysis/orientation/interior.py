@@ -317,9 +317,8 @@ def _check_separable(columns: Array, names: tuple[str, ...], angle: Array) -> No
     low, high = np.rad2deg(np.min(angle)), np.rad2deg(np.max(angle))
     side = ", all on one side of zero" if low * high > 0 else ""
     raise OrientationError(
-        f"interior orientation: angles from {low:.6g} to {high:.6g} deg{side}, cannot separate {', '.join(mixed)}"
-        f" (condition number {condition:.2g}); measure at more angles over both halves of the"
-        " field, or omit a term"
+        f"interior orientation: angles from {low:.6g} to {high:.6g} deg{side}, cannot separate {', '.join(mixed)} "
+        f"(condition number {condition:.2g}); measure at more angles over both halves of the field, or omit a term"
     )
 
 
@@ -634,11 +633,7 @@ def fit_interior_orientation(
             f"interior orientation: f = {f:.3g} +- {sigma:.2g} m; the angles span only {np.ptp(angles):.3g} rad, too"
             " little for their noise; turn the turntable over the whole field"
         )
-    if f < 0:
-        raise OrientationError(
-            f"interior orientation: the principal distance comes out as {f:.6g} m; angles and spot positions count in"
-            " opposite senses, change the sign of one of them"
-        )
+    _same_sense(values[k])
     return InteriorOrientation(
         terms=names,
         values=values,

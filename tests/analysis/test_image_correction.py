@@ -5,7 +5,7 @@ import pytest
 from scipy.linalg import block_diag
 from scipy.stats import chi2
 
-from analysis.orbit.image_correction import image_correction
+from analysis.orbit.rational_polynomial import image_correction
 from tests.analysis.refusals import refuses
 
 SIZE = np.array([12_000.0, 20_000.0])

@@ -43,8 +43,8 @@ from analysis.orbit.forward_intersection import (
     intersect,
     intersect_pair,
 )
-from analysis.orbit.image_correction import image_correction
 from analysis.orbit.jitter import JitterError, Observations, fit_spline, periodogram
+from analysis.orbit.rational_polynomial import image_correction
 from analysis.orientation.interior import OrientationError, fit_interior_orientation, line_orientation
 from analysis.spots.centroid import energy_centroid, gaussian_fit
 from analysis.spots.frame_screening import FramesError

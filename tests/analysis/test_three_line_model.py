@@ -16,9 +16,8 @@ from scenes.specs.orbit.setup import load_three_line_camera
 from tests.analysis.refusals import refuses
 from tests.twin.orbit_bench import CirclePlatform
 from twin.orbit.flight.earth import Earth
-from twin.orbit.flight.light_effects import NO_EFFECTS
 from twin.orbit.flight.line_camera import line_cameras
-from twin.orbit.flight.sensor import Sensor
+from twin.orbit.flight.sensor import NO_EFFECTS, Sensor
 
 ARCSEC = np.pi / 648000
 PITCH = 6.5e-6

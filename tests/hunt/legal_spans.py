@@ -13,10 +13,9 @@ from scenes.specs.orbit.setup import load_three_line_camera
 from tests.hunt.hunt import BAD_REFUSAL, REFUSED, RIGHT, WRONG_READING, Outcome
 from tests.twin.orbit_bench import CirclePlatform
 from twin.orbit.flight.earth import Earth
-from twin.orbit.flight.light_effects import NO_EFFECTS
 from twin.orbit.flight.line_camera import LineCamera, LineTimes, line_cameras
 from twin.orbit.flight.platform_table import PlatformTable, TabulatedTrajectory
-from twin.orbit.flight.sensor import Sensor
+from twin.orbit.flight.sensor import NO_EFFECTS, Sensor
 
 _AGREE = 1e-3
 """Metres: splines through readings up to 2 s apart are good to 1e-4 m, also half a microsecond beyond their ends."""

@@ -15,10 +15,9 @@ from scenes.specs.orbit.setup import load_three_line_camera
 from tests.tiers import quick
 from tests.twin import orbit_file_bench as bench
 from twin.orbit.flight.earth import Earth
-from twin.orbit.flight.light_effects import LightEffects
 from twin.orbit.flight.line_camera import line_cameras
 from twin.orbit.flight.platform_table import TabulatedTrajectory
-from twin.orbit.flight.sensor import Sensor
+from twin.orbit.flight.sensor import LightEffects, Sensor
 from twin.orbit.measured.earth_orientation import EarthOrientation, angular_velocity, read_earth_orientation
 from twin.orbit.measured.platform_files import platform_table, read_platform
 

@@ -15,9 +15,8 @@ from tests.robustness.cases import cases
 from tests.robustness.spoilt_run import mutant, write_files
 from tests.twin.orbit_bench import CirclePlatform
 from twin.orbit.flight.earth import Earth
-from twin.orbit.flight.light_effects import LightEffects
 from twin.orbit.flight.line_camera import line_cameras
-from twin.orbit.flight.sensor import Sensor
+from twin.orbit.flight.sensor import LightEffects, Sensor
 
 pytestmark = pytest.mark.second
 

@@ -16,8 +16,8 @@ from twin.orbit.conventions.pass_readings import read_line_clocks
 from twin.orbit.flight.earth import east_north_up
 from twin.orbit.flight.platform_table import TabulatedTrajectory
 from twin.orbit.measured import xml_file
-from twin.orbit.measured.clock import Readings
 from twin.orbit.measured.dimap_file import read_dimap
+from twin.orbit.measured.earth_orientation import Readings
 from twin.orbit.measured.orbit_files import OrbitReadings, require_earth_fixed_velocity
 from twin.orbit.measured.platform_files import platform_table, read_platform, read_scene
 

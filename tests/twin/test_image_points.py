@@ -19,9 +19,8 @@ from scenes.specs.orbit.setup import CalibrationSetup, MatchSetup, SimulateSetup
 from tests.twin import orbit_file_bench as bench
 from twin.orbit.calibration.calibration_run import true_values
 from twin.orbit.calibration.campaign import Campaign, FieldImages
-from twin.orbit.calibration.campaign_adjustment import simultaneous
+from twin.orbit.calibration.campaign_adjustment import screen_campaign, simultaneous
 from twin.orbit.calibration.flown_campaign import fly_fields
-from twin.orbit.calibration.screening import screen_campaign
 from twin.orbit.images import image_points
 from twin.orbit.images.image_points import MatchedPoints, map_points, tie_points
 from twin.orbit.images.patch import judged, true_ground

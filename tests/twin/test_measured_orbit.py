@@ -28,9 +28,8 @@ from twin.orbit.angle.measured_angle import angle_exported, run_measured_angle
 from twin.orbit.calibration.campaign_adjustment import calibrated_alone, gauge_of, simultaneous
 from twin.orbit.calibration.schemes import scheme_errors
 from twin.orbit.flight.earth import Earth
-from twin.orbit.flight.light_effects import LightEffects
 from twin.orbit.flight.line_camera import line_cameras
-from twin.orbit.flight.sensor import Sensor
+from twin.orbit.flight.sensor import LightEffects, Sensor
 from twin.orbit.images.simulate_run import run_simulation, simulation_exported
 from twin.orbit.measured.measurement_tables import read_measurements
 

@@ -14,8 +14,8 @@ from scenes.specs.orbit.setup import AngleSetup
 from tests.tiers import quick
 from twin.orbit.angle.angle_flight import AngleCamera, AnglePass, angle_camera, fly
 from twin.orbit.angle.angle_run import estimate_angles, frame_rows, run_angle, tls_angles, values_of
-from twin.orbit.flight.light_effects import NO_EFFECTS, LightEffects
 from twin.orbit.flight.line_camera import look_angle
+from twin.orbit.flight.sensor import NO_EFFECTS, LightEffects
 
 EXAMPLE = SCENES / ORBIT / "angle.yaml"
 SETUP = AngleSetup.read(EXAMPLE)

@@ -37,8 +37,8 @@ from twin.orbit.calibration.schemes import (
 )
 from twin.orbit.calibration.schemes import check_point_errors as at_checks
 from twin.orbit.calibration.schemes import strip_check_errors as in_strip
-from twin.orbit.flight.light_effects import NO_EFFECTS
 from twin.orbit.flight.line_camera import drifted_payload
+from twin.orbit.flight.sensor import NO_EFFECTS
 from twin.orbit.measured.pass_measurements import ImagePoints
 
 EXAMPLE = SCENES / ORBIT / "calibrate.yaml"

@@ -149,7 +149,7 @@ def test_what_is_exported_is_the_pass_that_was_read() -> None:
     from scenes.specs.orbit.setup import CheckSetup, MeasuredCalibrationSetup
     from twin.orbit.conventions.check_run import exported, measurements
     from twin.orbit.flight.platform_table import TabulatedTrajectory
-    from twin.orbit.measured.clock import Readings
+    from twin.orbit.measured.earth_orientation import Readings
     from twin.orbit.measured.measurement_tables import read_measurements
 
     folder = SCENES / "orbit/measured"
@@ -252,4 +252,4 @@ def test_a_reading_that_cannot_be_says_why(files, tmp_path: Path, name: str, old
     spec = with_absolute_files(OrbitCheckSpec.model_validate(data), tmp_path)
     setup = CheckSetup.model_construct(test=spec, camera=load_three_line_camera("th1"))
     readings, stated = read_pass(spec, setup.camera, Path())
-    assert why in _tried(_bench(setup, readings, stated), stated, ()).why
+    assert why in _tried(_bench(setup, readings, stated), ()).why

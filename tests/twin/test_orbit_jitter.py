@@ -12,9 +12,9 @@ from scenes.specs.orbit.setup import JitterSetup, load_three_line_camera
 from scenes.specs.procedures import PROCEDURES
 from scenes.yaml.yaml_file import read_yaml
 from tests.tiers import quick
-from twin.orbit.flight.light_effects import LightEffects
 from twin.orbit.flight.line_camera import line_cameras
 from twin.orbit.flight.platform_table import TabulatedTrajectory
+from twin.orbit.flight.sensor import LightEffects
 from twin.orbit.jitter import sights
 from twin.orbit.jitter.jitter_report import _warnings as jitter_warnings
 from twin.orbit.jitter.jitter_run import JITTER, JitterRun, blind_multiples, fly_strip, run_jitter

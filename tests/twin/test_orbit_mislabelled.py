@@ -14,7 +14,7 @@ from tests.twin.orbit_files import FIELDS, edit, export, flown, read_back, set_k
 from twin.framework.procedure import BenchError
 from twin.orbit.calibration.calibration_run import run_calibration
 from twin.orbit.calibration.campaign import campaign_of
-from twin.orbit.calibration.screening import _factors, mislabelled_points
+from twin.orbit.calibration.campaign_adjustment import _factors, mislabelled_points
 from twin.orbit.measured.measurement_tables import read_measurements
 from twin.orbit.measured.pass_measurements import duplicates
 

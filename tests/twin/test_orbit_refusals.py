@@ -491,7 +491,6 @@ PAIR: Any = Ns(
 FEW: dict[str, Any] = {
     "corrected_line": lambda line, *_: line,
     "_optics": lambda *_: None,
-    "second_view": lambda *_: 0.0,
     "Sensor": lambda *_: lines()["nadir"].sensor,
     "imaged_lines": lambda *_: None,
     "fly_patch": lambda *_: None,
@@ -500,6 +499,7 @@ FEW: dict[str, Any] = {
 
 
 def test_line_images_with_too_few_points_are_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(loop_run.pair_flight, "second_view", lambda *_: 0.0)
     for part, made in FEW.items():
         monkeypatch.setattr(loop_run, part, made)
     known = dict.fromkeys(PAIR.pair)

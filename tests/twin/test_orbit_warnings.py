@@ -94,7 +94,7 @@ def put(run: Any, path: str, value: Any) -> None:
 def any_run(monkeypatch: pytest.MonkeyPatch) -> None:
     """Kinds of runs are told by their classes, and some parts have tests of their own."""
     for module, name in (
-        (export_report, "SceneSource"),
+        (export_report.export_run, "SceneSource"),
         (angle_report, "SimulatedAngleRun"),
         (distortion_report, "SimulatedDistortion"),
         (distortion_report, "MeasuredDistortionSpec"),
@@ -105,7 +105,6 @@ def any_run(monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr(module, name, Ns(warnings=lambda run: []))
     for name in ("drift_warnings", "step_warnings"):
         monkeypatch.setattr(calibration_report, name, lambda *_: [])
-    monkeypatch.setattr(calibration_report, "any_effect", lambda effects: bool(effects.names))
     monkeypatch.setattr(calibration_report, "intersection_fit", lambda campaign, *_: campaign.meeting)
 
 

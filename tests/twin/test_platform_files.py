@@ -19,8 +19,14 @@ from tests.twin import orbit_file_bench as bench
 from tests.twin.orbit_bench import CirclePlatform
 from twin.orbit.flight.line_camera import LinePiece, line_cameras
 from twin.orbit.flight.platform_table import PlatformTable, TabulatedTrajectory
-from twin.orbit.measured.clock import Readings, epoch_before, known_scale, tai_minus_utc
-from twin.orbit.measured.earth_orientation import constant_orientation, read_earth_orientation
+from twin.orbit.measured.earth_orientation import (
+    Readings,
+    constant_orientation,
+    epoch_before,
+    known_scale,
+    read_earth_orientation,
+    tai_minus_utc,
+)
 from twin.orbit.measured.orbit_files import OrbitReadings, Segment, known_frame, read_oem, read_sp3
 from twin.orbit.measured.platform_files import platform_table, read_platform
 

@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 import rasterio
 
-from analysis.orbit.image_correction import Kind, image_correction
-from analysis.orbit.rational_polynomial import RationalPolynomial
+from analysis.orbit.rational_polynomial import Kind, RationalPolynomial, image_correction
 from tests.tiers import quick
 from tests.twin.dimap_bench import Scene, rpc, write
 from twin.framework.data_files import FrameFacts, tiff

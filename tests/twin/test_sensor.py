@@ -15,19 +15,19 @@ from scenes.specs.orbit.three_line_camera import ThreeLineCameraSpec
 from tests.tiers import quick
 from tests.twin.orbit_bench import RATE, CirclePlatform, turn
 from twin.orbit.flight.earth import Earth
-from twin.orbit.flight.light_effects import (
+from twin.orbit.flight.line_camera import LineCamera, line_cameras, traced_line_cameras
+from twin.orbit.flight.orbit import propagate
+from twin.orbit.flight.sensor import (
     NO_EFFECTS,
     SPEED_OF_LIGHT,
     LightEffects,
+    Sensor,
     aberrated,
     refracted,
     refractive_shift,
     standard_refractivity,
     unrefracted,
 )
-from twin.orbit.flight.line_camera import LineCamera, line_cameras, traced_line_cameras
-from twin.orbit.flight.orbit import propagate
-from twin.orbit.flight.sensor import Sensor
 from twin.orbit.flight.trajectory import Trajectory
 
 ARCSEC = math.radians(1.0 / 3600.0)

@@ -22,8 +22,7 @@ from twin.framework.data_files import FrameFacts, tiff
 from twin.orbit.export import line_scanner as line_scanning
 from twin.orbit.export.line_scanner import line_scanner
 from twin.orbit.export.rational_polynomial import sensor_polynomial
-from twin.orbit.flight.light_effects import NO_EFFECTS, LightEffects
-from twin.orbit.flight.sensor import Sensor
+from twin.orbit.flight.sensor import NO_EFFECTS, LightEffects, Sensor
 from twin.orbit.images.simulate_run import fly_simulation
 
 run = partial(invoke, command.app)

@@ -556,10 +556,8 @@ class SeriesResult:
     @property
     def from_exact(self) -> np.ndarray:
         """Readings minus the exact ones for an ideal turntable, mirrors and lenses, (2, rows, 2), radians."""
-        args = self.series.axis, self.series.angles
-        return self.readings - np.stack(
-            [autocollimator.exact_reading(*args, u, 2.0 * self.series.half_angle) for u in UNITS]
-        )
+        axis, angles, mirrors = self.series.axis, self.series.angles, 2.0 * self.series.half_angle
+        return self.readings - np.stack([autocollimator.exact_reading(axis, angles, u, mirrors) for u in UNITS])
 
 
 @dataclass(frozen=True, eq=False)
@@ -585,10 +583,7 @@ class ReadingTable:
         KeyError
             There is no series about this axis.
         """
-        for result in self.results:
-            if result.series.axis == axis:
-                return result
-        raise KeyError(axis)
+        return {result.series.axis: result for result in reversed(self.results)}[axis]
 
 
 AIRY_RADII = 4.0
@@ -730,9 +725,8 @@ def declared_spread(
         reading += jitter[:, 1:] - jitter[:, :1] + image_sigma * rng.standard_normal(reading.shape)
         columns.append(reading)
     first = series.angles if series.axis == "Z" else columns[0]
-    return np.asarray(
-        np.mean(np.abs(first - columns[1] / autocollimator.relation_factor(series.axis, 2, mirror_angle)), axis=1)
-    )
+    second = columns[1] / autocollimator.relation_factor(series.axis, 2, mirror_angle)
+    return np.asarray(np.mean(np.abs(first - second), axis=1))
 
 
 class Reader:
@@ -772,15 +766,12 @@ class Reader:
         p = self.spec.programme
         half_range = 1.02 * max(p.small, p.table, p.large) * p.steps
         angles = np.linspace(-half_range, half_range, CALIBRATION_POINTS)
-        rotations = np.stack([*np.meshgrid(angles, angles, indexing="ij"), np.zeros((len(angles),) * 2)], -1).reshape(
-            -1, 3
-        )
+        rotations = np.stack(np.meshgrid(angles, angles, 0.0, indexing="ij"), axis=-1).reshape(-1, 3)
         windows = self.path(p.narrow).windows([{axis_body("X"): Motion(rotate=triple(turn))} for turn in rotations])
         photons, corner = windows.photons[0], windows.corner[0]
         positions, _ = self.positions(self.detector.expected_dn(photons, self.exposure), corner)
-        return autocollimator.ReadingMap.fit(
-            positions, autocollimator.reading_of_normal(rotation_matrix(rotations) @ np.array([0.0, 0.0, -1.0]))
-        )
+        normals = rotation_matrix(rotations) @ np.array([0.0, 0.0, -1.0])
+        return autocollimator.ReadingMap.fit(positions, autocollimator.reading_of_normal(normals))
 
     def positions(self, mean: np.ndarray, corner: np.ndarray) -> tuple[np.ndarray, SpotPositions]:
         """Measure the positions of the spots in B window images, in pixels of the whole CCD.

@@ -13,7 +13,6 @@ row drifts by the smile of the mapping.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -21,7 +20,7 @@ import numpy as np
 from analysis.spots.noise import NoiseModel
 from optics.geometry.pose import rotation_matrix
 from optics.geometry.tree import State
-from optics.geometry.vector_shape import Disk, Polygon
+from optics.geometry.vector_shape import Disk
 from optics.numerics.backend import Backend, one_blas_thread
 from optics.raytrace.aim import AimError
 from optics.raytrace.trace import BeamMissedError
@@ -88,12 +87,12 @@ class PinholeImages:
         cls,
         path: TargetPath,
         state: State,
-        directions: Callable[[np.ndarray], np.ndarray],
+        light: np.ndarray,
         half_field: float,
         target: Target,
         ccd: LineCcd,
         window: int,
-        progress: Callable[[int, int], None] = lambda done, total: None,
+        advance: Advance = silent,
     ) -> PinholeImages:
         """Compute the spectra of the pinhole's images at the Chebyshev nodes of the field.
 
@@ -103,9 +102,8 @@ class PinholeImages:
             Light path from the target to the plane of the line CCD.
         state : State
             State of the camera.
-        directions : callable
-            Function from M rotations of the camera, (M,), radians, to directions of the light, (M, 3), in the world
-            frame.
+        light : (NODES, 3) ndarray
+            Directions of the light at the nodes, in the world frame.
         half_field : float
             Largest rotation of the camera to either side, radians.
         target : Target
@@ -114,15 +112,14 @@ class PinholeImages:
             Line CCD.
         window : int
             Side of an image, pixels.
-        progress : callable
-            Called with (done, total) nodes.
+        advance : callable
+            Called with the stage, and the done and total nodes.
 
         Raises
         ------
         BeamMissedError, AimError, ValueError
             The beam does not pass, or its wavefront is too irregular for a fit.
         """
-        light = directions(half_field * _nodes())
         pupils = path.pupils(state, light, path.places(state, light))
         wavelengths, weights = band_wavelengths(ccd.band)
         rim = np.stack([np.cos(_RIM), np.sin(_RIM)], axis=-1)
@@ -141,8 +138,10 @@ class PinholeImages:
             image = hole.mapped(path.local_map(state, direction, 1.5 * hole.radius))
             table = TransferTable.build(pupil, wavelengths, weights)
             spectra[n] = image.spectrum(*grid) * table(*grid) * common
-            diameter = _extent_x(image) if n == NODES // 2 else diameter
-            progress(n + 1, NODES)
+            if n == NODES // 2:
+                low, high, _, _ = image.bounds
+                diameter = high - low
+            advance("spectra of the spots", n + 1, NODES)
         return cls(half_field, fx, fy, spectra, pitch, window, diameter)
 
     def __call__(self, field_angle: float, position: np.ndarray) -> np.ndarray:
@@ -190,11 +189,6 @@ def centroid_offset(path: TargetPath, state: State, directions: np.ndarray) -> n
     return np.array(out)
 
 
-def field_nodes(half_field: float) -> np.ndarray:
-    """Return the field angles of the Chebyshev nodes at which images are computed, (NODES,), radians."""
-    return np.asarray(half_field * _nodes())
-
-
 def interpolated(values: np.ndarray, half_field: float, field_angle: np.ndarray) -> np.ndarray:
     """Return the polynomial through values at the Chebyshev nodes, (NODES,), evaluated at M field angles, (M,)."""
     return np.array([_node_weights(angle / half_field) @ values for angle in field_angle])
@@ -209,12 +203,6 @@ def _node_weights(position: float) -> np.ndarray:
     """Return the interpolation weights of the values at the nodes, (NODES,), for a position on -1 ... 1."""
     order = np.polynomial.chebyshev.chebvander(_nodes(), NODES - 1)
     return np.linalg.solve(order.T, np.polynomial.chebyshev.chebvander(np.array([position]), NODES - 1)[0])
-
-
-def _extent_x(image: Disk | Polygon) -> float:
-    """Return the size of a target's image (disk or polygon) along x, metres."""
-    low, high, _, _ = image.bounds
-    return high - low
 
 
 MIN_WIDTH = 2.0
@@ -347,9 +335,8 @@ class DistortionBench:
         ccd = LineCcd.from_specs(band, setup.detectors[band.detector])
         _check_pinhole(setup, camera.model.line_principal_distance)
         half_length = 0.5 * band.pixels * band.pitch
-        field_angle = np.arctan(test.reach * half_length / camera.model.line_principal_distance) * np.linspace(
-            -1.0, 1.0, test.points
-        )
+        edge = np.arctan(test.reach * half_length / camera.model.line_principal_distance)
+        field_angle = edge * np.linspace(-1.0, 1.0, test.points)
         _check_table(setup, field_angle)
         try:
             centre_direction = _aim(path, camera.as_built, band.offset)
@@ -358,24 +345,14 @@ class DistortionBench:
                 return _rotated(np.array([1.0, 0.0, 0.0]), angle, centre_direction)
 
             half_field = float(field_angle[-1])
-            images = PinholeImages.build(
-                path,
-                camera.as_built,
-                directions,
-                half_field,
-                pinhole(test.pinhole),
-                ccd,
-                test.window,
-                lambda done, total: advance("spectra of the spots", done, total),
-            )
-            nodes = directions(field_nodes(half_field))
+            nodes = directions(half_field * _nodes())
+            hole = pinhole(test.pinhole)
+            images = PinholeImages.build(path, camera.as_built, nodes, half_field, hole, ccd, test.window, advance)
             offsets = [centroid_offset(*light, nodes) for light in ((design, {}), (path, camera.as_built))]
         except (AimError, BeamMissedError, ValueError) as error:
-            raise BenchError(
-                f"the camera's beam cannot be traced: {error}",
-                ("collimator",),
-                "a wider collimator, or smaller errors in `as_built`",
-            ) from error
+            problem = f"the camera's beam cannot be traced: {error}"
+            remedy = "a wider collimator, or smaller errors in `as_built`"
+            raise BenchError(problem, ("collimator",), remedy) from error
         known, true = (interpolated(offset, half_field, field_angle) for offset in offsets)
         return cls(setup, path, camera.as_built, ccd, images, field_angle, centre_direction, known, true)
 
@@ -446,11 +423,8 @@ class DistortionBench:
         if np.min(column) < 0 or np.max(column) + test.window > self.ccd.band.pixels:
             overshoot = 0.5 * test.window + np.max(np.abs(position[..., 0])) / pitch - 0.5 * self.ccd.band.pixels
             most = test.reach - 2.0 * max(overshoot, 0.0) / self.ccd.band.pixels
-            raise BenchError(
-                "the first or last spot falls beside the line",
-                ("reach",),
-                f"at most about {most:.4f} for this zero of the table",
-            )
+            allowed = f"at most about {most:.4f} for this zero of the table"
+            raise BenchError("the first or last spot falls beside the line", ("reach",), allowed)
         inside = (spot - first) * pitch
         light = np.stack([self.images(w, at) for w, at in zip(self.field_angle, inside, strict=True)])
         # far tails of the Fourier sum may ring below zero by rounding
@@ -496,17 +470,12 @@ def _check_pinhole(setup: DistortionSetup, focal_length: float) -> None:
     most = 2.0 * (0.5 * test.window - MARGIN - BLUR)
     allowed = f"{1e6 * MIN_WIDTH * per_pixel:.0f} um to {1e6 * most * per_pixel:.0f} um"
     if width < MIN_WIDTH:
-        raise BenchError(
-            f"the pinhole's image is {width:.2g} pixels wide: too small, the pixels would bias its centroid",
-            ("pinhole",),
-            allowed,
-        )
+        problem = f"the pinhole's image is {width:.2g} pixels wide: too small, the pixels would bias its centroid"
+        raise BenchError(problem, ("pinhole",), allowed)
     if width > most:
-        raise BenchError(
-            f"the pinhole's image is {width:.3g} pixels wide and does not fit into a window of {test.window} pixels",
-            ("pinhole",),
-            f"{allowed}, or a larger window",
-        )
+        into = f"a window of {test.window} pixels"
+        problem = f"the pinhole's image is {width:.3g} pixels wide and does not fit into {into}"
+        raise BenchError(problem, ("pinhole",), f"{allowed}, or a larger window")
 
 
 def _check_table(setup: DistortionSetup, field_angle: np.ndarray) -> None:
@@ -516,8 +485,7 @@ def _check_table(setup: DistortionSetup, field_angle: np.ndarray) -> None:
     if field_angle[-1] > margin:
         raise BenchError(
             f"the camera's field requires +-{np.rad2deg(field_angle[-1]):.3f} deg of the turntable, but about its "
-            "camera_angle "
-            f"only +-{np.rad2deg(max(margin, 0.0)):.3f} deg are calibrated",
+            f"camera_angle only +-{np.rad2deg(max(margin, 0.0)):.3f} deg are calibrated",
             ("reach",),
             "a smaller reach, or a turntable file that is calibrated over the field",
         )

@@ -17,7 +17,7 @@ from scenes.yaml.units import ANGLE, LENGTH, format_quantity
 from twin.framework.artefact import FAR, Artefact, Cell, DecimalNumber, SvgFigure, Table, decimals_for
 from twin.framework.data_files import FrameFacts
 from twin.framework.report import Report, Section, answer
-from twin.framework.svg import BLUE, GREY, INK, LIGHT, ORANGE, VERMILION, look, new_figure, plain_axes, to_svg
+from twin.framework.svg import BLUE, GREY, INK, LIGHT, ORANGE, VERMILION, drawn, new_figure, plain_axes
 from twin.laboratory import distortion_run, turntable_run
 from twin.laboratory.distortion_run import DISTORTION, ESTIMATE, POINTS, TRUTH, DistortionRun, SimulatedDistortion
 from twin.laboratory.turntable_report import FIT_NAMES, rejected_table
@@ -25,6 +25,7 @@ from twin.laboratory.turntable_run import DOUBTFUL
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 RAW, COMPENSATED = "angles as read", "compensated angles"
 SHOWN = 3
@@ -147,8 +148,7 @@ def _verdict(run: DistortionRun, data: Mapping[str, Any]) -> tuple[str, tuple[st
         f"chi-square is {data['chi_square']:.1f} for {data['degrees_of_freedom']} degrees of freedom with the "
         "specified noise",
         f"{noise['rejected']} of {int(np.sum(run.present))} spots were rejected, {expected:.0f} expected by chance: "
-        "see "
-        "the noise",
+        "see the noise",
     )
 
 
@@ -182,8 +182,7 @@ def _warnings(run: DistortionRun, data: Mapping[str, Any]) -> tuple[str, ...]:
             out.append(
                 "as-built coma that increases over the field shifts energy centroids against chief rays and f by "
                 f"{1e6 * slope:.0f} µm, which is not in the sigma of f ({1e6 * sigma:.0f} µm): measure the wavefront "
-                "at several "
-                "fields"
+                "at several fields"
             )
     if run.readings is not None:
         out += run.readings.file.doubts
@@ -199,8 +198,7 @@ def _warnings(run: DistortionRun, data: Mapping[str, Any]) -> tuple[str, ...]:
         out.append(
             f"the line's middle is imaged {run.compensated.zero / ARCSEC:.3g} arcsec from `zero`, which moves the "
             f"principal point by {1e3 * moved:.3g} mm and is not in the sigmas; zero: {np.degrees(zero):.9f} deg "
-            "removes "
-            "this shift"
+            "removes this shift"
         )
     if abs(f / run.approximate_f - 1.0) > 0.05:
         out.append(
@@ -216,8 +214,7 @@ def _warnings(run: DistortionRun, data: Mapping[str, Any]) -> tuple[str, ...]:
     if run.compensation is None:
         out.append(
             "no calibration of the turntable: a dividing error of long period is not distinguishable from distortion, "
-            "and "
-            "only `angle_sigma` covers it"
+            "and only `angle_sigma` covers it"
         )
     return tuple(out)
 
@@ -250,7 +247,9 @@ def _curve(run: DistortionRun, data: Mapping[str, Any]) -> Section:
     keys = ["point", "reading_deg", "field_deg", "position_mm", "distortion_compensated_um"]
     keys += ["distortion_compensated_um_sigma", "residual_compensated_um", "sets_kept"]
     artefacts: tuple[Artefact, ...] = (
-        SvgFigure("distortion-curve", "Distortion over the field", caption, _curve_svg(run)),
+        SvgFigure(
+            "distortion-curve", "Distortion over the field", caption, drawn("distortion-curve", _curve_figure, run)
+        ),
         POINTS.table("distortion-points", "Point by point", "Means of the accepted sets.", data["points"], keys),
     )
     return Section("Distortion", tuple(text), artefacts, folded=1)
@@ -325,8 +324,7 @@ def _joint(joint: Mapping[str, Any]) -> Section:
                 "distortion-line",
                 "Joint model as a line of a payload's file",
                 "tan θ = (y − y0) (1 + k1 (y − y0)²) / f from the camera's Z, which is at the angle `axis` from the "
-                "zero of "
-                "the angles; principal_distance, principal_point: [0 mm, y0] and k1 as in a payload's file.",
+                "zero of the angles; principal_distance, principal_point: [0 mm, y0] and k1 as in a payload's file.",
                 joint["line"],
                 "",
                 line,
@@ -342,8 +340,7 @@ def _estimates(run: DistortionRun, data: Mapping[str, Any]) -> Section:
     constant_text = (
         "Equations (1) to (4) (Li et al., doi 10.3788/IRLA20200143) have no constant: W must count exactly from the "
         "direction that is imaged to the line's middle. The fitted constant places it "
-        f"{run.compensated.zero / ARCSEC:.3f} "
-        "arcsec from the specified zero"
+        f"{run.compensated.zero / ARCSEC:.3f} arcsec from the specified zero"
     )
     text, caption = [f"{constant_text}."], "All with compensated angles." if run.compensation is not None else ""
     if isinstance(run, SimulatedDistortion):
@@ -405,10 +402,8 @@ def _noise(run: DistortionRun, data: Mapping[str, Any]) -> Section:
         text.append(
             f"The table's repeatability, {format_quantity(repeatability, ANGLE)}, contributes "
             f"{1e6 * run.compensated.fit.value('principal_distance') * repeatability:.2f} µm of the scatter between "
-            "the sets; "
-            f"{data['truth']['gross_errors']} exposures had a gross error. Non-uniformity of the line's columns shifts "
-            "a "
-            f"spot by {noise['centroid_columns_um']:.3f} µm."
+            f"the sets; {data['truth']['gross_errors']} exposures had a gross error. Non-uniformity of the line's "
+            f"columns shifts a spot by {noise['centroid_columns_um']:.3f} µm."
         )
         artefacts.append(
             SvgFigure(
@@ -416,7 +411,7 @@ def _noise(run: DistortionRun, data: Mapping[str, Any]) -> Section:
                 "A spot, enlarged",
                 "Mean of the frames of one exposure in the middle of the field. Cross: energy centroid; "
                 "circle: its window.",
-                _spot_svg(run),
+                drawn("distortion-spot", _spot_figure, run),
             )
         )
     for record, key, what in (
@@ -429,58 +424,56 @@ def _noise(run: DistortionRun, data: Mapping[str, Any]) -> Section:
     return Section("Noise and rejected spots", tuple(text), tuple(artefacts), folded)
 
 
-def _curve_svg(run: DistortionRun) -> str:
+def _curve_figure(run: DistortionRun) -> Figure:
     """Draw distortion over the field, residuals from a smooth curve and, for a simulated bench, the error."""
-    with look("distortion-curve"):
-        known = isinstance(run, SimulatedDistortion)
-        figure = new_figure(8.0 if known else 6.0)
-        panels = figure.subplots(2 + known, 1, sharex=True, height_ratios=(1.25, 1.0, 1.0)[: 2 + known])
-        field = np.degrees(run.compensated.fit.angle)
+    known = isinstance(run, SimulatedDistortion)
+    figure = new_figure(8.0 if known else 6.0)
+    panels = figure.subplots(2 + known, 1, sharex=True, height_ratios=(1.25, 1.0, 1.0)[: 2 + known])
+    field = np.degrees(run.compensated.fit.angle)
+    if isinstance(run, SimulatedDistortion):
+        panels[0].plot(field, 1e6 * run.true_distortion, color=INK, lw=1.0, label="exact chief rays")
+        panels[2].set_title("Measured − true, with the total sigma", loc="left")
+    series = [(run.raw, RAW, ORANGE, "s", -0.005), (run.compensated, COMPENSATED, BLUE, "o", 0.005)]
+    for data, name, colour, marker, shift in series if run.compensation is not None else series[:1]:
+        style = {"fmt": marker, "color": colour, "ms": 3.5, "lw": 0.8, "label": name}
+        panels[0].errorbar(field + shift, 1e6 * data.distortion, 1e6 * data.sigma, **style)
+        panels[1].errorbar(field + shift, 1e6 * data.smooth.residual, 1e6 * data.means.sigma, **style)
         if isinstance(run, SimulatedDistortion):
-            panels[0].plot(field, 1e6 * run.true_distortion, color=INK, lw=1.0, label="exact chief rays")
-            panels[2].set_title("Measured − true, with the total sigma", loc="left")
-        series = [(run.raw, RAW, ORANGE, "s", -0.005), (run.compensated, COMPENSATED, BLUE, "o", 0.005)]
-        for data, name, colour, marker, shift in series if run.compensation is not None else series[:1]:
-            style = {"fmt": marker, "color": colour, "ms": 3.5, "lw": 0.8, "label": name}
-            panels[0].errorbar(field + shift, 1e6 * data.distortion, 1e6 * data.sigma, **style)
-            panels[1].errorbar(field + shift, 1e6 * data.smooth.residual, 1e6 * data.means.sigma, **style)
-            if isinstance(run, SimulatedDistortion):
-                panels[2].errorbar(field + shift, 1e6 * run.error(data), 1e6 * data.sigma, **style)
-        panels[0].set_title("Distortion D = L − c − f tan W + p tan² W, with its total sigma", loc="left")
-        panels[1].set_title("Residual from the smooth curve, with the sigma of the means", loc="left")
-        panels[-1].set_xlabel("field angle W [deg]")
-        for axes in panels:
-            axes.set_ylabel("µm")
-            _dress(axes)
-        for axes in panels[1:]:
-            axes.axhline(0.0, color=GREY, lw=0.8)
-        return to_svg(figure)
+            panels[2].errorbar(field + shift, 1e6 * run.error(data), 1e6 * data.sigma, **style)
+    panels[0].set_title("Distortion D = L − c − f tan W + p tan² W, with its total sigma", loc="left")
+    panels[1].set_title("Residual from the smooth curve, with the sigma of the means", loc="left")
+    panels[-1].set_xlabel("field angle W [deg]")
+    for axes in panels:
+        axes.set_ylabel("µm")
+        _dress(axes)
+    for axes in panels[1:]:
+        axes.axhline(0.0, color=GREY, lw=0.8)
+    return figure
 
 
-def _spot_svg(run: SimulatedDistortion) -> str:
+def _spot_figure(run: SimulatedDistortion) -> Figure:
     """Draw the spot in the middle of the field, and the row through its centre."""
-    with look("distortion-spot"):
-        figure = new_figure(3.6)
-        picture, profile = figure.subplots(1, 2, width_ratios=(1.0, 1.5))
-        point = len(run.record.column) // 2
-        image = mean_frames(run.record.frames[point, 0])
-        pitch = run.bench.ccd.band.pitch
-        column = run.spots.position[point, 0] + run.bench.design_offset[point]
-        column = column / pitch + run.bench.middle_column - run.record.column[point, 0]
-        row = run.spots.row[point, 0]
-        shown = picture.imshow(image, cmap="gray", interpolation="nearest", origin="upper")
-        picture.plot(column, row, "+", color=VERMILION, ms=12, mew=1.4)
-        angle = np.linspace(0.0, 2.0 * np.pi, 181)
-        radius = run.bench.radius
-        picture.plot(column + radius * np.cos(angle), row + radius * np.sin(angle), color=BLUE, lw=0.9)
-        picture.set(xlabel="column, along the line", ylabel="row, along the track")
-        figure.colorbar(shown, ax=picture, label="DN")
-        values = image[round(row)]
-        profile.step(np.arange(len(values)), values, where="mid", color=BLUE, lw=1.0, label="row through the centre")
-        profile.axvline(column, color=VERMILION, lw=0.9, label="energy centroid")
-        profile.set(xlabel="column", ylabel="DN")
-        _dress(profile, columns=1)
-        return to_svg(figure)
+    figure = new_figure(3.6)
+    picture, profile = figure.subplots(1, 2, width_ratios=(1.0, 1.5))
+    point = len(run.record.column) // 2
+    image = mean_frames(run.record.frames[point, 0])
+    pitch = run.bench.ccd.band.pitch
+    column = run.spots.position[point, 0] + run.bench.design_offset[point]
+    column = column / pitch + run.bench.middle_column - run.record.column[point, 0]
+    row = run.spots.row[point, 0]
+    shown = picture.imshow(image, cmap="gray", interpolation="nearest", origin="upper")
+    picture.plot(column, row, "+", color=VERMILION, ms=12, mew=1.4)
+    angle = np.linspace(0.0, 2.0 * np.pi, 181)
+    radius = run.bench.radius
+    picture.plot(column + radius * np.cos(angle), row + radius * np.sin(angle), color=BLUE, lw=0.9)
+    picture.set(xlabel="column, along the line", ylabel="row, along the track")
+    figure.colorbar(shown, ax=picture, label="DN")
+    values = image[round(row)]
+    profile.step(np.arange(len(values)), values, where="mid", color=BLUE, lw=1.0, label="row through the centre")
+    profile.axvline(column, color=VERMILION, lw=0.9, label="energy centroid")
+    profile.set(xlabel="column", ylabel="DN")
+    _dress(profile, columns=1)
+    return figure
 
 
 def _dress(axes: Axes, columns: int = 3) -> None:

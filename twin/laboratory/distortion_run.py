@@ -40,17 +40,8 @@ from scenes.yaml.errors import InputError, Issue
 from twin.framework.memory import Lowered, require_memory
 from twin.framework.procedure import Advance, BenchError, silent
 from twin.framework.record import Quantity, Record
-from twin.laboratory import turntable_run
+from twin.laboratory import measured_readings, turntable_run
 from twin.laboratory.distortion_bench import DistortionBench, DistortionRecord, DistortionTruth
-from twin.laboratory.measured_readings import (
-    Comparisons,
-    DataFile,
-    SpotReadings,
-    calibrated_text,
-    read_spots,
-    read_turntable,
-    unwrapped,
-)
 from twin.laboratory.turntable_run import TurntableModel, usable_fits
 
 CLOSED_FORMS = tuple(name for name in FITS if name != "network")
@@ -139,8 +130,8 @@ class DistortionRun:
     raw: interior.Distortion
     compensated: interior.Distortion
     specified_fit: interior.InteriorOrientation
-    readings: SpotReadings | None = None
-    tables: tuple[Comparisons, ...] = ()
+    readings: measured_readings.SpotReadings | None = None
+    tables: tuple[measured_readings.Comparisons, ...] = ()
 
     @property
     def rejected(self) -> NDArray[np.bool_]:
@@ -229,14 +220,12 @@ def _estimates(
     def printed(f: Array | float, p: Array | float, angle: Array) -> Estimate:
         return Estimate(float(f), float(p), interior.distortion(position, angle, f, p))
 
-    balanced_f = interior.principal_distance(position, angles)
+    balanced_f, shifted = interior.principal_distance(position, angles), angles - zero
     out = {
         "eq2": printed(*interior.principal_distance_and_point(position, angles), angles),
         "eq3": printed(balanced_f, 0.0, angles),
         "eq4": printed(balanced_f, interior.principal_point(position, angles, balanced_f), angles),
-        "eq2_zero_from_constant": printed(
-            *interior.principal_distance_and_point(position, angles - zero), angles - zero
-        ),
+        "eq2_zero_from_constant": printed(*interior.principal_distance_and_point(position, shifted), shifted),
     }
     f, p = "principal_distance", "principal_point"
     for name, model in (("constant", fit), ("constant_radial3", smooth)):
@@ -289,9 +278,8 @@ def measure(bench: DistortionBench, seed: int, advance: Advance = silent) -> Sim
             **reduce(*args, compensation),
         )
     except interior.OrientationError as error:
-        raise BenchError(
-            str(error), ("points",), f"{len(interior.SMOOTH) + 1} or more, over the whole field"
-        ) from error
+        allowed = f"{len(interior.SMOOTH) + 1} or more, over the whole field"
+        raise BenchError(str(error), ("points",), allowed) from error
 
 
 def reduce(
@@ -343,15 +331,12 @@ def reduce(
         raw = compensated = interior.Distortion.measure(raw_angles, spots, means, common)
     else:
         corrected_angles = sense * (compensation.correct(reading) - float(compensation.correct(zero)))
-        means = interior.reduce_sets(
-            corrected_angles, spots, approximate_f, approximate_f * compensation.repeatability, present
-        )
+        single = approximate_f * compensation.repeatability
+        means = interior.reduce_sets(corrected_angles, spots, approximate_f, single, present)
         # the residuals of this test estimate the white part at more angles than the calibration did
         common = replace(compensation, white=0.0).covariance(means.mean(reading))
-        raw, compensated = (
-            interior.Distortion.measure(raw_angles, spots, means),
-            interior.Distortion.measure(corrected_angles, spots, means, common),
-        )
+        raw = interior.Distortion.measure(raw_angles, spots, means)
+        compensated = interior.Distortion.measure(corrected_angles, spots, means, common)
     fit = compensated.fit
     return {
         "reading": reading,
@@ -376,17 +361,16 @@ def measure_files(spec: MeasuredDistortionSpec, seed: int) -> DistortionRun:
         A table cannot be used, or does not determine the unknowns.
     """
     files = spec.measured
-    readings = read_spots(files)
+    readings = measured_readings.read_spots(files)
     compensation, series, zero = None, None, files.zero
-    tables: tuple[Comparisons, ...] = ()
+    tables: tuple[measured_readings.Comparisons, ...] = ()
     if files.turntable is not None:
-        tables = read_turntable(files.turntable)
+        tables = measured_readings.read_turntable(files.turntable)
         cal, *held = tables
         series = cal.series
         # whole turns between the calibration's readings and those of the test
-        whole_circles = (
-            unwrapped(np.array([files.zero]), 0.5 * float(series.angle[0] + series.angle[-1]))[0] - files.zero
-        )
+        middle = 0.5 * float(series.angle[0] + series.angle[-1])
+        whole_circles = measured_readings.unwrapped(np.array([files.zero]), middle)[0] - files.zero
         zero, readings = files.zero + whole_circles, replace(readings, reading=readings.reading + whole_circles)
         _check_region(files, readings, series, zero)
         names, _ = usable_fits(files.turntable, cal, CLOSED_FORMS)
@@ -405,9 +389,11 @@ def measure_files(spec: MeasuredDistortionSpec, seed: int) -> DistortionRun:
     )
 
 
-def _check_region(files: DistortionFiles, readings: SpotReadings, series: CalibrationSeries, zero: float) -> None:
+def _check_region(
+    files: DistortionFiles, readings: measured_readings.SpotReadings, series: CalibrationSeries, zero: float
+) -> None:
     """Raise InputError if a reading lies outside of the calibrated region of the turntable."""
-    allowed = f"{calibrated_text(series.angle)}, the calibrated range"
+    allowed = f"{measured_readings.calibrated_text(series.angle)}, the calibrated range"
     if not covered(series.angle, zero):
         shown = f"{np.degrees(files.zero):.9g} deg"
         raise files.error("the turntable is not calibrated at this reading", ("zero",), found=shown, allowed=allowed)
@@ -420,15 +406,14 @@ def _check_region(files: DistortionFiles, readings: SpotReadings, series: Calibr
         raise InputError(Issue(text, readings.file.file, line, (readings.head,), shown, allowed))
 
 
-def _check_angles(files: DistortionFiles, readings: SpotReadings, zero: float) -> None:
+def _check_angles(files: DistortionFiles, readings: measured_readings.SpotReadings, zero: float) -> None:
     """Raise InputError for readings far from the angle zero, which suggest a wrong zero or unit in the file."""
     distance = np.abs(readings.reading - zero) * (readings.lines > 0)
     if np.max(distance) > MAX_FIELD_ANGLE:
         index = np.unravel_index(int(np.argmax(distance)), distance.shape)
         shown = f"{np.degrees(readings.reading[index]):.9g} deg, {np.degrees(distance[index]):.4g} deg from the zero"
-        allowed = (
-            f"within {np.degrees(MAX_FIELD_ANGLE):.0f} deg of `zero`, the reading at which the line's middle is imaged"
-        )
+        widest = f"{np.degrees(MAX_FIELD_ANGLE):.0f} deg"
+        allowed = f"within {widest} of `zero`, the reading at which the line's middle is imaged"
         line = int(readings.lines[index])
         raise InputError(Issue("an angle beyond any field", readings.file.file, line, (readings.head,), shown, allowed))
 
@@ -436,20 +421,12 @@ def _check_angles(files: DistortionFiles, readings: SpotReadings, zero: float) -
 def _locate(bench: DistortionBench, record: DistortionRecord) -> interior.Spots:
     """Measure the spots in the recorded frames; raise BenchError if any cannot be measured."""
     try:
-        return interior.locate_spots(
-            record.frames,
-            record.column,
-            bench.middle_column,
-            bench.ccd.band.pitch,
-            bench.noise,
-            bench.radius,
-            bench.design_offset,
-        )
+        line = bench.middle_column, bench.ccd.band.pitch, bench.noise
+        return interior.locate_spots(record.frames, record.column, *line, bench.radius, bench.design_offset)
     except SpotError as error:
         reason = next(iter(error.reasons.values()))
-        problem = (
-            f"{len(error.reasons)} of {record.column.size} spots cannot be measured; reason for the first: {reason}"
-        )
+        bad = f"{len(error.reasons)} of {record.column.size} spots cannot be measured"
+        problem = f"{bad}; reason for the first: {reason}"
         remedy = "less light: 30 to 80 percent is good" if "saturated" in reason else "more light or more frames"
         raise BenchError(problem, ("light",), remedy) from error
 
@@ -576,7 +553,7 @@ def _correlation(run: DistortionRun) -> float:
     return float(fit.correlation[fit.terms.index("principal_distance"), fit.terms.index("principal_point")])
 
 
-def _read(run: DistortionRun) -> SpotReadings:
+def _read(run: DistortionRun) -> measured_readings.SpotReadings:
     assert run.readings is not None
     return run.readings
 
@@ -587,7 +564,7 @@ def _across(run: DistortionRun) -> float | None:
     return None if across is None else float(np.ptp(across))
 
 
-def _files(run: DistortionRun) -> list[DataFile] | None:
+def _files(run: DistortionRun) -> list[measured_readings.DataFile] | None:
     return None if run.readings is None else [run.readings.file, *(table.file for table in run.tables)]
 
 

@@ -239,13 +239,8 @@ class FocusBench:
                 diffraction = _modulus(EdgeOptics.build(perfect, ccd.band, normal, _SEARCH), 0.0, f)
                 design = _modulus(designed.optics, best_focus(designed, f), f)
                 actual = _modulus(imager.optics, site.best, f)
-                parts = {k: float(v) for k, v in ccd.factors(np.array(x), np.array(y)).items()}
-                factors = {
-                    "diffraction": diffraction,
-                    "design": design / diffraction,
-                    "wavefront": actual / design,
-                    **parts,
-                }
+                factors = {"diffraction": diffraction, "design": design / diffraction, "wavefront": actual / design}
+                factors |= {k: float(v) for k, v in ccd.factors(np.array(x), np.array(y)).items()}
                 out.append(BudgetLine(name, edge, factors, imager.mtf(site.best, f)))
         return tuple(out)
 
@@ -375,32 +370,26 @@ class NyquistMtf:
     frames: Mapping[str, np.ndarray]
 
 
+@dataclass(frozen=True, eq=False)
 class Recorder:
     """Recorder of images of slanted edges, for one placement of the focal-plane assembly.
 
-    Parameters
+    Attributes
     ----------
-    bench
+    bench : FocusBench
         Bench with the camera.
-    placement
+    placement : Placement
         Placement of the assembly.
-    seed
+    seed : SeedSequence
         Seed of the noise and of the random sub-pixel position of the edge.
-    patterns
+    patterns : mapping
         Band -> gains and offsets of its columns.
     """
 
-    def __init__(
-        self,
-        bench: FocusBench,
-        placement: Placement,
-        seed: np.random.SeedSequence,
-        patterns: Mapping[str, FixedPattern],
-    ) -> None:
-        self.bench = bench
-        self.placement = placement
-        self.seed = seed
-        self.patterns = patterns
+    bench: FocusBench
+    placement: Placement
+    seed: np.random.SeedSequence
+    patterns: Mapping[str, FixedPattern]
 
     def frames(self, number: int, edge: str, shift: float, take: int) -> np.ndarray:
         """Record frames of an edge at one site, (frames, region, region), DN.
@@ -419,10 +408,8 @@ class Recorder:
         site, bench = self.bench.sites[number], self.bench
         height = self.placement.heights[site.band]
         ccd = bench.ccds[site.band]
-        direction_index = DIRECTIONS.index(edge)
-        offset_seed, frame_seed = (
-            stream(self.seed, which, number, direction_index, take) for which in (_OFFSET, _FRAMES)
-        )
+        key = number, DIRECTIONS.index(edge), take
+        offset_seed, frame_seed = (stream(self.seed, which, *key) for which in (_OFFSET, _FRAMES))
         offset = float(np.random.default_rng(offset_seed).uniform(-0.5, 0.5)) * ccd.band.pitch
         share = site.image(edge, self.placement.pose, height, shift, offset)
         photons = ccd.white_photons(bench.setup.test.white) * share
@@ -495,11 +482,10 @@ def in_focus(recorder: Recorder) -> tuple[NyquistMtf, ...]:
             takes = {edge: recorder.measure(number, edge, 0.0, 9000) for edge in DIRECTIONS}
         except EdgeError as error:
             where = recorder.bench.sites[number]
-            raise BenchError(
-                f"the edge cannot be measured after the alignment in {where.band} at field {where.field:g}: {error}",
-                ("misset", "chips"),
-                "chips closer to one plane, so that all of them can be in focus together",
-            ) from error
+            there = f"in {where.band} at field {where.field:g}"
+            problem = f"the edge cannot be measured after the alignment {there}: {error}"
+            remedy = "chips closer to one plane, so that all of them can be in focus together"
+            raise BenchError(problem, ("misset", "chips"), remedy) from error
         return NyquistMtf({e: (t[0], t[1]) for e, t in takes.items()}, {e: t[2] for e, t in takes.items()})
 
     with one_blas_thread(), ThreadPoolExecutor(cores()) as pool:
@@ -551,22 +537,16 @@ def _search(recorder: Recorder, number: int, zero: float, first: int = 0) -> flo
     shift = np.linspace(-shift_range, shift_range, 2 * int(np.ceil(plan.reach / step)) + 1)
     measurements = [recorder.attempt(number, ALONG, float(s), k) for k, s in enumerate(shift, first)]
     if all(np.isinf(m[1]) for m in measurements):
-        raise BenchError(
-            f"the edge cannot be measured anywhere through focus in {site.band} at field {site.field:g}: "
-            f"{measurements[0][3]}",
-            ("edge",),
-            "another edge, region or light",
-        )
+        there = f"in {site.band} at field {site.field:g}"
+        problem = f"the edge cannot be measured anywhere through focus {there}: {measurements[0][3]}"
+        raise BenchError(problem, ("edge",), "another edge, region or light")
     mtf = np.array([m[0] for m in measurements])
     best = int(np.argmax(mtf))
     if best in (0, len(shift) - 1):
         where = "the lower" if best == 0 else "the upper"
-        raise BenchError(
-            f"best focus of {site.band} at field {site.field:g} is not inside the scan: contrast is highest at {where} "
-            "end",
-            ("scan", "reach"),
-            "a longer reach",
-        )
+        focus = f"best focus of {site.band} at field {site.field:g}"
+        problem = f"{focus} is not inside the scan: contrast is highest at {where} end"
+        raise BenchError(problem, ("scan", "reach"), "a longer reach")
     return float(shift[best])
 
 

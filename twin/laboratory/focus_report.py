@@ -29,6 +29,7 @@ from twin.targets.target_images import ALONG, DIRECTION_NAMES, DIRECTIONS, TRACK
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 FIELD_COLOURS = (svg.BLUE, svg.GREEN, svg.ORANGE, svg.VERMILION, svg.PURPLE)
 EDGE_COLOURS = {ALONG: svg.BLUE, TRACK: svg.VERMILION}
@@ -39,29 +40,26 @@ _COLUMNS, _MOST_BANDS = 5, 10
 
 def _shown(run: FocusRun) -> list[tuple[int, FocusState, str]]:
     """Return number, state and title of the first and the last state (placement of the focal plane) measured."""
-    states = run.states
-    return (
-        [(0, states[0], "before"), (len(states) - 1, states[-1], "after")] if len(states) > 1 else [(0, states[0], "")]
-    )
+    last = len(run.states) - 1
+    return [(0, run.states[0], "before"), (last, run.states[last], "after")] if last else [(0, run.states[0], "")]
 
 
-def through_focus_svg(run: FocusRun) -> str:
+def through_focus_figure(run: FocusRun) -> Figure:
     """Draw the MTF through focus of every band, in both directions, before the first and after the last shims."""
     bands, shown = list(dict.fromkeys(run.bands))[:_MOST_BANDS], _shown(run)
-    with svg.look("through-focus"):
-        columns, each = min(len(bands), _COLUMNS), -(-len(bands) // _COLUMNS)
-        figure = svg.new_figure(3.0 * each * len(shown) + 0.3)
-        grid = figure.subplots(each * len(shown), columns, squeeze=False, sharey=True)
-        for (_, state, when), panels in zip(shown, np.split(grid, len(shown)), strict=True):
-            for axes, band in zip(panels.ravel(), bands, strict=False):
-                _curves(axes, run, state, band)
-                axes.set_title(", ".join(part for part in (band, when) if part) or "all sites")
-            for axes in panels.ravel()[len(bands) :]:
-                axes.set_visible(False)
-            panels[0, 0].set_ylabel("MTF with the pixel (○ filled: along the line,\nopen: along the track)")
-        for axes in grid[-1]:
-            axes.set_xlabel("shift of the image [µm]")
-        return svg.to_svg(figure)
+    columns, each = min(len(bands), _COLUMNS), -(-len(bands) // _COLUMNS)
+    figure = svg.new_figure(3.0 * each * len(shown) + 0.3)
+    grid = figure.subplots(each * len(shown), columns, squeeze=False, sharey=True)
+    for (_, state, when), panels in zip(shown, np.split(grid, len(shown)), strict=True):
+        for axes, band in zip(panels.ravel(), bands, strict=False):
+            _curves(axes, run, state, band)
+            axes.set_title(", ".join(part for part in (band, when) if part) or "all sites")
+        for axes in panels.ravel()[len(bands) :]:
+            axes.set_visible(False)
+        panels[0, 0].set_ylabel("MTF with the pixel (○ filled: along the line,\nopen: along the track)")
+    for axes in grid[-1]:
+        axes.set_xlabel("shift of the image [µm]")
+    return figure
 
 
 def _curves(axes: Axes, run: FocusRun, state: FocusState, band: str) -> None:
@@ -88,22 +86,21 @@ def _form(vertex: FocusVertex, positions: np.ndarray) -> np.ndarray:
     return np.where((value > vertex.peak / 3.0) & (u < 0.5 / QUARTIC), value, np.nan)
 
 
-def defocus_svg(run: FocusRun) -> str:
+def defocus_figure(run: FocusRun) -> Figure:
     """Draw the defocus at every site before the first and after the last shims, with the fitted plane.
 
     For a simulated bench the true defocus is drawn too.
     """
     shown = _shown(run)
-    with svg.look("defocus"):
-        figure = svg.new_figure(3.4)
-        panels = figure.subplots(1, len(shown), squeeze=False)[0]
-        for axes, (number, state, when) in zip(panels, shown, strict=True):
-            _defocus(axes, run, number, state)
-            axes.set(title=when, xlabel="along the line Y′ [mm]")
-        panels[0].set_ylabel("CCD downstream of focus [µm]")
-        handles, labels = panels[0].get_legend_handles_labels()
-        figure.legend(handles, labels, loc="outside upper center", ncols=max(len(labels), 1))
-        return svg.to_svg(figure)
+    figure = svg.new_figure(3.4)
+    panels = figure.subplots(1, len(shown), squeeze=False)[0]
+    for axes, (number, state, when) in zip(panels, shown, strict=True):
+        _defocus(axes, run, number, state)
+        axes.set(title=when, xlabel="along the line Y′ [mm]")
+    panels[0].set_ylabel("CCD downstream of focus [µm]")
+    handles, labels = panels[0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside upper center", ncols=max(len(labels), 1))
+    return figure
 
 
 def _defocus(axes: Axes, run: FocusRun, number: int, state: FocusState) -> None:
@@ -133,59 +130,47 @@ def _middle(run: SimulatedFocus, band: str) -> int:
     return min((i for i, s in enumerate(sites) if s.band == band), key=lambda i: abs(sites[i].field))
 
 
-def mtf_svg(run: SimulatedFocus) -> str:
+def mtf_figure(run: SimulatedFocus) -> Figure:
     """Draw the measured and true MTF curves in the middle of the field after the alignment."""
-    with svg.look("mtf-curves"):
-        bench, state = run.bench, run.states[-1]
-        figure = svg.new_figure(3.0)
-        panels = figure.subplots(1, len(bench.ccds), sharey=True, squeeze=False)[0]
-        for axes, band in zip(panels, bench.ccds, strict=True):
-            number = _middle(run, band)
-            site, ccd = bench.sites[number], bench.ccds[band]
-            defocus = state.true_chip_z(number)
-            for edge in DIRECTIONS:
-                frames = state.focus[number].frames[edge]
-                measured = slanted_edge_mtf(
-                    frames.mean(axis=0), noise=ccd.noise, frames=len(frames), uniform_light=True
-                )
-                frequency = measured.frequency / ccd.band.pitch
-                true = np.abs(site.imagers[edge].transfer(defocus, frequency))
-                colour = EDGE_COLOURS[edge]
-                axes.fill_between(
-                    PER_MM * frequency,
-                    measured.mtf - 2.0 * measured.sigma,
-                    measured.mtf + 2.0 * measured.sigma,
-                    color=colour,
-                    alpha=0.25,
-                    lw=0,
-                )
-                axes.plot(PER_MM * frequency, measured.mtf, color=colour, lw=1.2, label=DIRECTION_NAMES[edge])
-                axes.plot(
-                    PER_MM * frequency, true, color=svg.INK, lw=0.8, ls="--", label="truth" if edge == TRACK else None
-                )
-            axes.axvline(PER_MM * ccd.band.nyquist, color=svg.GREY, lw=0.8, ls=":")
-            axes.set(title=band, xlabel="cycles/mm", xlim=(0.0, PER_MM / ccd.band.pitch), ylim=(0.0, 1.02))
-            svg.plain_axes(axes)
-        panels[0].set_ylabel("MTF with the pixel")
-        handles, labels = panels[0].get_legend_handles_labels()
-        figure.legend(handles, labels, loc="outside upper center", ncols=3)
-        return svg.to_svg(figure)
+    bench, state = run.bench, run.states[-1]
+    figure = svg.new_figure(3.0)
+    panels = figure.subplots(1, len(bench.ccds), sharey=True, squeeze=False)[0]
+    for axes, band in zip(panels, bench.ccds, strict=True):
+        number = _middle(run, band)
+        site, ccd = bench.sites[number], bench.ccds[band]
+        defocus = state.true_chip_z(number)
+        for edge in DIRECTIONS:
+            frames = state.focus[number].frames[edge]
+            measured = slanted_edge_mtf(frames.mean(axis=0), noise=ccd.noise, frames=len(frames), uniform_light=True)
+            frequency = measured.frequency / ccd.band.pitch
+            true = np.abs(site.imagers[edge].transfer(defocus, frequency))
+            colour, shown, mtf, margin = EDGE_COLOURS[edge], PER_MM * frequency, measured.mtf, 2.0 * measured.sigma
+            axes.fill_between(shown, mtf - margin, mtf + margin, color=colour, alpha=0.25, lw=0)
+            axes.plot(shown, mtf, color=colour, lw=1.2, label=DIRECTION_NAMES[edge])
+            label = "truth" if edge == TRACK else None
+            axes.plot(shown, true, color=svg.INK, lw=0.8, ls="--", label=label)
+        axes.axvline(PER_MM * ccd.band.nyquist, color=svg.GREY, lw=0.8, ls=":")
+        axes.set(title=band, xlabel="cycles/mm", xlim=(0.0, PER_MM / ccd.band.pitch), ylim=(0.0, 1.02))
+        svg.plain_axes(axes)
+    panels[0].set_ylabel("MTF with the pixel")
+    handles, labels = panels[0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside upper center", ncols=3)
+    return figure
 
 
-def edges_svg(run: SimulatedFocus) -> str:
+def edges_figure(run: SimulatedFocus) -> Figure:
     """Draw the recorded edges of the first and the last band."""
-    with svg.look("edges"):
-        bench, state = run.bench, run.states[-1]
-        bands = list(bench.ccds)[:: max(len(bench.ccds) - 1, 1)]
-        figure = svg.new_figure(2.9)
-        panels = figure.subplots(1, 2 * len(bands), squeeze=False)[0]
-        for k, band in enumerate(bands):
-            number = _middle(run, band)
-            for axes, edge in zip(panels[2 * k : 2 * k + 2], DIRECTIONS, strict=True):
-                axes.imshow(state.focus[number].frames[edge][0], cmap="gray", interpolation="none")
-                axes.set_title(f"{band}, measures\n{DIRECTION_NAMES[edge]}")
-                axes.set(xlabel="pixel along the line", ylabel="line" if edge == ALONG and k == 0 else "")
-        return svg.to_svg(figure)
+    bench, state = run.bench, run.states[-1]
+    bands = list(bench.ccds)[:: max(len(bench.ccds) - 1, 1)]
+    figure = svg.new_figure(2.9)
+    panels = figure.subplots(1, 2 * len(bands), squeeze=False)[0]
+    for k, band in enumerate(bands):
+        number = _middle(run, band)
+        for axes, edge in zip(panels[2 * k : 2 * k + 2], DIRECTIONS, strict=True):
+            axes.imshow(state.focus[number].frames[edge][0], cmap="gray", interpolation="none")
+            axes.set_title(f"{band}, measures\n{DIRECTION_NAMES[edge]}")
+            axes.set(xlabel="pixel along the line", ylabel="line" if edge == ALONG and k == 0 else "")
+    return figure
 
 
 MOVED = {"image": "image, along the light", "target": "target, along the light", "focal_plane": "CCD, along the light"}
@@ -241,15 +226,12 @@ def _facts(run: FocusRun, test: MeasuredFocusSpec) -> tuple[tuple[str, str], ...
     """Return the facts about a measured series, as pairs of label and text."""
     mount, level, file = test.mount, run.states[0].level, run.readings and run.readings.file
     edges = " and ".join(DIRECTION_NAMES[edge] for edge in run.edges)
+    unread = "not read: the rotation about Z′ is not corrected"
+    read = unread if level is None else f"{level.angle / ARCMIN:.3f} arcmin"
     return (
         ("Sites", f"{len(run.places)} in {len(set(run.bands))} bands, MTF {edges}"),
         ("Scanned by moving", MOVED[test.measured.moved]),
-        (
-            "Level of the line",
-            "not read: the rotation about Z′ is not corrected"
-            if level is None
-            else f"{level.angle / ARCMIN:.3f} arcmin",
-        ),
+        ("Level of the line", read),
         (
             "Mount",
             f"{len(mount.holes)} holes, surface inclined by {np.degrees(mount.tilt):g}°, shims of "
@@ -273,10 +255,8 @@ def _bench_facts(run: SimulatedFocus) -> tuple[tuple[str, str], ...]:
         f"{name} {1e9 * b.spectrum.ends[0]:.0f}–{1e9 * b.spectrum.ends[1]:.0f} nm, {UM_PER_M * b.pitch:g} µm"
         for name, b in camera.bands.items()
     )
-    level = test.white
-    electrons = ", ".join(
-        f"{name} {_thousands(level * ccd.detector.full_well_e)} e" for name, ccd in run.bench.ccds.items()
-    )
+    level, ccds = test.white, run.bench.ccds.items()
+    electrons = ", ".join(f"{name} {_thousands(level * ccd.detector.full_well_e)} e" for name, ccd in ccds)
     return (
         (
             "Camera",
@@ -357,10 +337,8 @@ def _warnings(run: FocusRun, data: Mapping[str, Any]) -> tuple[str, ...]:
         out.append(
             f"the curves through focus scatter more than their sigmas allow, chi-square {square:.0f} for {freedom} "
             "degrees of freedom: the sigmas of the MTF are too small, or the curves have another form. The sigmas of "
-            "the "
-            f"sites are too small by a factor of about {np.sqrt(square / freedom):.1f}; those of plane and shims "
-            "include "
-            "the scatter of the sites"
+            f"the sites are too small by a factor of about {np.sqrt(square / freedom):.1f}; those of plane and shims "
+            "include the scatter of the sites"
         )
     move, noise = run.states[0].skew
     if run.readings and chi2.sf((move / noise) ** 2, 1) < DOUBTFUL:
@@ -398,9 +376,8 @@ def _summary(data: Mapping[str, Any]) -> Table:
         (f"change of shim {name.removeprefix('hole_')} [µm]", shim["change_um"], shim["change_um_sigma"])
         for name, shim in data["shims"].items()
     ]
-    caption = (
-        "Plane: best focus minus CCD. Sigmas include noise, CCDs off one plane, and an error common to all vertices."
-    )
+    sources = "noise, CCDs off one plane, and an error common to all vertices"
+    caption = f"Plane: best focus minus CCD. Sigmas include {sources}."
     return Table("alignment", "Result", caption, ("", "measured", "sigma"), rows, (None, 2, 2))
 
 
@@ -416,10 +393,8 @@ def _shims(run: FocusRun) -> Section:
         caption = (
             "Changes of thickness under each hole. The rotation in the mounting surface of "
             f"{fixed(shimming.plan.rotation / ARCMIN, 2)} arcmin is set by hand; without it the line would deviate "
-            "from its nominal "
-            f"level by {fixed(shimming.plan.level_coupling / ARCMIN, 2)} arcmin, as the mounting surface is not "
-            "parallel "
-            "to the focal plane."
+            f"from its nominal level by {fixed(shimming.plan.level_coupling / ARCMIN, 2)} arcmin, as the mounting "
+            "surface is not parallel to the focal plane."
         )
         tables.append(focus_run.SHIMS.table(f"shims-{number}", title, caption, rows, label="hole"))
     return Section("Shims", (), tuple(tables))
@@ -447,7 +422,7 @@ def _plane(run: FocusRun) -> Section:
     if isinstance(run, SimulatedFocus):
         caption += " Dashes: truth from the traced pupils."
     artefacts: tuple[Artefact, ...] = (
-        SvgFigure("defocus", "Defocus of the CCDs", caption, defocus_svg(run)),
+        SvgFigure("defocus", "Defocus of the CCDs", caption, svg.drawn("defocus", defocus_figure, run)),
         focus_run.SITE.table("places", "Sites", "Before the last shims.", focus_run.SITE.rows(last), keys),
     )
     return Section("Plane", text, artefacts, folded=1)
@@ -464,15 +439,13 @@ def _curve_section(run: FocusRun) -> Section:
     record = Record("A curve.", *where, focus_run.BUDGET["direction"], *focus_run.CURVE)
     drawn = "MTF with one sigma and the fitted curve, by band; black: the CCD."
     artefacts: list[Artefact] = [
-        SvgFigure("through-focus", "Through focus", drawn, through_focus_svg(run)),
+        SvgFigure("through-focus", "Through focus", drawn, svg.drawn("through-focus", through_focus_figure, run)),
         record.table("curves", "Curves through focus", "Vertices as shifts of the image.", rows),
     ]
     if run.readings and run.readings.no_edge:
         without_edge = [{**focus_run.ROW_FAULT(row), "file": Path(row.file).name} for row in run.readings.no_edge]
-        note = "These images have no weight."
-        artefacts.insert(
-            1, focus_run.ROW_FAULT.table("no-edge", "Images without a measurable edge", note, without_edge)
-        )
+        title, note = "Images without a measurable edge", "These images have no weight."
+        artefacts.insert(1, focus_run.ROW_FAULT.table("no-edge", title, note, without_edge))
     text: tuple[str, ...] = ()
     if isinstance(run, SimulatedFocus):
         ratio = run.bench.sites[0].nominal_per_shift
@@ -498,12 +471,8 @@ def _mtf_section(run: SimulatedFocus, data: Mapping[str, Any]) -> Section:
     ]
     names = list(data["mtf_budget"][0]["factors"])
     budget = [
-        (
-            line["band"],
-            DIRECTION_NAMES[line["direction"]],
-            *(f"{line['factors'][n]:.3f}" for n in names),
-            f"{line['total']:.3f}",
-        )
+        [line["band"], DIRECTION_NAMES[line["direction"]]]
+        + [f"{value:.3f}" for value in (*(line["factors"][n] for n in names), line["total"])]
         for line in data["mtf_budget"]
     ]
     return Section(
@@ -531,8 +500,13 @@ def _mtf_section(run: SimulatedFocus, data: Mapping[str, Any]) -> Section:
                 "MTF curves in the middle of the field, after the alignment",
                 "Measured from the slanted edge, with two sigma; dashed: the traced pupil times the detector's "
                 "factors. Dotted: Nyquist frequency.",
-                mtf_svg(run),
+                svg.drawn("mtf-curves", mtf_figure, run),
             ),
-            SvgFigure("edges", "Recorded edges", "First frame in the middle of the field.", edges_svg(run)),
+            SvgFigure(
+                "edges",
+                "Recorded edges",
+                "First frame in the middle of the field.",
+                svg.drawn("edges", edges_figure, run),
+            ),
         ),
     )

@@ -19,17 +19,7 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from analysis.arrays import UM_PER_M as UM
-from analysis.focal_plane.plane_fit import (
-    FocalPlaneFit,
-    LineLevel,
-    Mount,
-    ObservabilityError,
-    RigidMotion,
-    ShimError,
-    ShimPlan,
-    fit_focal_plane,
-    shim_plan,
-)
+from analysis.focal_plane import plane_fit
 from analysis.focal_plane.through_focus import FocusVertex
 from optics.geometry.pose import Pose, about_axis, rotation_matrix, rotation_vector
 from optics.numerics.backend import Backend, cores
@@ -67,7 +57,7 @@ class FocusState:
     """
 
     scans: tuple[SiteScan, ...]
-    level: LineLevel | None
+    level: plane_fit.LineLevel | None
 
     @property
     def defocus(self) -> np.ndarray:
@@ -123,7 +113,7 @@ class SimulatedState(FocusState):
         Shims that led to this placement; None for the first one.
     """
 
-    level: LineLevel
+    level: plane_fit.LineLevel
     bench: FocusBench
     placement: Placement
     focus: tuple[NyquistMtf, ...]
@@ -177,8 +167,8 @@ class Shimming:
         Standard deviation of its change from the middle to the ends of the sites, metres.
     """
 
-    plane: FocalPlaneFit
-    plan: ShimPlan
+    plane: plane_fit.FocalPlaneFit
+    plan: plane_fit.ShimPlan
     vertex_error: float = focus_bench.VERTEX_ERROR
     vertex_trend: float = focus_bench.VERTEX_TREND
 
@@ -355,7 +345,11 @@ def align_files(spec: MeasuredFocusSpec, seed: int = 0, advance: Advance = silen
         The mount does not allow the motion.
     """
     readings = read_focus(spec.measured, advance)
-    level = None if spec.measured.level is None else LineLevel(spec.measured.level.angle, spec.measured.level.sigma)
+    level = (
+        None
+        if spec.measured.level is None
+        else plane_fit.LineLevel(spec.measured.level.angle, spec.measured.level.sigma)
+    )
     state = FocusState(readings.scans, level)
     present = np.array(spec.shims or [spec.mount.thickness] * len(spec.mount.holes))
     try:
@@ -363,7 +357,7 @@ def align_files(spec: MeasuredFocusSpec, seed: int = 0, advance: Advance = silen
         # skew of the curves beyond its noise is an error common to all sites
         shared = float(np.sqrt(spec.vertex_error**2 + max(skew**2 - noise**2, 0.0)))
         shimming = plan_shimming(readings.positions, state, mount_of(spec), present, (shared, spec.vertex_trend))
-    except ObservabilityError as error:
+    except plane_fit.ObservabilityError as error:
         raise readings.table.error(0, "x", str(error).removeprefix("focal plane: ")) from error
     return FocusRun(
         test=spec,
@@ -382,11 +376,8 @@ def _check_light(bench: FocusBench) -> None:
     name = min(most, key=lambda n: most[n])
     white = bench.setup.test.white
     if white > most[name]:
-        raise BenchError(
-            f"the bright side of the edge, {100 * white:g}% of the full well, saturates pixels of {name}",
-            ("white",),
-            f"{np.floor(100 * most[name]):.0f} percent or less",
-        )
+        problem = f"the bright side of the edge, {100 * white:g}% of the full well, saturates pixels of {name}"
+        raise BenchError(problem, ("white",), f"{np.floor(100 * most[name]):.0f} percent or less")
 
 
 def align(bench: FocusBench, seed: int, advance: Advance = silent) -> SimulatedFocus:
@@ -426,7 +417,7 @@ def align(bench: FocusBench, seed: int, advance: Advance = silent) -> SimulatedF
 def plan_shimming(
     positions: np.ndarray,
     state: FocusState,
-    mount: Mount,
+    mount: plane_fit.Mount,
     present: np.ndarray,
     vertex: tuple[float, float] = (focus_bench.VERTEX_ERROR, focus_bench.VERTEX_TREND),
 ) -> Shimming:
@@ -453,7 +444,7 @@ def plan_shimming(
         The mount does not allow the motion.
     """
     # the plane is fitted to the distance of best focus downstream of the CCD
-    plane = fit_focal_plane(positions, -state.defocus, state.defocus_sigma, estimate_extra=True)
+    plane = plane_fit.fit_focal_plane(positions, -state.defocus, state.defocus_sigma, estimate_extra=True)
     return Shimming(plane, plan_shims(plane.correction(state.level), mount, present), *vertex)
 
 
@@ -467,7 +458,7 @@ def draw_placement(bench: FocusBench, seed: int) -> Placement:
     return Placement(Pose(rotation, shift), heights)
 
 
-def mount_of(test: FocusTestSpec | MeasuredFocusSpec) -> Mount:
+def mount_of(test: FocusTestSpec | MeasuredFocusSpec) -> plane_fit.Mount:
     """Return the mounting surface with its holes, as specified by the drawing, in the assembly's frame.
 
     Raises
@@ -477,12 +468,12 @@ def mount_of(test: FocusTestSpec | MeasuredFocusSpec) -> Mount:
     """
     spec = test.mount
     try:
-        return Mount.of(np.array(spec.holes), about_axis(1, spec.tilt)[:, 2], spec.clearance, spec.step)
-    except ShimError as error:
+        return plane_fit.Mount.of(np.array(spec.holes), about_axis(1, spec.tilt)[:, 2], spec.clearance, spec.step)
+    except plane_fit.ShimError as error:
         raise BenchError(str(error), ("mount", "holes"), "three holes or more that span a plane") from error
 
 
-def plan_shims(correction: RigidMotion, mount: Mount, present: np.ndarray) -> ShimPlan:
+def plan_shims(correction: plane_fit.RigidMotion, mount: plane_fit.Mount, present: np.ndarray) -> plane_fit.ShimPlan:
     """Compute the shims that move the focal-plane assembly by a correction.
 
     ``present`` is the present thickness of each shim, metres.
@@ -493,16 +484,15 @@ def plan_shims(correction: RigidMotion, mount: Mount, present: np.ndarray) -> Sh
         The mount does not allow the motion.
     """
     try:
-        return shim_plan(correction, mount, present)
-    except ShimError as error:
+        return plane_fit.shim_plan(correction, mount, present)
+    except plane_fit.ShimError as error:
         if error.slides:
             slide, far = max(zip(error.slides, error.holes, strict=True))
-            raise BenchError(
-                f"the alignment would slide hole_{far + 1} by {1e3 * slide:.3g} mm in the mounting surface, "
-                f"but the screws allow {1e3 * mount.clearance:.3g} mm",
-                ("mount", "clearance"),
-                "more clearance, or a smaller misset",
-            ) from error
+            limit = f"but the screws allow {1e3 * mount.clearance:.3g} mm"
+            problem = (
+                f"the alignment would slide hole_{far + 1} by {1e3 * slide:.3g} mm in the mounting surface, {limit}"
+            )
+            raise BenchError(problem, ("mount", "clearance"), "more clearance, or a smaller misset") from error
         raise BenchError(str(error), ("mount", "thickness"), "thicker shims to begin with") from error
 
 
@@ -557,7 +547,7 @@ def _measure_placement(
     reading = true_angle + float(np.random.default_rng(stream(seed, _LEVEL, number)).normal(0.0, sigma))
     return SimulatedState(
         scans,
-        LineLevel(reading, sigma),
+        plane_fit.LineLevel(reading, sigma),
         bench,
         placement,
         focus_bench.in_focus(recorder) if number > 0 else (),
@@ -567,7 +557,7 @@ def _measure_placement(
     )
 
 
-def _on_new_shims(pose: Pose, plan: ShimPlan, mount: Mount, setting: float) -> Pose:
+def _on_new_shims(pose: Pose, plan: plane_fit.ShimPlan, mount: plane_fit.Mount, setting: float) -> Pose:
     """Return the pose of the assembly on its new shims.
 
     Its rotation in the mounting surface is set with an error of ``setting`` radians.

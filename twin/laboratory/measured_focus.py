@@ -173,12 +173,8 @@ def _per_shift(table: Table, files: FocusFiles) -> Array | float:
     """
     if files.moved != "target":
         if "per shift" in table:
-            raise table.error(
-                0,
-                "per shift",
-                "the key is for a target that moves; a detector moves as much as the image",
-                allowed="moved: target",
-            )
+            text = "the key is for a target that moves; a detector moves as much as the image"
+            raise table.error(0, "per shift", text, allowed="moved: target")
         # moving the CCD downstream is equivalent to moving the image upstream
         return 1.0 if files.moved == "image" else -1.0
     if "per shift" in table:
@@ -219,9 +215,8 @@ def _sites(table: Table) -> tuple[_Site, ...]:
         empty = next((name for name, edge_rows in rows_by_edge.items() if not edge_rows.size), None)
         if empty is not None:
             text = f"{site} has no row of the edge {empty!r}, which other sites have"
-            raise table.error(
-                int(rows[0]), "edge", text, allowed="both directions at every site, or the same one at all"
-            )
+            allowed = "both directions at every site, or the same one at all"
+            raise table.error(int(rows[0]), "edge", text, allowed=allowed)
         out.append(site)
     return tuple(out)
 
@@ -233,10 +228,8 @@ def _scan(table: Table, site: _Site, shift: Array, mtf: Array, sigma: Array, rea
         good = int(np.sum(np.isfinite(sigma[rows])))
         try:
             if good < LEAST_POINTS:
-                raise FocusError(
-                    f"only {good} of {len(rows)} positions have a measurable edge, at least {LEAST_POINTS} are needed",
-                    {},
-                )
+                few = f"only {good} of {len(rows)} positions have a measurable edge"
+                raise FocusError(f"{few}, at least {LEAST_POINTS} are needed", {})
             vertex[edge] = focus_vertex(shift[rows], mtf[rows], sigma[rows])
         except FocusError as error:
             text = f"no best focus of {site}, edge {edge}: {error}; positions are shifts of the image, metres"
@@ -244,14 +237,8 @@ def _scan(table: Table, site: _Site, shift: Array, mtf: Array, sigma: Array, rea
             if bad:
                 text += f"; reason for its first image without an edge: {bad}"
             raise table.error(int(rows[0]), "shift", text) from error
-    return SiteScan(
-        shift={edge: shift[rows] for edge, rows in site.rows.items()},
-        mtf={edge: mtf[rows] for edge, rows in site.rows.items()},
-        sigma={edge: sigma[rows] for edge, rows in site.rows.items()},
-        vertex=vertex,
-        frames={},
-        target=np.empty(0),
-    )
+    curves = [{edge: values[rows] for edge, rows in site.rows.items()} for values in (shift, mtf, sigma)]
+    return SiteScan(*curves, vertex=vertex, frames={}, target=np.empty(0))
 
 
 def _from_images(

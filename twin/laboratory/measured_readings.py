@@ -95,10 +95,8 @@ class DataFile:
     @property
     def doubts(self) -> tuple[str, ...]:
         """Warnings about the contents of the file, such as copied rows."""
-        text = (
-            "of a repeated measurement equal another one to the last digit: were they copied? All count in the sigmas"
-        )
-        return (f"{self.copied} rows of {self.file} {text}",) if self.copied else ()
+        text = f"{self.copied} rows of {self.file} of a repeated measurement equal another one to the last digit"
+        return (f"{text}: were they copied? All count in the sigmas",) if self.copied else ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -169,9 +167,8 @@ def read_turntable(files: TurntableFiles) -> tuple[Comparisons, ...]:
     if files.held_out is None:
         return (series,)
     calibrated = series.series.angle
-    held_out = read_comparisons(
-        files.held_out, files.reference, fewest=1, around=0.5 * float(calibrated[0] + calibrated[-1])
-    )
+    middle = 0.5 * float(calibrated[0] + calibrated[-1])
+    held_out = read_comparisons(files.held_out, files.reference, fewest=1, around=middle)
     beyond = ~covered(calibrated, held_out.series.angle)
     if np.any(beyond):
         k = int(np.argmax(beyond))
@@ -266,10 +263,8 @@ def read_comparisons(path: str, reference_sigma: float, fewest: int = 4, around:
         worst = int(np.argmax(np.abs(mean - np.median(mean))))
         name = "difference" if "difference" in table else "reference"
         text = f"the difference from the reference changes by {np.degrees(np.ptp(mean)):.3g} deg over the region"
-        remedy = (
-            "less than 1 deg: reading minus reference, both with the same sense of rotation and in the unit of the head"
-        )
-        raise table.error(int(cells.first[worst]), name, text, allowed=remedy)
+        meant = "reading minus reference, both with the same sense of rotation and in the unit of the head"
+        raise table.error(int(cells.first[worst]), name, text, allowed=f"less than 1 deg: {meant}")
     series = CalibrationSeries(angle, matrix, reference_sigma, present=None if np.all(present) else present)
     return Comparisons(series, cells.matrix(table.lines, 0), DataFile.of(table, ["reading"]), table.heads[READING.name])
 
@@ -293,11 +288,8 @@ def read_spots(files: DistortionFiles) -> SpotReadings:
     if "set" in table and not numbered:
         raise InputError(Issue("sets of points without numbers", files.spots, 1, allowed="a column 'point' as well"))
     reading = unwrapped(table["reading"], files.zero)
-    group = (
-        np.unique(table["point"], return_inverse=True)[1]
-        if numbered
-        else np.argsort(np.argsort(reading, kind="stable"))
-    )
+    rows = np.argsort(np.argsort(reading, kind="stable"))
+    group = np.unique(table["point"], return_inverse=True)[1] if numbered else rows
     sets = table["set"] if "set" in table else np.zeros(len(table))
     order = np.lexsort((positions, reading, sets, group))
     cells = _Cells(table, group[order], order)
@@ -341,10 +333,9 @@ def _spot_positions(table: Table, files: DistortionFiles) -> tuple[Array, Array,
     """
     if ("along" in table) is ("column" in table):
         found = "neither" if "along" not in table else "both"
+        text = "a column with the positions of the spots is needed"
         allowed = "'along [mm]' from the line's middle, or 'column' with `line:` in the test's file"
-        raise InputError(
-            Issue("a column with the positions of the spots is needed", files.spots, 1, (), found, allowed)
-        )
+        raise InputError(Issue(text, files.spots, 1, (), found, allowed))
     none = np.zeros(len(table))
     if "along" in table:
         wrong = next((n for n in ("column sigma", "column fixed sigma") if n in table), None)
@@ -355,10 +346,8 @@ def _spot_positions(table: Table, files: DistortionFiles) -> tuple[Array, Array,
     if wrong is not None:
         raise table.error(0, wrong, "a sigma in lengths for positions in pixels", allowed=f"'column {wrong}'")
     if files.line is None:
-        allowed = "line: {pitch: 7 um, middle: 6143.5}"
-        raise files.error(
-            "positions in pixels need the pixel pitch of the line", ("spots",), found="column", allowed=allowed
-        )
+        text, allowed = "positions in pixels need the pixel pitch of the line", "line: {pitch: 7 um, middle: 6143.5}"
+        raise files.error(text, ("spots",), found="column", allowed=allowed)
     pitch = files.line.pitch
     temporal, fixed = (table.columns.get(n, none) for n in ("column sigma", "column fixed sigma"))
     return (table["column"] - files.line.middle) * pitch, temporal * pitch, fixed * pitch
@@ -368,16 +357,13 @@ def _few_points(table: Table, cells: _Cells, sets: Array | None) -> None:
     """Raise InputError for too few points, in total or in one set, or for more points than fit into memory."""
     count, need = len(cells.count), len(CALIBRATED) + 2
     if count < need or count > MAX_ANGLES:
-        few = "too few points" if count < need else "too many points"
-        remedy = (
-            f"{need} or more, over the whole field" if count < need else f"at most {MAX_ANGLES}; 'point' numbers them"
-        )
-        raise table.error(0, "", few, str(count), remedy)
+        few, many = f"{need} or more, over the whole field", f"at most {MAX_ANGLES}; 'point' numbers them"
+        text, remedy = ("too few points", few) if count < need else ("too many points", many)
+        raise table.error(0, "", text, str(count), remedy)
     points_per_set = cells.present.sum(axis=0)
     if np.min(points_per_set) < need:
         k = int(np.argmin(points_per_set))
-        row = int(np.flatnonzero(cells.slot == k)[0])
-        row = int(cells.order[row])
+        row = int(cells.order[np.flatnonzero(cells.slot == k)[0]])
         name = "point" if sets is None else "set"
         text = f"a set of {points_per_set[k]} points"
         raise table.error(row, name if name in table else "", text, allowed=f"{need} or more in every set")
@@ -436,11 +422,10 @@ class _Cells:
 
         Empty cells get ``empty``, or if that is None the first value of their group.
         """
-        start = (
-            np.asarray(value)[self.first] if empty is None else np.full(len(self.count), empty, np.asarray(value).dtype)
-        )
+        values = np.asarray(value)
+        start = values[self.first] if empty is None else np.full(len(self.count), empty, values.dtype)
         out = np.repeat(start[:, None], self.present.shape[1], axis=1)
-        out[self.group, self.slot] = np.asarray(value)[self.order]
+        out[self.group, self.slot] = values[self.order]
         return out
 
     def centre(self, value: Array) -> Array:
@@ -467,11 +452,9 @@ def _check_angles(cells: _Cells, angle: Array, fewest: int) -> None:
     count = len(angle)
     if fewest <= count <= MAX_ANGLES:
         return
-    text, remedy = (
-        ("few", f"{fewest} or more; where the table does not return to the same reading, a column 'position'")
-        if count < fewest
-        else ("many", f"at most {MAX_ANGLES}; a column 'position' numbers the stops of the table")
-    )
+    few = f"{fewest} or more; where the table does not return to the same reading, a column 'position'"
+    many = f"at most {MAX_ANGLES}; a column 'position' numbers the stops of the table"
+    text, remedy = ("few", few) if count < fewest else ("many", many)
     raise cells.table.error(0, READING.name, f"too {text} different readings", str(count), remedy)
 
 

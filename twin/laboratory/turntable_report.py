@@ -168,15 +168,13 @@ def _comparison(run: TurntableRun, result: Mapping[str, Any]) -> Section:
     series = run.series
     text = [
         f"Chauvenet's criterion rejects {series.rejected} of {np.sum(series.taken)} comparisons. By chance it would "
-        "reject "
-        f"{result['rejected_expected_by_chance']:.0f} on average if all were good: it trims normal noise, and the RMS "
-        "that remains is that of trimmed readings, for which the σ of one comparison is corrected."
+        f"reject {result['rejected_expected_by_chance']:.0f} on average if all were good: it trims normal noise, and "
+        "the RMS that remains is that of trimmed readings, for which the σ of one comparison is corrected."
     ]
     if result["suspect_angles"]:
         text.append(
             f"At {result['suspect_angles']} of the angles the accepted repeats scatter more than their number allows: "
-            "gross errors that mask each other. Those angles get the sigma of their own repeats; "
-            "measure them again."
+            "gross errors that mask each other. Those angles get the sigma of their own repeats; measure them again."
         )
     figure = SvgFigure(
         "turntable-comparisons",
@@ -214,9 +212,8 @@ def _fits(run: TurntableRun, result: Mapping[str, Any]) -> Section:
         if abs(periods - round(periods)) < 1e-6:
             text.append(
                 f"A step of the calibration is {round(periods)} whole periods of the grating's signal "
-                f"({subdivision.period / ARCSEC:.4g} arcsec), so that all calibration points lie at one phase and "
-                "do not show the subdivision error. The held-out readings lie at all phases, as the readings in use "
-                "do: "
+                f"({subdivision.period / ARCSEC:.4g} arcsec), so that all calibration points lie at one phase and do "
+                "not show the subdivision error. The held-out readings lie at all phases, as the readings in use do: "
                 "their residuals include what no fit can represent."
             )
     text += [f"The {FIT_NAMES[name]} failed: {failure}." for name, failure in result["failed"].items()]
@@ -293,8 +290,7 @@ def _chi_square(result: Mapping[str, Any]) -> Table:
     lines = TURNTABLE.lines(result, keys if result["heldout_degrees_of_freedom"] else keys[:2])
     note = (
         "Chi-square of the means against their sigmas, and of held-out readings against the compensation's covariance. "
-        "Far "
-        "above the degrees of freedom, the fit has errors beyond noise, which the misfits cover."
+        "Far above the degrees of freedom, the fit has errors beyond noise, which the misfits cover."
     )
     return Table("turntable-chi-square", "Chi-square of the chosen fit", note, ("", ""), lines)
 
@@ -320,8 +316,7 @@ def turntable_report(run: TurntableRun) -> Report:
         f"the {FIT_NAMES[chosen]} compensates it to σ = {sigma:.3f} arcsec{missed_text}, limited by {limit}",
         f"repeats scatter by {data['repeatability_arcsec']:.3f} arcsec",
         f"{data['rejected']} of {int(np.sum(run.series.taken))} comparisons were rejected, "
-        f"{data['rejected_expected_by_chance']:.0f} expected by chance: see the remaining error of a compensated "
-        "angle",
+        f"{data['rejected_expected_by_chance']:.0f} expected by chance: see the remaining error of a compensated angle",
     )
     judged_key = "cross_validation_rms_arcsec" if run.held_out is None else "heldout_rms_arcsec"
     by = "by cross-validation" if run.held_out is None else "on held-out angles"

@@ -26,18 +26,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from analysis.arrays import Array
 from analysis.statistics import p_value_of, rms
-from analysis.turntable.dividing_error import (
-    FITS,
-    AngleFit,
-    CalibrationSeries,
-    Choice,
-    DividingCompensation,
-    angles_left,
-    choose,
-    compensate,
-    expected_rejections,
-    fewest,
-)
+from analysis.turntable import dividing_error
 from optics.numerics.backend import Backend, one_blas_thread
 from optics.numerics.number_tree import FrozenMap
 from scenes.specs.camera_tests import DividingErrorSpec, MeasuredTurntableSpec, TurntableFiles, TurntableTestSpec
@@ -192,12 +181,12 @@ class TurntableModel:
             return np.zeros(shape)
         return rng.normal(0.0, self.spec.dividing_error.repeatability, shape)
 
-    def calibrate(self) -> CalibrationSeries:
+    def calibrate(self) -> dividing_error.CalibrationSeries:
         """Simulate the comparison of the table with the reference at equidistant readings of the region."""
         plan = self.spec.calibration
         return self._compare(self._steps(0.0, plan.count), plan.repeats, _CALIBRATION)
 
-    def held_out(self) -> CalibrationSeries:
+    def held_out(self) -> dividing_error.CalibrationSeries:
         """Simulate a separate series for validation, at angles between those of the calibration.
 
         The angles are in the middle of the steps, displaced at random by up to the specified spread.
@@ -215,7 +204,7 @@ class TurntableModel:
         plan = self.spec.calibration
         return np.asarray(plan.first + plan.step * (np.arange(count) + start), np.float64)
 
-    def _compare(self, angle: Array, repeats: int, number: int) -> CalibrationSeries:
+    def _compare(self, angle: Array, repeats: int, number: int) -> dividing_error.CalibrationSeries:
         """Simulate repeated comparisons of the table with the reference at given readings."""
         rng = np.random.default_rng(stream(self.seed, number))
         reference = self.spec.reference
@@ -225,7 +214,7 @@ class TurntableModel:
         measured = self.true_angle(readings, rng) + reference_error[:, None] + rng.normal(0.0, reference.noise, shape)
         gross = rng.random(shape) < reference.gross_probability
         measured = measured + gross * rng.choice([-1.0, 1.0], shape) * reference.gross_error
-        return CalibrationSeries(angle, readings - measured, reference.calibration)
+        return dividing_error.CalibrationSeries(angle, readings - measured, reference.calibration)
 
 
 TRUTH_READINGS = 4000
@@ -262,16 +251,16 @@ class TurntableRun:
 
     spec: TurntableTestSpec | MeasuredTurntableSpec
     seed: int
-    series: CalibrationSeries
-    held_out: CalibrationSeries | None
-    choice: Choice
-    compensation: DividingCompensation
+    series: dividing_error.CalibrationSeries
+    held_out: dividing_error.CalibrationSeries | None
+    choice: dividing_error.Choice
+    compensation: dividing_error.DividingCompensation
     model: TurntableModel | None = None
     tables: tuple[Comparisons, ...] = ()
     too_few: tuple[str, ...] = ()
 
     @property
-    def fits(self) -> dict[str, AngleFit]:
+    def fits(self) -> dict[str, dividing_error.AngleFit]:
         """Name -> fit of the dividing error, for all fits that succeeded, in the order in which they were made."""
         return {name: trial.fit for name, trial in self.choice.trials.items()}
 
@@ -342,7 +331,7 @@ def run_turntable(
     spec: TurntableTestSpec | MeasuredTurntableSpec,
     seed: int = 0,
     progress: Callable[[str], None] | None = None,
-    names: Sequence[str] = tuple(FITS),
+    names: Sequence[str] = tuple(dividing_error.FITS),
 ) -> TurntableRun:
     """Simulate or read the comparisons, reject outliers, fit them, choose a fit and build its compensation.
 
@@ -365,7 +354,7 @@ def run_turntable(
     report = progress or (lambda text: None)
     model: TurntableModel | None = None
     tables: tuple[Comparisons, ...] = ()
-    held_out: CalibrationSeries | None = None
+    held_out: dividing_error.CalibrationSeries | None = None
     too_few: tuple[str, ...] = ()
     if isinstance(spec, MeasuredTurntableSpec):
         report("read the comparisons")
@@ -380,23 +369,21 @@ def run_turntable(
         series, held_out = model.calibrate(), model.held_out()
     # the network's matrices are small
     with one_blas_thread():
-        choice = choose(series, seed, names, folds, report)
-        compensation = compensate(series, choice, held_out)
+        choice = dividing_error.choose(series, seed, names, folds, report)
+        compensation = dividing_error.compensate(series, choice, held_out)
     return TurntableRun(spec, seed, series, held_out, choice, compensation, model, tables, too_few)
 
 
 def _check_count(spec: TurntableTestSpec, names: Sequence[str]) -> None:
     """Raise InputError if the simulated calibration has too few angles for a fit."""
     plan = spec.calibration
-    left = angles_left(plan.count, plan.folds)
-    short = [name for name in names if left < fewest(name)]
+    left = dividing_error.angles_left(plan.count, plan.folds)
+    short = [name for name in names if left < dividing_error.fewest(name)]
     if short:
-        raise spec.error(
-            f"too few angles for the fit {short[0]!r}",
-            ("calibration", "step"),
-            found=f"{plan.count} angles, {left} of them without a fold of the cross-validation",
-            allowed=f"steps that leave {fewest(short[0])} or more",
-        )
+        found = f"{plan.count} angles, {left} of them without a fold of the cross-validation"
+        problem, allowed = f"too few angles for the fit {short[0]!r}", dividing_error.fewest(short[0])
+        key = ("calibration", "step")
+        raise spec.error(problem, key, found=found, allowed=f"steps that leave {allowed} or more")
 
 
 def usable_fits(
@@ -410,8 +397,8 @@ def usable_fits(
         There are too few angles for any fit.
     """
     count = len(comparisons.series.angle)
-    left = angles_left(count, files.folds)
-    enough = tuple(name for name in names if left >= fewest(name))
+    left = dividing_error.angles_left(count, files.folds)
+    enough = tuple(name for name in names if left >= dividing_error.fewest(name))
     if not enough:
         text = f"{count} angles, {left} of them without a fold of the cross-validation"
         issue = files.error("too few angles for any fit", ("comparisons",), found=text, allowed="more angles or folds")
@@ -479,7 +466,7 @@ FIT: Record[tuple[TurntableRun, str]] = Record(
     Quantity("effective_parameters", lambda s: s[0].fits[s[1]].effective_parameters, "trace of smoothing", decimals=1),
     Quantity("settings", lambda s: s[0].fits[s[1]].settings, "selected settings: order, period, smoothing, trainings"),
 )
-COMPENSATION: Record[DividingCompensation] = Record(
+COMPENSATION: Record[dividing_error.DividingCompensation] = Record(
     "Standard deviations of the errors of a compensated angle beyond the calibration's noise.",
     Quantity("common_arcsec", lambda c: c.common, "a constant, the same at all readings", decimals=4),
     Quantity("smooth_arcsec", lambda c: c.smooth, "misfit along the curve, correlated over one step", decimals=4),
@@ -502,7 +489,7 @@ TRUTH: Record[TurntableRun] = Record(
     Quantity("dividing_error_spread_arcsec", lambda r: np.std(r.true_error), "RMS of the true curve about its mean"),
     Quantity("part_rms_full_circle_arcsec", lambda r: _parts(r), "cause -> RMS of its error over the full circle"),
 )
-_Points: TypeAlias = tuple[TurntableRun, CalibrationSeries]
+_Points: TypeAlias = tuple[TurntableRun, dividing_error.CalibrationSeries]
 POINTS: Record[_Points] = Record(
     "One reading and its comparisons with the reference, reading minus reference.",
     Quantity("reading_deg", lambda s: s[1].angle, "reading of the table"),
@@ -516,7 +503,7 @@ POINTS: Record[_Points] = Record(
 )
 
 
-def _each(series: CalibrationSeries, values: Any) -> list[Any]:
+def _each(series: dividing_error.CalibrationSeries, values: Any) -> list[Any]:
     """Return values of a series as a list for each reading, without missing comparisons.
 
     ``values`` is an array (N, repeats) for N readings.
@@ -524,7 +511,7 @@ def _each(series: CalibrationSeries, values: Any) -> list[Any]:
     return [row[taken] for row, taken in zip(values, series.taken, strict=True)]
 
 
-def _fitted(run: TurntableRun, series: CalibrationSeries) -> list[dict[str, float]]:
+def _fitted(run: TurntableRun, series: dividing_error.CalibrationSeries) -> list[dict[str, float]]:
     """Return fit -> dividing error, radians, at every reading of a series."""
     values = {name: fit(series.angle) for name, fit in run.fits.items()}
     return [dict(zip(values, row, strict=True)) for row in zip(*values.values(), strict=True)]
@@ -568,7 +555,9 @@ TURNTABLE: Record[TurntableRun] = Record(
     Quantity("repeatability_arcsec", lambda r: r.series.repeatability, "one comparison, pooled σ", decimals=3),
     Quantity("rejected", lambda r: r.series.rejected, "comparisons that Chauvenet's criterion rejects"),
     Quantity(
-        "rejected_expected_by_chance", lambda r: expected_rejections(r.series.counts), "rejections expected by chance"
+        "rejected_expected_by_chance",
+        lambda r: dividing_error.expected_rejections(r.series.counts),
+        "rejections expected by chance",
     ),
     Quantity("suspect_angles", lambda r: np.sum(r.series.suspect), "readings that still scatter after the criterion"),
     Quantity("heldout_arcsec_sigma", lambda r: r.held_out and rms(r.held_out.sigma), "RMS sigma of the held-out means"),

@@ -10,20 +10,9 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
+from scenes.specs.orbit import flight
 from scenes.specs.orbit.angle import Relief, TerrainHeight
 from scenes.specs.orbit.calibration import CameraDriftSpec, FieldLength, MonitorReadingSpec
-from scenes.specs.orbit.flight import (
-    Altitude,
-    AngleErrors,
-    AttitudeSpec,
-    EarthSpec,
-    Frequency,
-    Interval,
-    Latitude,
-    Longitude,
-    PayloadTestSpec,
-    UtcTime,
-)
 from scenes.specs.orbit.measurements import MeasuredTestSpec
 from scenes.specs.orbit.scene import LineTime
 from scenes.specs.procedures import SENSORS
@@ -35,7 +24,6 @@ from scenes.yaml.units import ANGLE, DISTANCE, LENGTH, MOMENT
 Sensor = Literal["ties", "control", "monitor", "laser", "terrain", "tracker_angles"]
 LawKind = Literal["constant", "rate", "white", "walk", "slow", "orbital", "jitter"]
 Period = Annotated[float, Quantity(MOMENT, above_zero=True, largest="100000 h")]
-Sigmas = Annotated[tuple[float, float, float], Vector(Quantity(LENGTH, smallest="0 m", largest="10 km"))]
 Positive = Annotated[float, Quantity(LENGTH, above_zero=True, largest="1 km")]
 PointCount = Annotated[Whole, Field(ge=0, le=1_000_000)]
 
@@ -64,9 +52,9 @@ class LawSpec(Spec):
 
     law: LawKind
     shared_by: Literal["pass", "tracker", "block"] = "pass"
-    interval: Interval = 1.0
+    interval: flight.Interval = 1.0
     time: Period | None = None
-    frequency: Frequency | None = None
+    frequency: flight.Frequency | None = None
 
     @model_validator(mode="after")
     def _has_its_time(self) -> LawSpec:
@@ -105,7 +93,7 @@ class OrbitLawSpec(LawSpec):
         in a second.
     """
 
-    sigma: Sigmas
+    sigma: flight.LengthSigmas
 
 
 class ReadingLawsSpec(Spec):
@@ -164,9 +152,9 @@ class BlockPassSpec(Spec):
         Name of the star tracker that measures the attitude.
     """
 
-    epoch: UtcTime
-    longitude: Longitude | None = None
-    latitude: Latitude | None = None
+    epoch: flight.UtcTime
+    longitude: flight.Longitude | None = None
+    latitude: flight.Latitude | None = None
     direction: Literal["descending", "ascending"] = "descending"
     roll: Annotated[float, Quantity(ANGLE, largest="40 deg")] = 0.0
     tracker: Name = "tracker"
@@ -191,8 +179,8 @@ class AreaSpec(Spec):
         Size of the area from south to north, in metres.
     """
 
-    longitude: Longitude
-    latitude: Latitude
+    longitude: flight.Longitude
+    latitude: flight.Latitude
     height: TerrainHeight = 0.0
     relief: Relief = 0.0
     east: FieldLength = 20e3
@@ -288,13 +276,10 @@ class CameraChangeSpec(Spec):
     @model_validator(mode="after")
     def _may_change(self) -> CameraChangeSpec:
         both = (self.lasting, self.each_pass)
-        for k, name in enumerate(("d_alpha", "d_beta", "d_gamma")):
-            if not any(change.angles[k] for change in both):
+        for k, name in enumerate(("d_alpha", "d_beta", "d_gamma", "the principal distance")):
+            if not any((*change.angles, change.principal_distance)[k] for change in both):
                 problem = f"{name} has a prior sigma of zero, which is not realistic"
                 raise Problem(problem, None, "a sigma above zero in `lasting` or `each_pass`", within=("lasting",))
-        if not any(change.principal_distance for change in both):
-            problem = "the principal distance has a prior sigma of zero, which is not realistic"
-            raise Problem(problem, None, "a sigma above zero in `lasting` or `each_pass`", within=("lasting",))
         return self
 
 
@@ -319,7 +304,15 @@ def check_one_monitor(monitor: object, record: MonitorRecordSpec | None) -> None
         raise Problem("`monitor` and `monitor_record` are both given", None, "one of them", within=("monitor_record",))
 
 
-class OrbitAdjustSpec(PayloadTestSpec):
+def _require_groups(spec: OrbitAdjustSpec | MeasuredAdjustSpec, groups: tuple[str, ...]) -> None:
+    """Raise `Problem` for a component of variance that is neither among these groups nor a law of the readings."""
+    known = (*groups, *spec.errors.attitude, *spec.errors.orbit)
+    for k, name in enumerate(spec.components):
+        if name not in known:
+            raise unknown("no such group of variances", name, known, ("components", k))
+
+
+class OrbitAdjustSpec(flight.PayloadTestSpec):
     """Bundle adjustment of a simulated block of scenes.
 
     Attributes
@@ -372,11 +365,11 @@ class OrbitAdjustSpec(PayloadTestSpec):
     """
 
     lines: tuple[Name, ...] = ("forward", "nadir", "backward")
-    earth: EarthSpec = EarthSpec.model_construct()
-    altitude: Altitude = 500e3
+    earth: flight.EarthSpec = flight.EarthSpec.model_construct()
+    altitude: flight.Altitude = 500e3
     span: Annotated[float, Quantity(MOMENT, smallest="1 s", largest="1 h")] = 60.0
     line_time: LineTime = 0.7e-3
-    attitude: AttitudeSpec = AttitudeSpec.model_construct(steering="yaw")
+    attitude: flight.AttitudeSpec = flight.AttitudeSpec.model_construct(steering="yaw")
     area: AreaSpec
     passes: Annotated[Named[BlockPassSpec], not_empty("no passes", "at least one pass")]
     points: BlockPointsSpec = BlockPointsSpec.model_construct()
@@ -418,19 +411,9 @@ class OrbitAdjustSpec(PayloadTestSpec):
         ]
         if self.angles and not lasting:
             problem = "an angle between star trackers that have no constant error"
-            raise Problem(
-                problem,
-                None,
-                "an entry of errors.attitude with `law: constant` and `shared_by: tracker`",
-                within=("angles",),
-            )
-        return self._has_known_groups()
-
-    def _has_known_groups(self) -> OrbitAdjustSpec:
-        groups = ("image", "control", "laser", "terrain", *self.errors.attitude, *self.errors.orbit)
-        for k, name in enumerate(self.components):
-            if name not in groups:
-                raise unknown("no such group of variances", name, groups, ("components", k))
+            allowed = "an entry of errors.attitude with `law: constant` and `shared_by: tracker`"
+            raise Problem(problem, None, allowed, within=("angles",))
+        _require_groups(self, ("image", "control", "laser", "terrain"))
         return self
 
     @property
@@ -458,7 +441,7 @@ class CameraReadingSpec(Spec):
         Change d_f of the principal distance, in metres.
     """
 
-    angles: AngleErrors
+    angles: flight.AngleErrors
     principal_distance: Annotated[float, Quantity(LENGTH, largest="5 mm")] = 0.0
 
 
@@ -519,10 +502,7 @@ class MeasuredAdjustSpec(MeasuredTestSpec):
 
     @model_validator(mode="after")
     def _has_known_groups(self) -> MeasuredAdjustSpec:
-        groups = ("image", "control", *self.errors.attitude, *self.errors.orbit)
-        for k, name in enumerate(self.components):
-            if name not in groups:
-                raise unknown("no such group of variances", name, groups, ("components", k))
+        _require_groups(self, ("image", "control"))
         check_one_monitor(self.monitor, self.monitor_record)
         if "monitor" in self.without and "monitor" not in self.sensors:
             raise Problem("there is no monitor to exclude", None, "a section `monitor:`", within=("without",))

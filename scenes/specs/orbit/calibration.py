@@ -204,9 +204,8 @@ class CalibrationImagesSpec(Spec):
             raise Problem(problem, found, f"{LEAST_PATCHES} or more", within=("patches",))
         if self.points.control < 1 or self.points.check < 1:
             found = f"control {self.points.control}, check {self.points.check}"
-            raise Problem(
-                "a calibration needs control and check points", found, "1 or more of each", within=("points",)
-            )
+            problem = "a calibration needs control and check points"
+            raise Problem(problem, found, "1 or more of each", within=("points",))
         return self
 
 

@@ -199,10 +199,8 @@ class CorrectionSpec(Spec):
             allowed = "mechanism: the motion of a body, as forward/focal_plane shift z"
             raise Problem("image processing cannot correct the focus", "no mechanism", allowed, within=("quantity",))
         if self.mechanism is None and self.response != 1.0:
-            allowed = "no response, or a mechanism"
-            raise Problem(
-                "a correction by image processing has no response", str(self.response), allowed, None, ("response",)
-            )
+            problem, allowed = "a correction by image processing has no response", "no response, or a mechanism"
+            raise Problem(problem, str(self.response), allowed, None, ("response",))
         try:
             kind = self.motion[1]
         except Problem as problem:
@@ -471,10 +469,8 @@ class OrbitMonitorSpec(TitledSpec):
         if interval > span + _EVEN:
             raise Problem("longer than the course", moment(interval), f"at most {moment(span)}", within=key)
         if abs(interval - step * round(interval / step)) > _EVEN or interval < step - _EVEN:
-            near = moment(step * max(round(interval / step), 1))
-            raise Problem(
-                "not a multiple of the course's step", moment(interval), f"multiples of {moment(step)}", near, key
-            )
+            near, allowed = moment(step * max(round(interval / step), 1)), f"multiples of {moment(step)}"
+            raise Problem("not a multiple of the course's step", moment(interval), allowed, near, key)
 
     @property
     def loop(self) -> MechanismsSpec:
@@ -544,14 +540,8 @@ class OrbitMonitorSpec(TitledSpec):
         frames = RenderSpec.model_construct(
             images=("spots",), targets=None, stray=None, frames=self.frames, seed=self.seed
         )
-        job = JobSpec.model_construct(
-            instrument=self.instrument,
-            perturb=PerturbationSpec.of(self.perturb),
-            course=self.course,
-            disturbances=self.disturbances,
-            render=frames,
-            analysis=self.analysis,
-        )
+        shared = {key: getattr(self, key) for key in ("instrument", "course", "disturbances", "analysis")}
+        job = JobSpec.model_construct(perturb=PerturbationSpec.of(self.perturb), render=frames, **shared)
         return job.with_source(self.source)
 
     def check_nodes(self, nodes: Mapping[str, NodeInfo]) -> None:

@@ -40,11 +40,8 @@ Corner = tuple[Annotated[Number, Field(ge=-10.0, le=10.0)], Annotated[Number, Fi
 
 def _is_convex(outline: tuple[Corner, ...]) -> tuple[Corner, ...]:
     corners = np.array(outline, float)
-    if (
-        len(corners) < 3
-        or abs(area(corners)) < _SMALLEST
-        or abs(area(hull(corners[None]))[0]) > abs(area(corners)) * (1.0 + 1e-9)
-    ):
+    size = abs(area(corners)) if len(corners) >= 3 else 0.0
+    if size < _SMALLEST or abs(area(hull(corners[None]))[0]) > size * (1.0 + 1e-9):
         allowed = "three corners or more, in order, of a convex polygon; divide other shapes into several polygons"
         raise Problem("not a convex polygon", str([list(corner) for corner in outline]), allowed)
     return outline
@@ -145,9 +142,8 @@ class TerrainSpec(Spec):
     @model_validator(mode="after")
     def _fractal_has_relief(self) -> "TerrainSpec":
         if self.kind == "fractal" and self.relief is None:
-            raise Problem(
-                "a fractal terrain without relief", None, "the rms of its heights, '80 m'", within=("relief",)
-            )
+            allowed = "the rms of its heights, '80 m'"
+            raise Problem("a fractal terrain without relief", None, allowed, within=("relief",))
         return self
 
 

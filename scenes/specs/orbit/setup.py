@@ -56,13 +56,8 @@ def _line_detectors(camera: ThreeLineCameraSpec) -> FrozenMap[str, DetectorSpec]
     """Return reference of each image section of a payload -> data sheet of the line CCD."""
     sections: list[tuple[KeyPath, LineImageSpec | None]] = [(("image",), camera.image)]
     sections += [(("lines", name, "image"), line.image) for name, line in camera.lines.items()]
-    return FrozenMap(
-        {
-            image.detector: load.load_detector(image.detector, camera, (*key, "detector"))
-            for key, image in sections
-            if image is not None
-        }
-    )
+    used = [(key, image.detector) for key, image in sections if image is not None]
+    return FrozenMap({name: load.load_detector(name, camera, (*key, "detector")) for key, name in used})
 
 
 class AngleSetup(ExperimentSetup[OrbitAngleSpec]):
@@ -135,9 +130,8 @@ class AngleSetup(ExperimentSetup[OrbitAngleSpec]):
         test, lines = self.test, tuple(self.pixels)
         has = f"{names_text(lines)} in {self.camera_name}"
         if len(lines) < 2:
-            raise test.error(
-                "an angle needs two lines", ("camera",), found=has, allowed="a camera with two lines or more"
-            )
+            allowed = "a camera with two lines or more"
+            raise test.error("an angle needs two lines", ("camera",), found=has, allowed=allowed)
         angles = test.angles or usual_angles(lines)
         if angles is None:
             problem = "the lines of the angles are missing"
@@ -202,11 +196,9 @@ class CalibrationSetup(PayloadSetup[OrbitCalibrationSpec]):
         _require_known("line", test, ("drift",), test.drift, LINES)
         _require_movable(test, (*test.perturb, *test.drift), camera)
         if "nadir" in test.perturb and any(test.perturb["nadir"].principal_point):
-            raise test.error(
-                "the nadir line's principal point is the gauge",
-                ("perturb", "nadir", "principal_point"),
-                allowed="no change; rotate the whole camera instead, by errors.star_tracker.bias",
-            )
+            problem, key = "the nadir line's principal point is the gauge", ("perturb", "nadir", "principal_point")
+            allowed = "no change; rotate the whole camera instead, by errors.star_tracker.bias"
+            raise test.error(problem, key, allowed=allowed)
         fewest = min(camera.pixels_of(name) for name in LINES)
         if test.points is not None:
             _require_ends(test, "points", (test.points.first, test.points.last), fewest, f"the lines of {camera.name}")
@@ -218,6 +210,10 @@ class CalibrationSetup(PayloadSetup[OrbitCalibrationSpec]):
             key, pixels = ("images", "patches", k, "pixel"), camera.pixels_of("nadir")
             _require_pixel(test, key, patch.pixel, pixels, f"the nadir line of {camera.name}")
         return self
+
+
+_JOB_PARTS = ("instrument", "cameras", "detector", "disturbances")
+"""Contents of files that a test of monitoring shares with the job of its images."""
 
 
 class MonitorSetup(ExperimentSetup[OrbitMonitorSpec]):
@@ -249,7 +245,7 @@ class MonitorSetup(ExperimentSetup[OrbitMonitorSpec]):
     def parts(cls, test: OrbitMonitorSpec) -> dict[str, Any]:
         """Read the instrument with its cameras, data sheets and disturbances; return field -> content."""
         job = resolve_job(test.job)
-        parts = {key: getattr(job, key) for key in ("instrument", "cameras", "detector", "disturbances")}
+        parts = {key: getattr(job, key) for key in _JOB_PARTS}
         if test.mechanisms is not None and test.mechanisms.images is not None:
             sheets = {name: line_detector(camera) for name, camera in job.cameras.items()}
             parts["line_detectors"] = FrozenMap(sheets)
@@ -265,14 +261,8 @@ class MonitorSetup(ExperimentSetup[OrbitMonitorSpec]):
     @property
     def resolved(self) -> ResolvedJob:
         """Job of the monitor's images with the content of all files to which it refers."""
-        return ResolvedJob.model_construct(
-            job=self.test.job,
-            instrument=self.instrument,
-            cameras=self.cameras,
-            detector=self.detector,
-            line_detectors=None,
-            disturbances=self.disturbances,
-        )
+        parts = {key: getattr(self, key) for key in _JOB_PARTS}
+        return ResolvedJob.model_construct(job=self.test.job, line_detectors=None, **parts)
 
     @property
     def pair(self) -> tuple[str, str]:
@@ -548,10 +538,9 @@ def _require_rotations(test: OrbitAngleSpec, lines: tuple[str, ...]) -> None:
     for name, change in test.perturb.items():
         for action in change.needs():
             if action != "rotate":
+                problem, key = f"a payload's line does not allow {action}", ("perturb", name, action)
                 allowed = "a rotation, or an instrument of traced cameras instead of a payload"
-                raise test.error(
-                    f"a payload's line does not allow {action}", ("perturb", name, action), allowed=allowed
-                )
+                raise test.error(problem, key, allowed=allowed)
         if change.pivot != DEFAULT_PIVOT:
             problem = "a payload's line has no pivots"
             raise test.error(problem, ("perturb", name, "pivot"), found=change.pivot, allowed="no pivot")

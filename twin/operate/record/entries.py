@@ -15,7 +15,7 @@ import numpy as np
 from scenes.specs.resolved import ResolvedJob
 from scenes.yaml.errors import InputError, Issue, Problem
 from twin.orbit.flight.earth import DAY
-from twin.orbit.measured.clock import Readings, calendar, single_reading, tai_minus_utc
+from twin.orbit.measured.earth_orientation import Readings, calendar, single_reading, tai_minus_utc
 
 EPOCH_DAY = 51544
 """Modified Julian day of 2000-01-01; times count from its beginning in TAI."""

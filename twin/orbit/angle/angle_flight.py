@@ -30,12 +30,18 @@ from scenes.specs.perturbation import perturbation_issues
 from scenes.yaml.errors import InputError
 from twin.framework.procedure import BenchError
 from twin.monitor.truth import trace_truth
-from twin.orbit.flight import light_effects
 from twin.orbit.flight.earth import Earth, east_north_up
-from twin.orbit.flight.light_effects import NO_EFFECTS, LightEffects
 from twin.orbit.flight.line_camera import LineAngles, LineCamera, line_cameras, line_normal, traced_line_cameras
 from twin.orbit.flight.orbit import propagate
-from twin.orbit.flight.sensor import Sensor
+from twin.orbit.flight.sensor import (
+    NO_EFFECTS,
+    SPEED_OF_LIGHT,
+    LightEffects,
+    Sensor,
+    aberrated,
+    rotated_with_earth,
+    unrefracted,
+)
 from twin.orbit.flight.trajectory import Trajectory
 
 if TYPE_CHECKING:
@@ -509,13 +515,13 @@ def without_effects(
         Corrected points, ITRS, in metres, at unchanged distances from the satellite.
     """
     source = points
-    delay = np.linalg.norm(source - station, axis=-1) / light_effects.SPEED_OF_LIGHT * effects.light_time
-    position = light_effects.rotated_with_earth(np.broadcast_to(station, source.shape), delay)
+    delay = np.linalg.norm(source - station, axis=-1) / SPEED_OF_LIGHT * effects.light_time
+    position = rotated_with_earth(np.broadcast_to(station, source.shape), delay)
     if effects.refraction:
-        source = light_effects.unrefracted(source, position, earth, effects.wavelength)
-    arm = light_effects.rotated_with_earth(source - position, -delay)
+        source = unrefracted(source, position, earth, effects.wavelength)
+    arm = rotated_with_earth(source - position, -delay)
     if effects.aberration:
-        arm = light_effects.aberrated(arm / np.linalg.norm(arm, axis=-1, keepdims=True), velocity)
+        arm = aberrated(arm / np.linalg.norm(arm, axis=-1, keepdims=True), velocity)
         arm = arm * np.linalg.norm(points - station, axis=-1, keepdims=True)
     return np.asarray(station + arm)
 

@@ -22,7 +22,7 @@ from twin.framework import svg
 from twin.framework.artefact import FAR, Cell, SvgFigure, Table, fixed
 from twin.framework.report import Report, Section, answer
 from twin.orbit.angle.angle_run import UNLIKELY, AngleRun, PassAngles, Scatter, SimulatedAngleRun, values_of
-from twin.orbit.flight.light_effects import SPEED_OF_LIGHT, LightEffects
+from twin.orbit.flight.sensor import SPEED_OF_LIGHT, LightEffects
 
 METHOD_NAMES = {
     "printed": "planes, eq. 5 as printed",
@@ -102,9 +102,8 @@ def _simulated_verdict(run: SimulatedAngleRun) -> tuple[list[str], tuple[str, ..
         (name, true), change = next(iter(flight.trace.items())), run.change / ARCSEC
         at = run.names.index(name)
         lead.append(
-            f"By the ground points, {names[at]} has changed by {fixed(change[at], 2)} ± "
-            f"{along.sigma[at] / ARCSEC:.2f} arcsec since the laboratory; the ray trace of the instrument gives "
-            f"{fixed(true / ARCSEC, 3)} arcsec."
+            f"By the ground points, {names[at]} has changed by {fixed(change[at], 2)} ± {along.sigma[at] / ARCSEC:.2f} "
+            f"arcsec since the laboratory; the ray trace of the instrument gives {fixed(true / ARCSEC, 3)} arcsec."
         )
     with np.errstate(divide="ignore", invalid="ignore"):
         worst = float(np.nanmax(np.abs(error) / sigma)) if np.any(sigma > 0.0) else None

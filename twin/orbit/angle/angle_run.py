@@ -41,8 +41,8 @@ from optics.numerics.backend import one_blas_thread
 from twin.framework.procedure import Advance, BenchError, silent
 from twin.framework.record import Quantity, Record
 from twin.orbit.angle.angle_flight import AnglePass, Measurement, angle_camera, fly
-from twin.orbit.flight.light_effects import NO_EFFECTS, LightEffects
 from twin.orbit.flight.line_camera import LineAngles
+from twin.orbit.flight.sensor import NO_EFFECTS, LightEffects
 
 if TYPE_CHECKING:
     from optics.numerics.backend import Backend
@@ -375,15 +375,9 @@ def run_angle(setup: AngleSetup, backend: Backend | None, seed: int, advance: Ad
         first, third = Scatter.of(planes, flight.dihedral), Scatter.of(alongs, flight.along_track)
         second = Scatter.of(resections, flight.along_track)
         common = reduce_to_station(measurement, estimate.resection)
-        result = PassAngles(
-            "pass 1",
-            flight.spec.time,
-            flight.before_launch,
-            {name: np.array([f"point {k + 1}" for k in range(len(p))]) for name, p in flight.pixel.items()},
-            dict.fromkeys(flight.lines, (0.0, 0.0)),
-            measurement,
-            estimate,
-        )
+        ids = {name: np.array([f"point {k + 1}" for k in range(len(p))]) for name, p in flight.pixel.items()}
+        points = flight.before_launch, ids, dict.fromkeys(flight.lines, (0.0, 0.0))
+        result = PassAngles("pass 1", flight.spec.time, *points, measurement, estimate)
         difference = np.where(narrow(flight), third.values - second.values, first.values - np.abs(second.values))
         return SimulatedAngleRun(
             setup=setup,
@@ -445,9 +439,7 @@ def reduce_to_station(measurement: Measurement, section: Resection) -> Measureme
     for name, offset in measurement.offset.items():
         if np.any(offset):
             strips[name] = Strip(strips[name].points - offset @ section.axes(name).T, strips[name].covariance)
-    return replace(
-        measurement, strips=strips, offset={name: np.zeros_like(v) for name, v in measurement.offset.items()}
-    )
+    return replace(measurement, strips=strips, offset={n: np.zeros_like(v) for n, v in measurement.offset.items()})
 
 
 def tls_angles(common: Measurement) -> PlaneAngles:

@@ -31,10 +31,9 @@ from twin.framework.procedure import Advance, BenchError, silent
 from twin.orbit.angle.angle_flight import LEAST_SIGMA, Measurement, without_effects
 from twin.orbit.angle.angle_run import AngleRun, PassAngles, SimulatedAngleRun, estimate_angles, run_angle
 from twin.orbit.flight.earth import Earth
-from twin.orbit.flight.light_effects import EARTH_RATE, NO_EFFECTS, LightEffects
 from twin.orbit.flight.line_camera import LineAngles, LineCamera, LineTimes, line_cameras
 from twin.orbit.flight.platform_table import PlatformTable, TabulatedTrajectory
-from twin.orbit.flight.sensor import Sensor
+from twin.orbit.flight.sensor import EARTH_RATE, NO_EFFECTS, LightEffects, Sensor
 from twin.orbit.measured.measurement_tables import CAMERA_FILE, campaign_files, read_measurements
 from twin.orbit.measured.pass_measurements import GroundPoints, ImagePoints, PassMeasurements
 
@@ -129,15 +128,9 @@ def _measured_angles(setup: MeasuredAngleSetup, measured: PassMeasurements) -> P
     noise = test.errors.gps
     sigma = float(np.sqrt(np.mean(np.square(noise.noise)) + np.mean(np.square(noise.drift))))
     measurement = Measurement.of(laboratory, Station.of(path.position(moment), sigma), strips)
-    return PassAngles(
-        measured.name,
-        moment,
-        laboratory,
-        FrozenMap({name: measured.ground.ids[points[name].point] for name in used}),
-        FrozenMap({k: (float(np.min(t) - moment), float(np.max(t) - moment)) for k, t in seconds.items()}),
-        measurement,
-        estimate_angles(measurement),
-    )
+    ids = FrozenMap({name: measured.ground.ids[points[name].point] for name in used})
+    span = FrozenMap({k: (float(np.min(t) - moment), float(np.max(t) - moment)) for k, t in seconds.items()})
+    return PassAngles(measured.name, moment, laboratory, ids, span, measurement, estimate_angles(measurement))
 
 
 def _pairs(
@@ -184,16 +177,9 @@ def _strip(
     sensor = Sensor.of_lines(camera, path, earth, times, NO_EFFECTS)
     height = earth.geodetic(ground)[2]
     last = (sensor.lines - 1.0, sensor.camera.pixels - 1.0)
-    low = [np.clip(v, 0.0, end) - 0.25 for v, end in zip((points.line, points.pixel), last, strict=True)]
-    slopes = [
-        2.0
-        * (
-            sensor.ground(low[0] + 0.5 * (k == 0), low[1] + 0.5 * (k == 1), height)
-            - sensor.ground(low[0], low[1], height)
-        )
-        for k in (0, 1)
-    ]
-    slope = np.stack(slopes, axis=-1)
+    line, pixel = (np.clip(v, 0.0, end) - 0.25 for v, end in zip((points.line, points.pixel), last, strict=True))
+    ends = (sensor.ground(line + 0.5 * (k == 0), pixel + 0.5 * (k == 1), height) for k in (0, 1))
+    slope = 2.0 * (np.stack(list(ends), axis=-1) - sensor.ground(line, pixel, height)[..., None])
     spread = spread + slope @ points.covariance @ np.swapaxes(slope, 1, 2)
     spread = spread + LEAST_SIGMA**2 * np.eye(3)
     square = np.sum(arm**2, axis=1)[:, None, None] * np.eye(3) - arm[:, :, None] * arm[:, None, :]

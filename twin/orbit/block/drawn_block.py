@@ -35,10 +35,9 @@ from twin.orbit.block.measured_block import (
 )
 from twin.orbit.calibration.campaign import PassData, line_model, pass_data, passing_orbit
 from twin.orbit.flight.earth import Earth, east_north_up
-from twin.orbit.flight.light_effects import NO_EFFECTS
 from twin.orbit.flight.line_camera import LineTimes, drifted_payload, line_cameras
 from twin.orbit.flight.orbit import propagate
-from twin.orbit.flight.sensor import Platform, Sensor
+from twin.orbit.flight.sensor import NO_EFFECTS, Platform, Sensor
 from twin.orbit.flight.trajectory import Attitude, Trajectory
 from twin.orbit.measured.pass_measurements import ImagePoints, point_names
 

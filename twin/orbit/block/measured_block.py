@@ -22,10 +22,10 @@ from scenes.specs.orbit.adjust import CameraChangeSpec, LawSpec
 from scenes.specs.orbit.calibration import CameraDriftSpec, MonitorReadingSpec
 from scenes.specs.orbit.setup import MeasuredAdjustSetup
 from twin.framework.procedure import Advance, BenchError, silent
-from twin.orbit.calibration.campaign import light_effects, line_model, pass_data
+from twin.orbit.calibration.campaign import line_model, pass_data
 from twin.orbit.flight.earth import Earth, tai_of
-from twin.orbit.flight.light_effects import NO_EFFECTS
 from twin.orbit.flight.platform_table import TabulatedTrajectory
+from twin.orbit.flight.sensor import NO_EFFECTS, LightEffects
 from twin.orbit.measured.measurement_tables import read_measurements
 from twin.orbit.measured.pass_measurements import PassMeasurements
 
@@ -136,7 +136,7 @@ def measured_block(
     points = _first_coordinates(points, raw, models, number)
     earth = Earth()
     height = earth.geodetic(points.start)[2]
-    removed = light_effects(spec.effects) if spec.effects.corrected else NO_EFFECTS
+    removed = LightEffects.of(spec.effects) if spec.effects.corrected else NO_EFFECTS
     scenes = []
     for measured in passes:
         rays_of_pass = {line: raw[f"{measured.name}/{line}"] for line in measured.images}

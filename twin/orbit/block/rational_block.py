@@ -18,8 +18,7 @@ from analysis.arrays import Array
 from analysis.block import block as model
 from analysis.block.block_adjustment import BlockAdjustment, intersected
 from analysis.block.error_processes import BlockError
-from analysis.orbit.image_correction import coefficient_rows
-from analysis.orbit.rational_polynomial import RationalPolynomial
+from analysis.orbit.rational_polynomial import RationalPolynomial, coefficient_rows
 from optics.numerics.number_tree import FrozenMap
 from scenes.specs.orbit.rational import RationalAdjustSpec, RationalImageSpec
 from scenes.specs.orbit.setup import RationalAdjustSetup

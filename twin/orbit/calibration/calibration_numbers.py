@@ -14,33 +14,22 @@ from analysis.orbit.calibration_parameters import OFFSET, RATE, Combination
 from analysis.orbit.forward_intersection import CheckErrors
 from analysis.orbit.three_line_model import BIAS
 from twin.framework.record import Quantity, Record
+from twin.orbit.calibration import schemes
 from twin.orbit.calibration.calibration_run import CalibrationRun, FieldResult, Unknown, unit, unknowns
 from twin.orbit.calibration.campaign import Campaign, FieldImages, FieldPass, Screening, interior_names
-from twin.orbit.calibration.campaign_adjustment import LatitudeFit
+from twin.orbit.calibration.campaign_adjustment import LatitudeFit, ground_sample, intersection_fit
 from twin.orbit.calibration.influences import AttitudeDrift, ChipStep, DatumRow, LightRow, UnexpectedChange
-from twin.orbit.calibration.schemes import (
-    DriftSize,
-    FieldErrors,
-    Monitoring,
-    Repeatability,
-    Repeats,
-    SchemeMeans,
-    Strips,
-    Treatment,
-    meets,
-)
-from twin.orbit.calibration.screening import ground_sample, intersection_fit
 from twin.orbit.images.patch import LineComparison
 from twin.orbit.images.simulate_run import MATCH_COUNTS
 
 # --- errors at check points, by scheme -------------------------------------------------------------------
 
-ERRORS: Record[CheckErrors | FieldErrors] = Record(
+ERRORS: Record[CheckErrors | schemes.FieldErrors] = Record(
     "RMS errors at check points, in metres.",
     Quantity("plan_rms_m", lambda e: e.plan_rms, "RMS error in plan, east and north together"),
     Quantity("height_rms_m", lambda e: e.height_rms, "RMS error in height"),
 )
-MEANS: Record[SchemeMeans] = Record(
+MEANS: Record[schemes.SchemeMeans] = Record(
     "RMS errors over the fields, for each scheme of averaged parameters.",
     Quantity("plan_mean_m", lambda means: means.plan, "mean over the fields in plan"),
     Quantity("plan_spread_m", lambda means: means.plan_spread, "standard deviation over the fields in plan"),
@@ -57,7 +46,7 @@ REPEATED: Record[tuple[Array, Array, float]] = Record(
 )
 
 
-def _repeats(run: CalibrationRun) -> Repeats:
+def _repeats(run: CalibrationRun) -> schemes.Repeats:
     assert run.repeats is not None
     return run.repeats
 
@@ -73,20 +62,20 @@ CAMPAIGNS: Record[CalibrationRun] = Record(
     Quantity("count", lambda run: len(_repeats(run).plan), "number of campaigns"),
     Quantity("schemes", _repeated, "errors by scheme", record=REPEATED),
 )
-TREATMENT: Record[Treatment] = Record(
+TREATMENT: Record[schemes.Treatment] = Record(
     "Errors of drifting cameras, adjusted with the monitor's readings or without.",
     Quantity("all_fields", lambda t: t.together, "errors with all fields adjusted at once", record=ERRORS),
     Quantity("p_value", lambda t: t.p_value, "probability of a chi-square at least as large in that adjustment"),
     Quantity("schemes", lambda t: t.schemes, "errors without ground control, by scheme", record=ERRORS),
 )
-CAMERA_DRIFT: Record[tuple[Monitoring, DriftSize]] = Record(
+CAMERA_DRIFT: Record[tuple[schemes.Monitoring, schemes.DriftSize]] = Record(
     "Errors for one size of the cameras' drift from field to field.",
     Quantity("factor", lambda d: d[1].factor, "size of the drift relative to that of the file"),
     Quantity("d_alpha_rad_sigma", lambda d: d[1].factor * d[0].angle, "standard deviation of Δα of an outer line"),
     Quantity("without_monitor", lambda d: d[1].without, "adjusted as if no camera drifted", record=TREATMENT),
     Quantity("with_monitor", lambda d: d[1].monitored, "adjusted with the monitor's readings", record=TREATMENT),
 )
-MONITORING: Record[Monitoring] = Record(
+MONITORING: Record[schemes.Monitoring] = Record(
     "Cameras that drift from field to field, with and without the on-board monitor.",
     Quantity("d_alpha_rad_sigma", lambda m: m.angle, "standard deviation of Δα of an outer line in the file"),
     Quantity("height_for_1_arcsec_m", lambda m: m.metres, "height change for 1 arcsec of Δα of the forward line"),
@@ -95,8 +84,8 @@ MONITORING: Record[Monitoring] = Record(
 )
 TIES: Record[tuple[Mapping[str, CheckErrors], Mapping[str, CheckErrors]]] = Record(
     "Errors of a scheme without and with tie points, over the check points of all fields.",
-    Quantity("without_ties", lambda e: FieldErrors.pooled(e[0].values()), record=ERRORS),
-    Quantity("with_ties", lambda e: FieldErrors.pooled(e[1].values()), record=ERRORS),
+    Quantity("without_ties", lambda e: schemes.FieldErrors.pooled(e[0].values()), record=ERRORS),
+    Quantity("with_ties", lambda e: schemes.FieldErrors.pooled(e[1].values()), record=ERRORS),
 )
 DATUM_SIGMA: Record[Datum] = Record(
     "Uncertainty of a rotation of the whole pass.",
@@ -106,7 +95,7 @@ DATUM_SIGMA: Record[Datum] = Record(
 )
 
 
-def _strips(run: CalibrationRun) -> Strips:
+def _strips(run: CalibrationRun) -> schemes.Strips:
     assert run.strips is not None
     return run.strips
 
@@ -115,9 +104,7 @@ STRIPS: Record[CalibrationRun] = Record(
     "Passes adjusted on tie points.",
     Quantity("ties", lambda run: _strips(run).ties, "number of tie points that two lines or more see, by field"),
     Quantity("p_value", lambda run: _strips(run).p_values, "probability of a chi-square at least as large, by field"),
-    Quantity(
-        "schemes", lambda run: {k: (run.schemes[k], tied) for k, tied in _strips(run).schemes.items()}, record=TIES
-    ),
+    Quantity("schemes", lambda r: {k: (r.schemes[k], tied) for k, tied in _strips(r).schemes.items()}, record=TIES),
     Quantity("datum", lambda run: {d.name: d for d in _strips(run).datum}, record=DATUM_SIGMA),
 )
 MAP_LIMITS: Record[CalibrationRun] = Record(
@@ -127,9 +114,11 @@ MAP_LIMITS: Record[CalibrationRun] = Record(
     Quantity("height_limit_m", lambda run: run.setup.test.limits.height, "largest RMS error in height"),
     Quantity("source", lambda run: "of the file", "source of the limits"),
     Quantity(
-        "before", lambda run: meets(run.before, run.setup.test.limits), "true if the laboratory's camera meets it"
+        "before",
+        lambda run: schemes.meets(run.before, run.setup.test.limits),
+        "true if the laboratory's camera meets it",
     ),
-    Quantity("schemes", lambda run: {k: meets(e, run.setup.test.limits) for k, e in run.schemes.items()}),
+    Quantity("schemes", lambda run: {k: schemes.meets(e, run.setup.test.limits) for k, e in run.schemes.items()}),
 )
 
 # --- points measured in images ---------------------------------------------------------------------------
@@ -451,7 +440,7 @@ LATITUDE: Record[LatitudeFit] = Record(
     Quantity("degrees_of_freedom", lambda fit: fit.degrees_of_freedom, "degrees of freedom of this chi-square"),
     Quantity("p_value", lambda fit: fit.p_value, "probability of a chi-square at least as large by latitude alone"),
 )
-REPEATABILITY: Record[Repeatability] = Record(
+REPEATABILITY: Record[schemes.Repeatability] = Record(
     "Scatter of a parameter from field to field.",
     Quantity("name", lambda r: r.name, "name of the parameter"),
     Quantity("unit", lambda r: unit(r.name), "unit of scatter and sigma"),

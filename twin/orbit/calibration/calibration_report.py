@@ -1,28 +1,35 @@
-"""Report of an in-orbit calibration: verdict, lead, facts and warnings."""
+"""Report of an in-orbit calibration: verdict, lead, facts, warnings, and errors by scheme of averaged parameters."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Mapping
+from dataclasses import astuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from matplotlib.figure import Figure
 
 from analysis.arrays import ARCSEC
 from scenes.specs.orbit.setup import MeasuredCalibrationSetup
 from scenes.yaml.units import ANGLE, LENGTH, format_quantity
-from twin.framework.artefact import decimals_for
-from twin.framework.report import Report, answer
-from twin.orbit.calibration import calibration_sections
-from twin.orbit.calibration.calibration_numbers import CALIBRATION
+from twin.framework import svg
+from twin.framework.artefact import Cell, PngFigure, Table, decimals_for
+from twin.framework.report import Report, Section, answer
+from twin.orbit.calibration.calibration_numbers import CALIBRATION, MATCHING, SCREENED
 from twin.orbit.calibration.calibration_run import CalibrationRun, unit
-from twin.orbit.calibration.campaign import any_effect, light_effects
+from twin.orbit.calibration.calibration_sections import Rows, adjustment_sections, figure_of, prior_dominated
+from twin.orbit.calibration.campaign_adjustment import ground_sample, intersection_fit
 from twin.orbit.calibration.influences import UNEXPECTED_SIGMAS, drift_warnings, step_warnings
-from twin.orbit.calibration.schemes import meets, values_of
-from twin.orbit.calibration.screening import intersection_fit
-from twin.orbit.images.simulate_report import changes_text
+from twin.orbit.calibration.schemes import RMS, FieldErrors, Monitoring, SchemeMeans, meets, values_of
+from twin.orbit.flight.sensor import LightEffects
+from twin.orbit.images.image_points import UNMODELLED_SIGMA
+from twin.orbit.images.patch import WRONG
+from twin.orbit.images.simulate_report import SORTS, changes_text, points_png
 from twin.orbit.measured.pass_measurements import duplicates, listed
 
 if TYPE_CHECKING:
     from scenes.specs.orbit.setup import CalibrationSetup
+
 
 _FEW = 30
 """Smallest number of degrees of freedom of the check points' intersections at which a small p-value raises a warning.
@@ -33,6 +40,8 @@ _WIDE = 2.0
 """Ratio of the residuals of a line's image points to their sigmas above which there is a warning."""
 _MANY = 0.1
 """Share of rejected image points above which there is a warning."""
+COLOURS = (svg.BLUE, svg.ORANGE, svg.GREEN, svg.VERMILION, svg.PURPLE, svg.SKY, svg.GREY)
+MARKERS = "osD^vP"
 
 
 def calibration_report(run: CalibrationRun) -> Report:
@@ -49,29 +58,40 @@ def calibration_report(run: CalibrationRun) -> Report:
     before = decimals_for(min(plan, height), 3)
     without = "" if not (worse and meets(run.before, limits)) else ", as the laboratory's parameters alone do"
     verdict, more = answer(
-        f"Calibration makes the errors at check points {how}: from {plan:.{before}f} m in plan and "
-        f"{height:.{before}f} m in height to {after[0]:.2f} m and {after[1]:.2f} m "
-        f"(scheme {scheme}, mean of the fields' RMS)",
+        f"Calibration makes the errors at check points {how}: from {plan:.{before}f} m in plan and {height:.{before}f} "
+        f"m in height to {after[0]:.2f} m and {after[1]:.2f} m (scheme {scheme}, mean of the fields' RMS)",
         f"{('schemes ' if len(good) > 1 else 'scheme ') + ', '.join(good) if good else 'no scheme'} "
         f"{'meet' if len(good) > 1 else 'meets'} the limits of {limits.plan:g} m in plan and {limits.height:g} m in "
         f"height, assumed for 1:50 000, in every field{without}: see the table of schemes",
     )
     lead = (
         *more,
-        calibration_sections.scheme_summary(run.scheme_means),
-        *(() if run.monitoring is None else (calibration_sections.monitor_gain(run),)),
-        *(() if run.strips is None else (calibration_sections.strip_gain(run),)),
+        scheme_summary(run.scheme_means),
+        *(() if run.monitoring is None else (monitor_gain(run),)),
+        *(() if run.strips is None else (strip_gain(run),)),
     )
     return Report(
         "Calibration in orbit over test fields",
         verdict,
         lead,
         _measured_facts(setup, run) if isinstance(setup, MeasuredCalibrationSetup) else _facts(setup),
-        calibration_sections.summary(run),
-        calibration_sections.sections(run, CALIBRATION(run)),
+        summary(run),
+        _sections(run, CALIBRATION(run)),
         warnings=_warnings(run),
         unmet=not good,
     )
+
+
+def _sections(run: CalibrationRun, data: Mapping[str, Any]) -> tuple[Section, ...]:
+    candidates = (
+        _schemes(run),
+        None if run.repeats is None else _repeats(run),
+        _measured(run) if run.truth is None else None,
+        None if run.campaign.images is None else _images(run, data["images"]),
+        None if run.monitoring is None else _monitoring(run),
+        None if run.strips is None else _strips(run),
+    )
+    return *(section for section in candidates if section is not None), *adjustment_sections(run, data)
 
 
 def _facts(setup: CalibrationSetup) -> tuple[tuple[str, str], ...]:
@@ -105,10 +125,12 @@ def _points(setup: CalibrationSetup) -> str:
 
 def _light(setup: CalibrationSetup) -> str:
     effects = setup.test.effects
-    if not any_effect(light_effects(effects)):
-        return "none"
-    on = [name.replace("_", " ") for name in ("light_time", "aberration", "refraction") if getattr(effects, name)]
-    return f"{', '.join(on)}; {'corrected' if effects.corrected else 'not corrected'} in the image points"
+    on = LightEffects.of(effects).names
+    return (
+        f"{', '.join(on)}; {'corrected' if effects.corrected else 'not corrected'} in the image points"
+        if on
+        else "none"
+    )
 
 
 def _warnings(run: CalibrationRun) -> tuple[str, ...]:
@@ -127,12 +149,12 @@ def _warnings(run: CalibrationRun) -> tuple[str, ...]:
         )
     assumptions += drift_warnings(run.campaign, run.drift)
     assumptions += step_warnings(run.chip_steps)
-    if resting := calibration_sections.prior_dominated(adjustment):
+    if resting := prior_dominated(adjustment):
         assumptions.append(
             f"{', '.join(resting)}: determined by the priors launch.bias and launch.interior, not by the points; the "
             "sigmas are only as good as these priors. More points, or a longer and wider field, would determine them"
         )
-    if any_effect(run.campaign.effects) and not spec.effects.corrected:
+    if run.campaign.effects.names and not spec.effects.corrected:
         assumptions.append(
             "light time, aberration and refraction are left in the image points; the parameters absorb them"
         )
@@ -153,7 +175,7 @@ def _measured_facts(setup: MeasuredCalibrationSetup, run: CalibrationRun) -> tup
         quaternion = f"scalar {conventions.quaternion.scalar}, {direction}, body {', '.join(conventions.body_axes)}"
     paths = {flight.measured.interpolation for flight in run.campaign.passes}
     joined = {"spline": "cubic splines", "lagrange": "Lagrange polynomials of ten readings"}
-    light = "none" if not any_effect(run.campaign.effects) else f"{'' if test.effects.corrected else 'not '}corrected"
+    light = "none" if not run.campaign.effects.names else f"{'' if test.effects.corrected else 'not '}corrected"
     held = " and ".join(run.together.gauge.held)
     return (
         ("Camera", f"{setup.camera.name}, {setup.camera.description}"),
@@ -212,3 +234,483 @@ def _measured_warnings(run: CalibrationRun) -> list[str]:
                 "errors"
             )
     return warnings
+
+
+def scheme_names(run: CalibrationRun) -> list[str]:
+    """Return the names of the schemes, each a list of fields whose parameters are averaged; the last averages none."""
+    names = [f"{k + 1}: {', '.join(s)}" for k, s in enumerate(run.campaign.spec.schemes)]
+    return [*names, f"{len(names) + 1}: each field its own"]
+
+
+def summary(run: CalibrationRun) -> Table:
+    """Return the table of the schemes' errors at the check points of all fields."""
+    rows: Rows = []
+    for name, errors in zip(["laboratory", *scheme_names(run)], (run.before, *run.schemes.values()), strict=True):
+        values = [values_of(errors, what) for what in RMS]
+        numbers = [float(v) for rms in values for v in (rms.mean(), rms.std(), rms.max())]
+        rows.append((name, *numbers, "yes" if meets(errors, run.campaign.spec.limits) else "no"))
+    return Table(
+        "schemes",
+        "Schemes of parameters, tested on all fields without ground control",
+        "RMS at check points, metres: mean, standard deviation and largest of the fields.",
+        ("parameters", "plan [m]", "spread", "largest", "height [m]", "spread", "largest", "meets 1:50 000"),
+        rows,
+        (None, 2, 2, 2, 2, 2, 2, None),
+    )
+
+
+def scheme_summary(means: SchemeMeans | None) -> str:
+    """Return a sentence on how averaging the parameters of several fields changes the errors in plan and height."""
+    if means is None:
+        return "There is only one scheme of averaged parameters, so schemes are not compared."
+    plan, spread, height = means.plan, means.plan_spread, means.height
+    return (
+        f"From the first to the last scheme of averaged parameters, the mean RMS in plan changes from {plan[0]:.2f} m "
+        f"to {plan[-1]:.2f} m and its spread over the fields from {spread[0]:.2f} m to {spread[-1]:.2f} m; the mean "
+        f"RMS in height changes from {height[0]:.2f} m to {height[-1]:.2f} m, by "
+        f"{100.0 * means.height_change:.1f}% at most between any two schemes."
+    )
+
+
+def _schemes(run: CalibrationRun) -> Section:
+    columns = {"laboratory": run.before} | {f"scheme {name}": errors for name, errors in run.schemes.items()}
+    tables = [
+        Table(
+            what.removesuffix("_rms"),
+            f"RMS in {what.removesuffix('_rms')} at check points without ground control, metres",
+            "",
+            ("field", *columns),
+            [(name, *(getattr(errors[name], what) for errors in columns.values())) for name in run.before],
+            (None, *(2,) * len(columns)),
+        )
+        for what in RMS
+    ]
+    text = (
+        f"Every field is calibrated by itself (three attitude biases and {len(run.campaign.inner)} elements of the "
+        f"interior orientation, of which two are held). Each scheme uses the mean of the parameters of its "
+        f"fields: {'; '.join(scheme_names(run))}.",
+        scheme_summary(run.scheme_means),
+    )
+    check = "Arrows: errors in plan; colours: errors in height. Before calibration and with the field's own parameters."
+    title = f"Errors at check points of {run.campaign.passes[0].name}"
+    figures = (
+        figure_of(
+            run, _schemes_figure, "schemes-of-fields", "Schemes", "RMS errors at check points; each line is a field."
+        ),
+        figure_of(run, _check_figure, "check-points", title, check),
+    )
+    return Section("Schemes of averaged parameters", text, (figures[0], *tables, figures[1]))
+
+
+def _repeats(run: CalibrationRun) -> Section:
+    assert run.repeats is not None
+    limits, count = run.campaign.spec.limits, len(run.repeats.plan)
+    met = run.repeats.met(limits.plan, limits.height)
+    rows: Rows = []
+    for k, name in enumerate(scheme_names(run)):
+        cells: list[Cell] = [name]
+        for values in (run.repeats.plan[:, k], run.repeats.height[:, k]):
+            mean = values.mean(axis=1)
+            cells += [float(mean.mean()), float(mean.std(ddof=1)) if count > 1 else None]
+            cells += [float(values.std(axis=1).mean())]
+        rows.append((*cells, f"{100.0 * met[k]:.0f}%"))
+    heads = [head for what in ("plan", "height") for head in (f"{what} [m]", "± campaign", "spread of fields")]
+    table = Table(
+        "campaigns",
+        f"{count} campaigns over the same fields",
+        "RMS at check points, metres: mean of the fields, averaged over the campaigns, with its standard deviation "
+        "from campaign to campaign; spread over the fields; share of campaigns in which every field meets 1:50 000. "
+        "Biases, orbits, points and noise are drawn anew; the camera, the fields and the drift with latitude are the "
+        "same.",
+        ("parameters", *heads, "1:50 000"),
+        rows,
+        (None, 2, 2, 2, 2, 2, 2, None),
+    )
+    return Section("Other campaigns", (), (table,))
+
+
+def _measured(run: CalibrationRun) -> Section:
+    campaign = run.campaign
+    rows: Rows = []
+    sizes: Rows = []
+    for flight in campaign.passes:
+        rejected, alone = campaign.rejected.get(flight.name), run.fields[flight.name].adjustment
+        fit, errors = intersection_fit(campaign, flight, alone), list(run.schemes.values())[-1][flight.name]
+        factors = {} if rejected is None else {line: f"{factor:.2f}" for line, factor in rejected.factors.items()}
+        alike = len(set(factors.values())) == 1
+        factor = factors.popitem()[1] if alike else ", ".join(f"{line} {v}" for line, v in factors.items())
+        lost = (None, None, None) if rejected is None else (len(rejected.points), len(rejected.check_points), factor)
+        points = (int(flight.is_control.sum()), flight.tie_count, len(flight.check_ground))
+        ratio, check = (v.chi_square / max(v.degrees_of_freedom, 1) for v in (alone, fit))
+        rows.append((flight.name, *points, *lost, ratio, alone.p_value, check))
+        for line in flight.data.sensors:
+            along, across = ground_sample(flight, line)
+            pixel = float(np.sqrt(along * across))
+            both = errors.plan_rms / pixel, errors.height_rms / pixel
+            sizes.append((flight.name, line, along, across, *both, errors.count))
+    heads = ("image points rejected", "check rejected", "factor", "χ²/dof", "p", "check χ²/dof")
+    tables = (
+        Table(
+            "measured-points",
+            "Points of every pass",
+            "Rejected: image points by robust weights, and check points whose rays do not intersect. Factor: applied "
+            "to the given sigmas of image points by line, from the remaining residuals. Chi-square over its degrees of "
+            "freedom: of the pass adjusted by itself, and of the rays of its check points with these parameters.",
+            ("pass", "control", "ties", "check", *heads),
+            rows,
+            (None, None, None, None, None, None, None, 2, 3, 2),
+        ),
+        Table(
+            "measured-pixels",
+            "Ground sample distance, and errors of check points in ground pixels",
+            "Ground sample distance of the middle of each line, metres; RMS errors of the check points with the pass's "
+            "own parameters, in ground pixels (geometric mean of along and across).",
+            ("pass", "line", "along the track [m]", "across [m]", "plan [px]", "height [px]", "check points"),
+            sizes,
+            (None, None, 3, 3, 2, 2, None),
+        ),
+    )
+    none = () if campaign.rejected else ("No image point was rejected: the file has `screening: none`.",)
+    return Section("Measurements", (*none, _limits(run)), tables)
+
+
+def _limits(run: CalibrationRun) -> str:
+    noise, flight = run.campaign.noise, run.campaign.passes[0]
+    ground = flight.altitude / float(np.mean([m.interior[0] for m in run.campaign.laboratory.values()]))
+    control = np.trace(flight.control_covariance[flight.is_control], axis1=1, axis2=2)
+    # white noise of the readings by their spline, in metres on the ground, beside that of the image
+    parts = {
+        "image points": noise.image * ground,
+        "readings of the attitude": noise.attitude * flight.altitude,
+        "slow errors of the attitude": noise.slow_attitude * flight.altitude,
+        "readings of the orbit": noise.station,
+        "control points": float(np.sqrt(np.mean(control / 3.0))),
+    }
+    texts = ", ".join(f"{name} {value:.2g} m" for name, value in sorted(parts.items(), key=lambda v: -v[1]) if value)
+    return (
+        f"Error budget on the ground at nadir (1σ) of a single ray to a single point of {flight.name}: {texts}. The "
+        "largest of these errors limits the accuracy. More points reduce all of them but slow errors of the attitude."
+    )
+
+
+def _images(run: CalibrationRun, data: Mapping[str, Any]) -> Section:
+    campaign, total, spec = run.campaign, data["total"], run.campaign.simulated.images
+    assert campaign.images is not None
+    assert spec is not None
+    screened = SCREENED.table(
+        "image-points",
+        "Image points in the adjustment",
+        "Points that every line sees, before and after screening by robust weights (IGG) and, for check points, by the "
+        "intersection of their rays.",
+        {images.name: SCREENED(images.screening) for images in campaign.images if images.screening is not None},
+        label="field",
+    )
+    judgements = {
+        f"{field}, {SORTS[sort]}, {line}": numbers
+        for field, sorts in data["fields"].items()
+        for sort, lines in sorts.items()
+        for line, numbers in lines.items()
+    }
+    caption = (
+        f"Wrong: {WRONG}; before any test, after the thresholds of matching, after consensus with the neighbours. RMS "
+        "and chi-square of correct positions."
+    )
+    counts = ("wrong_found", "found", "wrong_matched", "matched", "wrong_accepted", "accepted")
+    keys = (*counts, "right_rejected_by_consensus", "rms_lines_px", "rms_pixels_px", "chi_square_ratio")
+    matching = MATCHING.table("image-matching", "Matching", caption, judgements, keys, "field, points, line", digits=4)
+    remaining = " and ".join(str(int(p.control.control.sum())) for p in campaign.passes)
+    text = (
+        f"In each field {len(spec.patches)} patches of {spec.lines} x {spec.pixels} pixels are rendered by every line. "
+        f"Of {total['found']} matched positions, {total['wrong_found']} are wrong "
+        f"({100.0 * total['wrong_found'] / total['found']:.1f}%), mostly on parcels that look different in the "
+        f"orthophoto. After the thresholds of matching {total['wrong_matched']} of {total['matched']} are wrong, after "
+        f"the test of the neighbours {total['wrong_accepted']} of {total['accepted']}, after the adjustment "
+        f"{total['wrong_left']} of {total['left']} image points and {total['wrong_check_left']} of "
+        f"{total['check_left']} check points. The test of the neighbours rejects "
+        f"{total['right_rejected_by_consensus']} correct positions, the adjustment "
+        f"{total['right_rejected_by_adjustment']}. {remaining} control points remain. Their image points are weighted "
+        f"by the covariances of the matching, with {UNMODELLED_SIGMA:g} px added for errors that the fit does not "
+        "show.",
+    )
+    first = campaign.images[0]
+    figures = [
+        PngFigure(
+            f"points-{sort}",
+            f"Predicted to matched positions, {SORTS[sort]} points, first patch of {first.name}",
+            "Arrows: displacement less its median, enlarged as the title says; crosses: rejected by the test of the "
+            "neighbours; points: not matched.",
+            points_png(first.shown, points),
+        )
+        for sort, points in first.patches[0].points.sorts.items()
+    ]
+    return Section("Points in images", text, (matching, screened, *figures))
+
+
+def monitor_gain(run: CalibrationRun) -> str:
+    """Return a sentence on the height error with and without the on-board monitor."""
+    assert run.monitoring is not None
+    none, nominal = run.monitoring.at(0.0), run.monitoring.at(1.0)
+    scheme = list(none.without.schemes)[-2]
+    still, blind = none.without.schemes[scheme].height_rms, nominal.without.schemes[scheme].height_rms
+    text = (
+        f"With cameras that drift by {run.monitoring.angle / ARCSEC:.2g} arcsec (Δα, 1σ) from field to field, the "
+        f"height error without ground control (scheme {scheme}) is {blind:.2f} m RMS, against {still:.2f} m without "
+        "drift"
+    )
+    if nominal.monitored is None:
+        return f"{text}."
+    return f"{text}; with the on-board monitor's readings, {nominal.monitored.schemes[scheme].height_rms:.2f} m."
+
+
+def _monitoring(run: CalibrationRun) -> Section:
+    study, spec = run.monitoring, run.campaign.simulated
+    assert study is not None
+    drifts = "; ".join(
+        f"{name} {', '.join(format_quantity(v, ANGLE) for v in drift.angles)}, "
+        f"Δf {format_quantity(drift.principal_distance, LENGTH)}"
+        for name, drift in spec.drift.items()
+    )
+    text = [
+        f"Each line camera differs in every field from its reference state, 1σ of Δα, Δβ, Δγ: {drifts}. "
+        f"1 arcsec of Δα of the forward line is {abs(study.metres):.2f} m of height."
+    ]
+    if spec.monitor is not None:
+        angles = ", ".join(format_quantity(v, ANGLE) for v in spec.monitor.angles)
+        length = format_quantity(spec.monitor.principal_distance, LENGTH)
+        text.append(f"The monitor reads each camera in each pass with {angles} and Δf {length}, 1σ.")
+    rows: Rows = []
+    for size in study.sizes:
+        cells: list[Cell] = [size.factor, size.factor * study.angle / ARCSEC]
+        for treatment in (size.without, size.monitored):
+            cells += (None,) * 3 if treatment is None else (*astuple(treatment.together), treatment.p_value)
+        rows.append(tuple(cells))
+    none, nominal = study.at(0.0).without, study.at(1.0)
+    cases = {"no drift": none.schemes, "no monitor": nominal.without.schemes}
+    cases["monitor"] = {} if nominal.monitored is None else nominal.monitored.schemes
+    figure = figure_of(
+        run,
+        _drift_figure,
+        "monitor-heights",
+        "Height errors and the drift of the cameras",
+        "Left: one campaign, its drift drawn once and scaled; the dashed line is the mean of many campaigns. "
+        "Right: RMS over all fields.",
+    )
+    by_size = Table(
+        "monitor-sizes",
+        "All fields adjusted at once",
+        "RMS at check points of all fields, metres, each field with its own bias; p-value of the fit, with the noise "
+        "of the readings of attitude and orbit treated as independent (which brings it too near to 1).",
+        ("drift × file's", "σ Δα [arcsec]", "plan", "height", "p", "plan, monitor", "height, monitor", "p, monitor"),
+        rows,
+        (1, 2, 2, 2, 3, 2, 2, 3),
+    )
+    evaluate_schemes = Table(
+        "monitor-schemes",
+        "Schemes without ground control, with the file's drift",
+        "RMS at check points of all fields, metres; the last scheme lets each field use its own parameters.",
+        ("scheme", *(f"{what}, {case}" for what in ("plan", "height") for case in cases)),
+        [
+            (scheme, *(getattr(case.get(scheme), what, None) for what in RMS for case in cases.values()))
+            for scheme in none.schemes
+        ],
+        (None, 2, 2, 2, 2, 2, 2),
+    )
+    return Section("Cameras that drift, and the on-board monitor", tuple(text), (figure, by_size, evaluate_schemes))
+
+
+def strip_gain(run: CalibrationRun) -> str:
+    """Return a sentence on the check points' errors with and without the adjustment of passes on tie points."""
+    assert run.strips is not None
+    scheme = list(run.schemes)[-2]
+    old, new = (FieldErrors.pooled(e[scheme].values()) for e in (run.schemes, run.strips.schemes))
+    return (
+        f"With at least {min(run.strips.ties.values())} tie points per pass in the calibration and in an adjustment of "
+        f"each pass, the height RMS of scheme {scheme} changes from {old.height_rms:.2f} m to {new.height_rms:.2f} m "
+        f"and the plan RMS from {old.plan_rms:.2f} m to {new.plan_rms:.2f} m."
+    )
+
+
+def _strips(run: CalibrationRun) -> Section:
+    strips = run.strips
+    assert strips is not None
+    rows: Rows = []
+    for scheme, fields in strips.schemes.items():
+        old, new = (FieldErrors.pooled(e.values()) for e in (run.schemes[scheme], fields))
+        rows.append((scheme, old.plan_rms, new.plan_rms, old.height_rms, new.height_rms))
+    table = Table(
+        "strips",
+        "Check points with and without tie points",
+        "RMS at check points of all fields without ground control, metres. Without ties: calibrated on control points, "
+        "intersected with the measured attitude and orbit. With ties: calibrated on control and tie points, "
+        "intersected with the adjusted attitude and orbit. In the last scheme each field uses its own parameters.",
+        ("scheme", "plan", "plan, with ties", "height", "height, with ties"),
+        rows,
+        (None, 2, 2, 2, 2),
+    )
+    common = Table(
+        "strip-datum",
+        f"Rotations of a whole pass, {run.campaign.passes[0].name}",
+        "Sigma from the readings' noise alone and with tie points, in arcseconds, or arcseconds per second for rates. "
+        "A ratio near 1 means that tie points do not determine the rotation.",
+        ("rotation", "before", "after", "ratio"),
+        [(d.name, d.before / ARCSEC, d.after / ARCSEC, d.after / d.before) for d in strips.datum],
+        (None, 4, 4, 3),
+    )
+    tracker = run.campaign.spec.errors.star_tracker
+    slow = max(tracker.slow.noise) / ARCSEC
+    noise = f"{max(tracker.noise) / ARCSEC:g} arcsec from reading to reading"
+    if slow:
+        noise += f" and {slow:g} arcsec that change within {tracker.slow.interval:g} s"
+    counts = ", ".join(f"{k} {n}" for k, n in strips.ties.items())
+    text = (
+        f"Every pass is adjusted on points that the lines see in common ({counts}), without ground coordinates. Check "
+        f"points, which are not among them, are then intersected with the adjusted attitude and orbit. The attitude's "
+        f"noise is {noise}.",
+    )
+    return Section("Adjustment of the strips", text, (table, common))
+
+
+def _expected_height(run: CalibrationRun, study: Monitoring, factor: np.ndarray) -> np.ndarray:
+    """Return the expected RMS height error without a monitor, in metres, for n multiples of the file's drift.
+
+    Parameters
+    ----------
+    run : CalibrationRun
+        Results of the calibration.
+    study : Monitoring
+        Comparison of calibrations with and without the monitor.
+    factor : (n,) ndarray
+        Factors by which the file's drift is multiplied.
+
+    Notes
+    -----
+    It is the expectation over many campaigns in which all fields are adjusted at once and the cameras' drift is
+    constant within a field. The parameters absorb the mean over the fields of the outer lines' rotation d_alpha about
+    the camera's Y, so that it is subtracted.
+    """
+    spec = run.campaign.simulated
+    square = sum(drift.angles[0] ** 2 for name, drift in spec.drift.items() if name != "nadir")
+    metres = study.metres * np.sqrt(square * (1.0 - 1.0 / len(spec.fields))) / ARCSEC
+    return np.asarray(np.hypot(study.at(0.0).without.together.height_rms, factor * metres))
+
+
+def _drift_figure(run: CalibrationRun) -> Figure:
+    study = run.monitoring
+    assert study is not None
+    figure = svg.new_figure(4.3)
+    left, right = figure.subplots(1, 2)
+    angle = study.angle / ARCSEC or 1.0
+    size = np.array([s.factor for s in study.sizes])
+    fine = np.linspace(0.0, size[-1], 101)
+    left.plot(
+        fine * angle, _expected_height(run, study, fine), "--", color=svg.GREY, lw=1.0, label="mean of many campaigns"
+    )
+    cases = {"without monitor": (svg.VERMILION, "o"), "with monitor": (svg.BLUE, "s")}
+    monitored = [s.monitored for s in study.sizes if s.monitored is not None]
+    for (label, (colour, marker)), rows in zip(
+        cases.items(), ([s.without for s in study.sizes], monitored), strict=True
+    ):
+        if rows:
+            height = [row.together.height_rms for row in rows]
+            left.plot(size * angle, height, f"{marker}-", color=colour, lw=1.4, ms=5, label=label)
+    unit = "σ of Δα of an outer line [arcsec]" if study.angle else "size of the drift against the file's"
+    left.set(title="All fields adjusted at once", xlabel=unit, ylabel="height RMS at check points [m]")
+    names = list(study.sizes[0].without.schemes)
+    nominal = study.at(1.0)
+    bars: list[tuple[str, str, list[FieldErrors]]] = [
+        ("no drift", svg.GREY, list(study.at(0.0).without.schemes.values())),
+        ("without monitor", svg.VERMILION, list(nominal.without.schemes.values())),
+    ]
+    if nominal.monitored is not None:
+        bars.append(("with monitor", svg.BLUE, list(nominal.monitored.schemes.values())))
+    position, width = np.arange(len(names)), 0.8 / len(bars)
+    for k, (label, colour, values) in enumerate(bars):
+        at = position + (k - 0.5 * (len(bars) - 1)) * width
+        right.bar(at, [v.height_rms for v in values], 0.92 * width, color=colour, label=label)
+    title = "Without ground control, the file's drift"
+    right.set(title=title, xticks=position, xlabel="scheme", ylabel="height RMS at check points [m]")
+    right.set_xticklabels([*names[:-1], f"{names[-1]}\neach its own"])
+    for axes in (left, right):
+        axes.set_ylim(0.0, None)
+        svg.gridded(axes)
+        axes.tick_params(colors=svg.INK)
+    handles, labels = left.get_legend_handles_labels()
+    more, other = right.get_legend_handles_labels()
+    figure.legend([*handles, more[0]], [*labels, other[0]], loc="outside lower center", ncols=4)
+    return figure
+
+
+def _schemes_figure(run: CalibrationRun) -> Figure:
+    """Draw the RMS errors in plan and in height at every field's check points, by scheme."""
+    figure = svg.new_figure(4.3)
+    panels = figure.subplots(1, 2)
+    names, spec = list(run.schemes), run.campaign.spec
+    position = np.arange(len(names))
+    labels = [
+        f"{k}\n{len(s)} field{'s' * (len(s) > 1)}" for k, s in zip(names, run.campaign.spec.schemes, strict=False)
+    ]
+    labels.append(f"{names[-1]}\neach its own")
+    for axes, what, title, limit in zip(
+        panels, RMS, ("plan", "height"), (spec.limits.plan, spec.limits.height), strict=True
+    ):
+        table = np.array([values_of(errors, what) for errors in run.schemes.values()])
+        for k, field in enumerate(run.before):
+            style = MARKERS[k // len(COLOURS) % len(MARKERS)]
+            colour = COLOURS[k % len(COLOURS)]
+            axes.plot(position, table[:, k], f"{style}-", color=colour, lw=0.9, ms=4, label=field)
+        axes.plot(position, table.mean(axis=1), "-", color=svg.INK, lw=2.2, label="mean of the fields")
+        before = values_of(run.before, what)
+        low, high = before.min(), before.max()
+        axes.set_ylim(0.0, 1.35 * table.max())
+        label = f"before calibration {low:.0f} to {high:.0f} m; limit for 1:50 000 {limit:g} m"
+        axes.set(title=f"RMS in {title} [m]", xticks=position, xlabel="scheme")
+        axes.text(0.5, 0.97, label, transform=axes.transAxes, ha="center", va="top", color=svg.GREY, fontsize=8.5)
+        if limit < 1.35 * table.max():
+            axes.axhline(limit, color=svg.GREY, lw=0.9, ls="--")
+        axes.set_xticklabels(labels)
+        svg.gridded(axes)
+    svg.shared_legend(figure, panels[0], "lower center", 4)
+    return figure
+
+
+def _check_figure(run: CalibrationRun) -> Figure:
+    """Draw the errors at the first field's check points before calibration and with the field's own parameters.
+
+    Arrows show the error in plan, colours the error in height.
+    """
+    flight = run.campaign.passes[0]
+    _, lat, _ = (float(v) for v in flight.data.earth.geodetic(flight.check_ground.mean(axis=0)))
+    lon, latitude, _ = flight.data.earth.geodetic(flight.check_ground)
+    east = (lon - lon.mean()) * 6.378e3 * np.cos(lat)
+    north = (latitude - latitude.mean()) * 6.357e3
+    figure = svg.new_figure(5.2)
+    panels = figure.subplots(1, 2, sharex=True, sharey=True)
+    cases = (
+        ("laboratory's camera", run.before[flight.name]),
+        ("its own parameters", list(run.schemes.values())[-1][flight.name]),
+    )
+    for axes, (title, errors) in zip(panels, cases, strict=True):
+        size = float(f"{np.sqrt(np.nanmean(np.sum(errors.error[:, :2] ** 2, axis=1))):.1g}")
+        tall = errors.error[:, 2]
+        middle = float(np.median(tall))
+        extent = float(np.abs(tall - middle).max())
+        arrows = axes.quiver(
+            east,
+            north,
+            errors.error[:, 0],
+            errors.error[:, 1],
+            tall,
+            cmap="viridis",
+            clim=(middle - extent, middle + extent),
+            width=0.004,
+            scale=16.0 * size,
+        )
+        axes.quiverkey(arrows, 0.8, 0.04, size, f"{size:g} m in plan", labelpos="E", coordinates="axes")
+        axes.set_title(f"{title}: plan {errors.plan_rms:.2f} m, height {errors.height_rms:.2f} m")
+        axes.set(xlabel="east [km]")
+        axes.set_aspect("equal")
+        axes.margins(0.14)
+        figure.colorbar(arrows, ax=axes, shrink=0.75, label="height error [m]", location="bottom")
+        svg.gridded(axes)
+    panels[0].set_ylabel("north [km]")
+    return figure

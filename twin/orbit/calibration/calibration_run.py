@@ -25,49 +25,11 @@ from scenes.specs.orbit.setup import MeasuredCalibrationSetup
 from scenes.yaml.yaml_file import dump_yaml
 from twin.framework.memory import Lowered, require_memory
 from twin.framework.procedure import Advance, BenchError, silent
+from twin.orbit.calibration import campaign_adjustment, influences
+from twin.orbit.calibration import schemes as scheme_tests
 from twin.orbit.calibration.campaign import Campaign, FieldPass, campaign_of
-from twin.orbit.calibration.campaign_adjustment import (
-    LatitudeFit,
-    calibrated_alone,
-    gauge_of,
-    latitude_fits,
-    rate_priors,
-    simultaneous,
-    with_detected_drift,
-)
 from twin.orbit.calibration.flown_campaign import fly_fields
-from twin.orbit.calibration.influences import (
-    AttitudeDrift,
-    ChipStep,
-    DatumRow,
-    LightRow,
-    UnexpectedChange,
-    datum_rows,
-    light_rows,
-    unexpected_changes,
-)
-from twin.orbit.calibration.schemes import (
-    Monitoring,
-    Repeatability,
-    Repeats,
-    SchemeMeans,
-    Strips,
-    adjust_strips,
-    laboratory_errors,
-    meets,
-    repeat_campaigns,
-    repeatability,
-    scheme_errors,
-    study_monitoring,
-)
-from twin.orbit.calibration.screening import require_correct_names, screen_campaign
-from twin.orbit.measured.measurement_tables import (
-    CAMERA_FILE,
-    LINES_SEE_POINTS,
-    TEST_FILE,
-    campaign_files,
-    read_measurements,
-)
+from twin.orbit.measured import measurement_tables
 
 if TYPE_CHECKING:
     from optics.numerics.backend import Backend
@@ -170,22 +132,22 @@ class CalibrationRun:
     stepwise: Stepwise
     before: Mapping[str, CheckErrors]
     schemes: Mapping[str, Mapping[str, CheckErrors]]
-    scheme_means: SchemeMeans | None
-    latitude: tuple[LatitudeFit, ...]
-    repeatability: tuple[Repeatability, ...]
-    light: tuple[LightRow, ...]
-    datum: tuple[DatumRow, ...]
-    unexpected_changes: tuple[UnexpectedChange, ...]
-    drift: AttitudeDrift
-    chip_steps: tuple[ChipStep, ...]
-    repeats: Repeats | None
-    monitoring: Monitoring | None
-    strips: Strips | None
+    scheme_means: scheme_tests.SchemeMeans | None
+    latitude: tuple[campaign_adjustment.LatitudeFit, ...]
+    repeatability: tuple[scheme_tests.Repeatability, ...]
+    light: tuple[influences.LightRow, ...]
+    datum: tuple[influences.DatumRow, ...]
+    unexpected_changes: tuple[influences.UnexpectedChange, ...]
+    drift: influences.AttitudeDrift
+    chip_steps: tuple[influences.ChipStep, ...]
+    repeats: scheme_tests.Repeats | None
+    monitoring: scheme_tests.Monitoring | None
+    strips: scheme_tests.Strips | None
 
     @property
     def within_limits(self) -> list[str]:
         """Names of the schemes with which every field meets the limits of the test's file."""
-        return [name for name, errors in self.schemes.items() if meets(errors, self.setup.test.limits)]
+        return [name for name, errors in self.schemes.items() if scheme_tests.meets(errors, self.setup.test.limits)]
 
 
 def unit(name: str) -> str:
@@ -238,12 +200,9 @@ def unknowns(run: CalibrationRun) -> dict[str, Unknown]:
     sigma, held = adjustment.sigma, adjustment.gauge.held
     whole = adjustment.sigma_with(dict.fromkeys(held, run.campaign.spec.launch.interior))
     truth = [None] * len(adjustment.names) if run.truth is None else run.truth.tolist()
-    return {
-        name: Unknown(name, value, sigma[name], whole[name], share, name in held, true)
-        for name, value, share, true in zip(
-            adjustment.names, adjustment.values.tolist(), adjustment.prior_share.tolist(), truth, strict=True
-        )
-    }
+    values, shares = adjustment.values.tolist(), adjustment.prior_share.tolist()
+    rows = zip(adjustment.names, values, shares, truth, strict=True)
+    return {n: Unknown(n, value, sigma[n], whole[n], share, n in held, true) for n, value, share, true in rows}
 
 
 @one_blas_thread()  # of small matrices: threads would only wait for each other
@@ -291,7 +250,7 @@ def _key_and_remedy(error: ValueError, measured: bool) -> tuple[tuple[str, ...],
             return ("data",), f"{remedy}, state a larger launch.bias, or reject points (`screening: robust`)"
         return ("errors",), "a datum and biases within the range that launch.bias allows"
     if measured:
-        return ("data",), LINES_SEE_POINTS
+        return ("data",), measurement_tables.LINES_SEE_POINTS
     return ("errors",), "errors that an adjustment can take, and more points"
 
 
@@ -310,26 +269,26 @@ def _run(setup: AnyCalibration, seed: int, advance: Advance) -> CalibrationRun:
     campaign = source_of(setup, shown, advance)
     parts = 6 + len(campaign.passes)
     advance("calibration", 1, parts)
-    latitude = latitude_fits(campaign, simultaneous(campaign))
-    rates = rate_priors(campaign, latitude)
-    campaign = with_detected_drift(campaign, rates)
-    together = simultaneous(campaign, rates)
+    latitude = campaign_adjustment.latitude_fits(campaign, campaign_adjustment.simultaneous(campaign))
+    rates = campaign_adjustment.rate_priors(campaign, latitude)
+    campaign = campaign_adjustment.with_detected_drift(campaign, rates)
+    together = campaign_adjustment.simultaneous(campaign, rates)
     advance("calibration", 2, parts)
     fields = {}
     for k, flight in enumerate(campaign.passes):
-        fields[flight.name] = FieldResult(calibrated_alone(campaign, flight), *third_differences(flight))
+        adjustment = campaign_adjustment.calibrated_alone(campaign, flight)
+        fields[flight.name] = FieldResult(adjustment, *third_differences(flight))
         advance("calibration", 3 + k, parts)
     first = campaign.spec.schemes[0][0]
     control = next(p.control for p in campaign.passes if p.name == first)
-    stepwise_result = stepwise(
-        [control], campaign.laboratory, campaign.noise, held=gauge_of(campaign).held, tolerance=STEPWISE_TOLERANCE
-    )
+    held, cameras = campaign_adjustment.gauge_of(campaign).held, campaign.laboratory
+    stepwise_result = stepwise([control], cameras, campaign.noise, held=held, tolerance=STEPWISE_TOLERANCE)
     alone = {name: result.adjustment for name, result in fields.items()}
-    schemes = scheme_errors(campaign, alone)
+    schemes = scheme_tests.scheme_errors(campaign, alone)
     advance("calibration", parts - 3, parts)
-    light = light_rows(campaign, together.sigma)
+    light = influences.light_rows(campaign, together.sigma)
     advance("calibration", parts - 1, parts)
-    datum = datum_rows(campaign)
+    datum = influences.datum_rows(campaign)
     advance("calibration", parts, parts)
     return CalibrationRun(
         setup,
@@ -339,19 +298,19 @@ def _run(setup: AnyCalibration, seed: int, advance: Advance) -> CalibrationRun:
         None if campaign.known_truth is None else true_values(campaign, together.names),
         FrozenMap(fields),
         stepwise_result,
-        laboratory_errors(campaign),
+        scheme_tests.laboratory_errors(campaign),
         schemes,
-        SchemeMeans.of(schemes),
+        scheme_tests.SchemeMeans.of(schemes),
         latitude,
-        repeatability(campaign, alone),
+        scheme_tests.repeatability(campaign, alone),
         light,
         datum,
-        unexpected_changes(campaign, together),
-        AttitudeDrift.of(campaign, together),
-        ChipStep.of(campaign, together),
-        None if isinstance(setup, MeasuredCalibrationSetup) else repeat_campaigns(setup, others, advance),
-        None if isinstance(setup, MeasuredCalibrationSetup) else study_monitoring(setup, shown, advance),
-        adjust_strips(campaign, advance),
+        influences.unexpected_changes(campaign, together),
+        influences.AttitudeDrift.of(campaign, together),
+        influences.ChipStep.of(campaign, together),
+        None if isinstance(setup, MeasuredCalibrationSetup) else scheme_tests.repeat_campaigns(setup, others, advance),
+        None if isinstance(setup, MeasuredCalibrationSetup) else scheme_tests.study_monitoring(setup, shown, advance),
+        scheme_tests.adjust_strips(campaign, advance),
     )
 
 
@@ -377,14 +336,14 @@ def source_of(setup: AnyCalibration, seed: np.random.SeedSequence, advance: Adva
         The passes cannot be simulated, or their points cannot be used.
     """
     if isinstance(setup, MeasuredCalibrationSetup):
-        measured = read_measurements(setup.data, setup.camera, advance)
+        measured = measurement_tables.read_measurements(setup.data, setup.camera, advance)
         campaign = campaign_of(setup.test, setup.camera, measured, setup.test.ties == "apart")
         if setup.test.screening == "robust":
-            return screen_campaign(campaign)
-        require_correct_names(campaign)
+            return campaign_adjustment.screen_campaign(campaign)
+        campaign_adjustment.require_correct_names(campaign)
         return campaign
     campaign = fly_fields(setup, seed, advance)
-    return screen_campaign(campaign) if campaign.images is not None else campaign
+    return campaign_adjustment.screen_campaign(campaign) if campaign.images is not None else campaign
 
 
 def true_values(campaign: Campaign, names: tuple[str, ...]) -> np.ndarray:
@@ -441,8 +400,8 @@ def exported(run: CalibrationRun) -> dict[str, str]:
 
 def files_of(setup: AnyCalibration, campaign: Campaign) -> dict[str, str]:
     """Return the files of a campaign, path -> text; the campaign need not be calibrated."""
-    files = campaign_files([flight.measurements for flight in campaign.passes], setup.camera.plain())
-    return files | {TEST_FILE: dump_yaml(_test(setup))}
+    files = measurement_tables.campaign_files([flight.measurements for flight in campaign.passes], setup.camera.plain())
+    return files | {measurement_tables.TEST_FILE: dump_yaml(_test(setup))}
 
 
 def _test(setup: AnyCalibration) -> dict[str, Any]:
@@ -453,7 +412,7 @@ def _test(setup: AnyCalibration) -> dict[str, Any]:
     common = {
         "name": spec.name,
         "description": spec.description,
-        "camera": f"./{CAMERA_FILE}",
+        "camera": f"./{measurement_tables.CAMERA_FILE}",
         "data": ".",
         "schemes": plain["schemes"],
         **{key: plain[key] for key in ("effects", "launch", "limits")},

@@ -1,32 +1,34 @@
-"""Sections of the report of an in-orbit calibration: schemes, parameters, fields, biases, influences and observability.
+"""Sections of a calibration's report on the adjustment: parameters, fields, biases, influences and observability.
 
 docs/orbit.md explains how averaging, drifting cameras, tie points and effects on the light change the result.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import astuple
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from matplotlib.figure import Figure
 
 from analysis.arrays import ARCSEC
 from analysis.calibration.adjustment import Adjustment
 from analysis.orbit.calibration_parameters import OFFSET, RATE
-from analysis.orbit.three_line_model import BIAS
+from analysis.orbit.three_line_model import BIAS, misclosure
 from scenes.yaml.units import ANGLE, LENGTH, format_quantity
-from twin.framework.artefact import Cell, DecimalNumber, PngFigure, SvgFigure, Table
+from twin.framework import svg
+from twin.framework.artefact import Cell, DecimalNumber, SvgFigure, Table
 from twin.framework.report import Section
-from twin.orbit.calibration.calibration_numbers import CHIP_STEP, LATITUDE, MATCHING, SCREENED
-from twin.orbit.calibration.calibration_plots import figure_svg
+from twin.orbit.calibration.calibration_numbers import CHIP_STEP, LATITUDE
 from twin.orbit.calibration.calibration_run import STEPWISE_TOLERANCE, CalibrationRun
+from twin.orbit.calibration.campaign import FieldPass
+from twin.orbit.calibration.flown_campaign import true_bias
 from twin.orbit.calibration.influences import UNEXPECTED_SIGMAS, LightRow
-from twin.orbit.calibration.schemes import RMS, FieldErrors, SchemeMeans, meets, values_of
-from twin.orbit.calibration.screening import ground_sample, intersection_fit
-from twin.orbit.images.image_points import UNMODELLED_SIGMA
-from twin.orbit.images.patch import WRONG
-from twin.orbit.images.point_report import SORTS, points_png
+
+if TYPE_CHECKING:
+    pass
+
 
 _SCALES = {"rad": (ARCSEC, "arcsec"), "rad/s": (1e-3 * ARCSEC, "mas/s"), "m": (1.0, "m")}
 """Unit of an unknown in result files -> unit of the tables of the report, as its size in SI units and its name."""
@@ -36,8 +38,8 @@ MOSTLY = 0.5
 Rows = list[tuple[Cell, ...]]
 
 
-def sections(run: CalibrationRun, data: Mapping[str, Any]) -> tuple[Section, ...]:
-    """Return the sections of a calibration's report.
+def adjustment_sections(run: CalibrationRun, data: Mapping[str, Any]) -> tuple[Section, ...]:
+    """Return the sections of a calibration's report on the adjustment of all fields.
 
     Parameters
     ----------
@@ -46,358 +48,140 @@ def sections(run: CalibrationRun, data: Mapping[str, Any]) -> tuple[Section, ...
     data : Mapping[str, Any]
         Content of calibration.json.
     """
-    candidates = (
-        _schemes(run),
-        None if run.repeats is None else _repeats(run),
-        _measured(run) if run.truth is None else None,
-        None if run.campaign.images is None else _images(run, data["images"]),
-        None if run.monitoring is None else _monitoring(run),
-        None if run.strips is None else _strips(run),
-        _parameters(run, data),
-        _fields(run),
-        _biases(run, data),
-        _light(run),
-        _datum(run),
-        _rank(run),
-        _data(run),
-    )
-    return tuple(section for section in candidates if section is not None)
+    return (_parameters(run, data), _fields(run), _biases(run, data), _light(run), _datum(run), _rank(run), _data(run))
 
 
-def _figure(run: CalibrationRun, name: str, title: str, caption: str) -> SvgFigure:
-    return SvgFigure(name, title, caption, figure_svg(name, run))
+def figure_of(
+    run: CalibrationRun, draw: Callable[[CalibrationRun], Figure], name: str, title: str, caption: str
+) -> SvgFigure:
+    """Return a figure of the report from the function that draws it, its name, title and caption."""
+    return SvgFigure(name, title, caption, svg.drawn(f"calibration-{name}", draw, run))
 
 
-def scheme_names(run: CalibrationRun) -> list[str]:
-    """Return the names of the schemes, each a list of fields whose parameters are averaged; the last averages none."""
-    names = [f"{k + 1}: {', '.join(s)}" for k, s in enumerate(run.campaign.spec.schemes)]
-    return [*names, f"{len(names) + 1}: each field its own"]
-
-
-def summary(run: CalibrationRun) -> Table:
-    """Return the table of the schemes' errors at the check points of all fields."""
-    rows: Rows = []
-    for name, errors in zip(["laboratory", *scheme_names(run)], (run.before, *run.schemes.values()), strict=True):
-        values = [values_of(errors, what) for what in RMS]
-        numbers = [float(v) for rms in values for v in (rms.mean(), rms.std(), rms.max())]
-        rows.append((name, *numbers, "yes" if meets(errors, run.campaign.spec.limits) else "no"))
-    return Table(
-        "schemes",
-        "Schemes of parameters, tested on all fields without ground control",
-        "RMS at check points, metres: mean, standard deviation and largest of the fields.",
-        ("parameters", "plan [m]", "spread", "largest", "height [m]", "spread", "largest", "meets 1:50 000"),
-        rows,
-        (None, 2, 2, 2, 2, 2, 2, None),
-    )
-
-
-def scheme_summary(means: SchemeMeans | None) -> str:
-    """Return a sentence on how averaging the parameters of several fields changes the errors in plan and height."""
-    if means is None:
-        return "There is only one scheme of averaged parameters, so schemes are not compared."
-    plan, spread, height = means.plan, means.plan_spread, means.height
-    return (
-        f"From the first to the last scheme of averaged parameters, the mean RMS in plan changes from {plan[0]:.2f} m "
-        f"to {plan[-1]:.2f} m and its spread over the fields from {spread[0]:.2f} m to {spread[-1]:.2f} m; the mean "
-        f"RMS in height changes from {height[0]:.2f} m to {height[-1]:.2f} m, by "
-        f"{100.0 * means.height_change:.1f}% at most between any two schemes."
-    )
-
-
-def _schemes(run: CalibrationRun) -> Section:
-    columns = {"laboratory": run.before} | {f"scheme {name}": errors for name, errors in run.schemes.items()}
-    tables = [
-        Table(
-            what.removesuffix("_rms"),
-            f"RMS in {what.removesuffix('_rms')} at check points without ground control, metres",
-            "",
-            ("field", *columns),
-            [(name, *(getattr(errors[name], what) for errors in columns.values())) for name in run.before],
-            (None, *(2,) * len(columns)),
+def _latitude_figure(run: CalibrationRun) -> Figure:
+    """Draw each field's attitude bias with its sigma, the truth where it is known, and the fit against latitude."""
+    figure = svg.new_figure(3.9)
+    campaign, passes = run.campaign, run.campaign.passes
+    latitude = np.array([p.latitude for p in passes])
+    span = np.linspace(latitude.min() - 0.03, latitude.max() + 0.03, 101)
+    for k, (axes, axis) in enumerate(zip(figure.subplots(1, 3), BIAS, strict=True)):
+        value = np.array([run.together.value(f"{p.name} {axis}") for p in passes]) / ARCSEC
+        sigma = np.array([run.together.sigma[f"{p.name} {axis}"] for p in passes]) / ARCSEC
+        if campaign.known_truth is not None:
+            truth = true_bias(campaign.simulated, span)
+            axes.plot(np.degrees(span), truth[:, k] / ARCSEC, color=svg.GREY, lw=1.0, ls="--", label="truth, no season")
+        for fit in run.latitude[k : k + 1]:
+            axes.plot(np.degrees(span), fit.curve(span) / ARCSEC, color=svg.VERMILION, lw=1.3, label="fit")
+        if campaign.known_truth is not None:
+            true = np.array([p.bias[k] for p in passes]) / ARCSEC
+            axes.plot(np.degrees(latitude), true, "x", color=svg.INK, ms=6, label="truth of the field", zorder=4)
+        axes.errorbar(
+            np.degrees(latitude), value, sigma, fmt="o", color=svg.BLUE, ms=4, lw=1.2, capsize=2, label="estimated, 1σ"
         )
-        for what in RMS
-    ]
-    text = (
-        f"Every field is calibrated by itself (three attitude biases and {len(run.campaign.inner)} elements of the "
-        f"interior orientation, of which two are held). Each scheme uses the mean of the parameters of its "
-        f"fields: {'; '.join(scheme_names(run))}.",
-        scheme_summary(run.scheme_means),
-    )
-    check = "Arrows: errors in plan; colours: errors in height. Before calibration and with the field's own parameters."
-    title = f"Errors at check points of {run.campaign.passes[0].name}"
-    figures = (
-        _figure(run, "schemes-of-fields", "Schemes", "RMS errors at check points; each line is a field."),
-        _figure(run, "check-points", title, check),
-    )
-    return Section("Schemes of averaged parameters", text, (figures[0], *tables, figures[1]))
+        axes.set(title=f"{axis} [arcsec]", xlabel="latitude [deg]")
+        svg.gridded(axes)
+        handles = axes.get_legend_handles_labels()
+    figure.legend(*handles, loc="outside lower center", ncols=4)
+    return figure
 
 
-def _repeats(run: CalibrationRun) -> Section:
-    assert run.repeats is not None
-    limits, count = run.campaign.spec.limits, len(run.repeats.plan)
-    met = run.repeats.met(limits.plan, limits.height)
-    rows: Rows = []
-    for k, name in enumerate(scheme_names(run)):
-        cells: list[Cell] = [name]
-        for values in (run.repeats.plan[:, k], run.repeats.height[:, k]):
-            mean = values.mean(axis=1)
-            cells += [float(mean.mean()), float(mean.std(ddof=1)) if count > 1 else None]
-            cells += [float(values.std(axis=1).mean())]
-        rows.append((*cells, f"{100.0 * met[k]:.0f}%"))
-    heads = [head for what in ("plan", "height") for head in (f"{what} [m]", "± campaign", "spread of fields")]
-    table = Table(
-        "campaigns",
-        f"{count} campaigns over the same fields",
-        "RMS at check points, metres: mean of the fields, averaged over the campaigns, with its standard deviation "
-        "from campaign to campaign; spread over the fields; share of campaigns in which every field meets 1:50 000. "
-        "Biases, orbits, points and noise are drawn anew; the camera, the fields and the drift with latitude are the "
-        "same.",
-        ("parameters", *heads, "1:50 000"),
-        rows,
-        (None, 2, 2, 2, 2, 2, 2, None),
-    )
-    return Section("Other campaigns", (), (table,))
+def _correlation_figure(run: CalibrationRun) -> Figure:
+    """Draw the correlation matrix of the simultaneous adjustment, without the unknowns that the gauge fixes."""
+    adjustment = run.together
+    sigma = adjustment.sigma
+    free = [k for k, name in enumerate(adjustment.names) if sigma[name] > 0.0]
+    names = [adjustment.names[k] for k in free]
+    figure = svg.new_figure(min(9.2, 2.6 + 0.14 * len(names)))
+    axes = figure.subplots()
+    shown = svg.signed_map(axes, adjustment.correlation[np.ix_(free, free)], 1.0)
+    size = 6.5 if len(names) > 40 else 8.0
+    axes.set_xticks(np.arange(len(names)), names, rotation=90, fontsize=size)
+    axes.set_yticks(np.arange(len(names)), names, fontsize=size)
+    # lines between the interior and the fields
+    groups = ["interior" if name in run.campaign.inner else name.split()[0] for name in names]
+    for k in range(1, len(groups)):
+        if groups[k] != groups[k - 1]:
+            axes.axhline(k - 0.5, color=svg.INK, lw=0.6)
+            axes.axvline(k - 0.5, color=svg.INK, lw=0.6)
+    figure.colorbar(shown, ax=axes, shrink=0.6, label="correlation")
+    return figure
 
 
-def _measured(run: CalibrationRun) -> Section:
-    campaign = run.campaign
-    rows: Rows = []
-    sizes: Rows = []
-    for flight in campaign.passes:
-        rejected, alone = campaign.rejected.get(flight.name), run.fields[flight.name].adjustment
-        fit, errors = intersection_fit(campaign, flight, alone), list(run.schemes.values())[-1][flight.name]
-        factors = {} if rejected is None else {line: f"{factor:.2f}" for line, factor in rejected.factors.items()}
-        alike = len(set(factors.values())) == 1
-        factor = factors.popitem()[1] if alike else ", ".join(f"{line} {v}" for line, v in factors.items())
-        lost = (None, None, None) if rejected is None else (len(rejected.points), len(rejected.check_points), factor)
-        points = (int(flight.is_control.sum()), flight.tie_count, len(flight.check_ground))
-        ratio, check = (v.chi_square / max(v.degrees_of_freedom, 1) for v in (alone, fit))
-        rows.append((flight.name, *points, *lost, ratio, alone.p_value, check))
-        for line in flight.data.sensors:
-            along, across = ground_sample(flight, line)
-            pixel = float(np.sqrt(along * across))
-            both = errors.plan_rms / pixel, errors.height_rms / pixel
-            sizes.append((flight.name, line, along, across, *both, errors.count))
-    heads = ("image points rejected", "check rejected", "factor", "χ²/dof", "p", "check χ²/dof")
-    tables = (
-        Table(
-            "measured-points",
-            "Points of every pass",
-            "Rejected: image points by robust weights, and check points whose rays do not intersect. Factor: applied "
-            "to the given sigmas of image points by line, from the remaining residuals. Chi-square over its degrees of "
-            "freedom: of the pass adjusted by itself, and of the rays of its check points with these parameters.",
-            ("pass", "control", "ties", "check", *heads),
-            rows,
-            (None, None, None, None, None, None, None, 2, 3, 2),
-        ),
-        Table(
-            "measured-pixels",
-            "Ground sample distance, and errors of check points in ground pixels",
-            "Ground sample distance of the middle of each line, metres; RMS errors of the check points with the pass's "
-            "own parameters, in ground pixels (geometric mean of along and across).",
-            ("pass", "line", "along the track [m]", "across [m]", "plan [px]", "height [px]", "check points"),
-            sizes,
-            (None, None, 3, 3, 2, 2, None),
-        ),
+def _residuals(run: CalibrationRun, flight: FieldPass, line: str) -> np.ndarray:
+    """Return the residuals of a field's control points in one line after the adjustment, (n, 2), px in x and y."""
+    adjustment, rays = run.together, flight.control.rays[line]
+    names = (f"{flight.name} offset {axis}" for axis in OFFSET)
+    offset = np.array([adjustment.value(name) if name in adjustment.names else 0.0 for name in names])
+    residual = misclosure(
+        adjustment.cameras[line],
+        rays,
+        adjustment.ground[flight.name][rays.point],
+        adjustment.bias(flight.name),
+        flight.control.axes @ offset,
     )
-    none = () if campaign.rejected else ("No image point was rejected: the file has `screening: none`.",)
-    return Section("Measurements", (*none, _limits(run)), tables)
+    return np.asarray(residual / flight.data.pitch[line])
 
 
-def _limits(run: CalibrationRun) -> str:
-    noise, flight = run.campaign.noise, run.campaign.passes[0]
-    ground = flight.altitude / float(np.mean([m.interior[0] for m in run.campaign.laboratory.values()]))
-    control = np.trace(flight.control_covariance[flight.is_control], axis1=1, axis2=2)
-    # white noise of the readings by their spline, in metres on the ground, beside that of the image
-    parts = {
-        "image points": noise.image * ground,
-        "readings of the attitude": noise.attitude * flight.altitude,
-        "slow errors of the attitude": noise.slow_attitude * flight.altitude,
-        "readings of the orbit": noise.station,
-        "control points": float(np.sqrt(np.mean(control / 3.0))),
-    }
-    texts = ", ".join(f"{name} {value:.2g} m" for name, value in sorted(parts.items(), key=lambda v: -v[1]) if value)
-    return (
-        f"Error budget on the ground at nadir (1σ) of a single ray to a single point of {flight.name}: {texts}. "
-        "The largest of these errors limits the accuracy. More points reduce all of them but slow errors of the"
-        " attitude."
-    )
+_BINS = 12
+"""Number of parts of a line over which residuals are averaged."""
 
 
-def _images(run: CalibrationRun, data: Mapping[str, Any]) -> Section:
-    campaign, total, spec = run.campaign, data["total"], run.campaign.simulated.images
-    assert campaign.images is not None
-    assert spec is not None
-    screened = SCREENED.table(
-        "image-points",
-        "Image points in the adjustment",
-        "Points that every line sees, before and after screening by robust weights (IGG) and, for check points, by the "
-        "intersection of their rays.",
-        {images.name: SCREENED(images.screening) for images in campaign.images if images.screening is not None},
-        label="field",
-    )
-    judgements = {
-        f"{field}, {SORTS[sort]}, {line}": numbers
-        for field, sorts in data["fields"].items()
-        for sort, lines in sorts.items()
-        for line, numbers in lines.items()
-    }
-    caption = (
-        f"Wrong: {WRONG}; before any test, after the thresholds of matching, after consensus with the neighbours. RMS "
-        "and chi-square of correct positions."
-    )
-    counts = ("wrong_found", "found", "wrong_matched", "matched", "wrong_accepted", "accepted")
-    keys = (*counts, "right_rejected_by_consensus", "rms_lines_px", "rms_pixels_px", "chi_square_ratio")
-    matching = MATCHING.table("image-matching", "Matching", caption, judgements, keys, "field, points, line", digits=4)
-    remaining = " and ".join(str(int(p.control.control.sum())) for p in campaign.passes)
-    text = (
-        f"In each field {len(spec.patches)} patches of {spec.lines} x {spec.pixels} pixels are rendered by every line. "
-        f"Of {total['found']} matched positions, {total['wrong_found']} are wrong "
-        f"({100.0 * total['wrong_found'] / total['found']:.1f}%), mostly on parcels that look different in the "
-        f"orthophoto. After the thresholds of matching {total['wrong_matched']} of {total['matched']} are wrong, after "
-        f"the test of the neighbours {total['wrong_accepted']} of {total['accepted']}, after the adjustment "
-        f"{total['wrong_left']} of {total['left']} image points and {total['wrong_check_left']} of "
-        f"{total['check_left']} check points. The test of the neighbours rejects "
-        f"{total['right_rejected_by_consensus']} correct positions, the adjustment "
-        f"{total['right_rejected_by_adjustment']}. {remaining} control points remain. Their image points are weighted "
-        f"by the covariances of the matching, with {UNMODELLED_SIGMA:g} px added for errors that the fit does not "
-        "show.",
-    )
-    first = campaign.images[0]
-    figures = [
-        PngFigure(
-            f"points-{sort}",
-            f"Predicted to matched positions, {SORTS[sort]} points, first patch of {first.name}",
-            "Arrows: displacement less its median, enlarged as the title says; crosses: rejected by the test of the "
-            "neighbours; points: not matched.",
-            points_png(first.shown, points),
+def _along_figure(run: CalibrationRun) -> Figure:
+    """Draw the residuals of all fields' control points over the pixels of each line, with means of its parts."""
+    lines = list(dict.fromkeys(line for flight in run.campaign.passes for line in flight.control.rays))
+    figure = svg.new_figure(4.6)
+    grid = figure.subplots(2, len(lines), sharex="col", sharey="row", squeeze=False)
+    for column, line in zip(grid.T, lines, strict=True):
+        flights = [flight for flight in run.campaign.passes if line in flight.control.rays]
+        pixel = np.concatenate([flight.control_images[line].pixel for flight in flights])
+        residual = np.concatenate([_residuals(run, flight, line) for flight in flights])
+        edges = np.linspace(pixel.min(), pixel.max(), _BINS + 1)
+        part = np.clip(np.digitize(pixel, edges) - 1, 0, _BINS - 1)
+        filled = [k for k in range(_BINS) if np.sum(part == k) > 1]
+        middle = 0.5 * (edges[1:] + edges[:-1])[filled]
+        for axes, values in zip(column, residual.T, strict=True):
+            axes.axhline(0.0, color=svg.GREY, lw=0.7)
+            axes.plot(pixel, values, ".", color=svg.SKY, ms=3.0, alpha=0.7, label="control points of all fields")
+            mean = np.array([values[part == k].mean() for k in filled])
+            error = np.array([values[part == k].std(ddof=1) / np.sqrt(np.sum(part == k)) for k in filled])
+            axes.errorbar(middle, mean, error, fmt="o", color=svg.BLUE, ms=4.0, lw=1.0, label="mean of a part, ±σ")
+            svg.gridded(axes)
+        column[0].set_title(line, loc="left")
+        column[1].set_xlabel("pixel along the line")
+    grid[0, 0].set_ylabel("x, along the track [px]")
+    grid[1, 0].set_ylabel("y, along the line [px]")
+    svg.shared_legend(figure, grid[0, 0])
+    return figure
+
+
+def _residual_figure(run: CalibrationRun) -> Figure:
+    """Draw the residuals of the first field's control points in the images of the lines, in pixels."""
+    flight = run.campaign.passes[0]
+    figure = svg.new_figure(3.9)
+    shown = tuple(flight.control.rays)
+    panels = figure.subplots(1, len(shown), sharex=True, squeeze=False)[0]
+    for axes, line in zip(panels, shown, strict=True):
+        residual = _residuals(run, flight, line)
+        images = flight.control_images[line]
+        arrows = axes.quiver(
+            images.pixel,
+            images.line / 1e3,
+            residual[:, 1],
+            residual[:, 0],
+            color=svg.BLUE,
+            width=0.004,
+            scale=14.0,
+            zorder=3,
         )
-        for sort, points in first.patches[0].points.sorts.items()
-    ]
-    return Section("Points in images", text, (matching, screened, *figures))
-
-
-def monitor_gain(run: CalibrationRun) -> str:
-    """Return a sentence on the height error with and without the on-board monitor."""
-    assert run.monitoring is not None
-    none, nominal = run.monitoring.at(0.0), run.monitoring.at(1.0)
-    scheme = list(none.without.schemes)[-2]
-    still, blind = none.without.schemes[scheme].height_rms, nominal.without.schemes[scheme].height_rms
-    text = (
-        f"With cameras that drift by {run.monitoring.angle / ARCSEC:.2g} arcsec (Δα, 1σ) from field to field, the "
-        f"height error without ground control (scheme {scheme}) is {blind:.2f} m RMS, against {still:.2f} m without "
-        "drift"
-    )
-    if nominal.monitored is None:
-        return f"{text}."
-    return f"{text}; with the on-board monitor's readings, {nominal.monitored.schemes[scheme].height_rms:.2f} m."
-
-
-def _monitoring(run: CalibrationRun) -> Section:
-    study, spec = run.monitoring, run.campaign.simulated
-    assert study is not None
-    drifts = "; ".join(
-        f"{name} {', '.join(format_quantity(v, ANGLE) for v in drift.angles)}, "
-        f"Δf {format_quantity(drift.principal_distance, LENGTH)}"
-        for name, drift in spec.drift.items()
-    )
-    text = [
-        f"Each line camera differs in every field from its reference state, 1σ of Δα, Δβ, Δγ: {drifts}. "
-        f"1 arcsec of Δα of the forward line is {abs(study.metres):.2f} m of height."
-    ]
-    if spec.monitor is not None:
-        angles = ", ".join(format_quantity(v, ANGLE) for v in spec.monitor.angles)
-        length = format_quantity(spec.monitor.principal_distance, LENGTH)
-        text.append(f"The monitor reads each camera in each pass with {angles} and Δf {length}, 1σ.")
-    rows: Rows = []
-    for size in study.sizes:
-        cells: list[Cell] = [size.factor, size.factor * study.angle / ARCSEC]
-        for treatment in (size.without, size.monitored):
-            cells += (None,) * 3 if treatment is None else (*astuple(treatment.together), treatment.p_value)
-        rows.append(tuple(cells))
-    none, nominal = study.at(0.0).without, study.at(1.0)
-    cases = {"no drift": none.schemes, "no monitor": nominal.without.schemes}
-    cases["monitor"] = {} if nominal.monitored is None else nominal.monitored.schemes
-    figure = _figure(
-        run,
-        "monitor-heights",
-        "Height errors and the drift of the cameras",
-        "Left: one campaign, its drift drawn once and scaled; the dashed line is the mean of many campaigns. "
-        "Right: RMS over all fields.",
-    )
-    by_size = Table(
-        "monitor-sizes",
-        "All fields adjusted at once",
-        "RMS at check points of all fields, metres, each field with its own bias; p-value of the fit, with the noise "
-        "of the readings of attitude and orbit treated as independent (which brings it too near to 1).",
-        ("drift × file's", "σ Δα [arcsec]", "plan", "height", "p", "plan, monitor", "height, monitor", "p, monitor"),
-        rows,
-        (1, 2, 2, 2, 3, 2, 2, 3),
-    )
-    evaluate_schemes = Table(
-        "monitor-schemes",
-        "Schemes without ground control, with the file's drift",
-        "RMS at check points of all fields, metres; the last scheme lets each field use its own parameters.",
-        ("scheme", *(f"{what}, {case}" for what in ("plan", "height") for case in cases)),
-        [
-            (scheme, *(getattr(case.get(scheme), what, None) for what in RMS for case in cases.values()))
-            for scheme in none.schemes
-        ],
-        (None, 2, 2, 2, 2, 2, 2),
-    )
-    return Section("Cameras that drift, and the on-board monitor", tuple(text), (figure, by_size, evaluate_schemes))
-
-
-def strip_gain(run: CalibrationRun) -> str:
-    """Return a sentence on the check points' errors with and without the adjustment of passes on tie points."""
-    assert run.strips is not None
-    scheme = list(run.schemes)[-2]
-    old, new = (FieldErrors.pooled(e[scheme].values()) for e in (run.schemes, run.strips.schemes))
-    return (
-        f"With at least {min(run.strips.ties.values())} tie points per pass in the calibration and in an adjustment of "
-        f"each pass, the height RMS of scheme {scheme} changes from {old.height_rms:.2f} m to {new.height_rms:.2f} m "
-        f"and the plan RMS from {old.plan_rms:.2f} m to {new.plan_rms:.2f} m."
-    )
-
-
-def _strips(run: CalibrationRun) -> Section:
-    strips = run.strips
-    assert strips is not None
-    rows: Rows = []
-    for scheme, fields in strips.schemes.items():
-        old, new = (FieldErrors.pooled(e.values()) for e in (run.schemes[scheme], fields))
-        rows.append((scheme, old.plan_rms, new.plan_rms, old.height_rms, new.height_rms))
-    table = Table(
-        "strips",
-        "Check points with and without tie points",
-        "RMS at check points of all fields without ground control, metres. Without ties: calibrated on control points, "
-        "intersected with the measured attitude and orbit. With ties: calibrated on control and tie points, "
-        "intersected with the adjusted attitude and orbit. In the last scheme each field uses its own parameters.",
-        ("scheme", "plan", "plan, with ties", "height", "height, with ties"),
-        rows,
-        (None, 2, 2, 2, 2),
-    )
-    common = Table(
-        "strip-datum",
-        f"Rotations of a whole pass, {run.campaign.passes[0].name}",
-        "Sigma from the readings' noise alone and with tie points, in arcseconds, or arcseconds per second for rates. "
-        "A ratio near 1 means that tie points do not determine the rotation.",
-        ("rotation", "before", "after", "ratio"),
-        [(d.name, d.before / ARCSEC, d.after / ARCSEC, d.after / d.before) for d in strips.datum],
-        (None, 4, 4, 3),
-    )
-    tracker = run.campaign.spec.errors.star_tracker
-    slow = max(tracker.slow.noise) / ARCSEC
-    noise = f"{max(tracker.noise) / ARCSEC:g} arcsec from reading to reading"
-    if slow:
-        noise += f" and {slow:g} arcsec that change within {tracker.slow.interval:g} s"
-    counts = ", ".join(f"{k} {n}" for k, n in strips.ties.items())
-    text = (
-        f"Every pass is adjusted on points that the lines see in common ({counts}), without ground coordinates. Check "
-        f"points, which are not among them, are then intersected with the adjusted attitude and orbit. The attitude's "
-        f"noise is {noise}.",
-    )
-    return Section("Adjustment of the strips", text, (table, common))
+        axes.plot(images.pixel, images.line / 1e3, ".", color=svg.GREY, ms=2)
+        axes.quiverkey(arrows, 0.86, 1.04, 1.0, "1 px", labelpos="E", coordinates="axes")
+        rms = np.sqrt(np.mean(residual**2, axis=0))
+        axes.set_title(f"{line}: x {rms[0]:.2f} px, y {rms[1]:.2f} px", loc="left")
+        axes.set(xlabel="pixel")
+        axes.margins(0.12)
+        svg.gridded(axes)
+    panels[0].set_ylabel("image line, thousands")
+    return figure
 
 
 def _parameters(run: CalibrationRun, data: Mapping[str, Any]) -> Section:
@@ -448,14 +232,17 @@ def _parameters(run: CalibrationRun, data: Mapping[str, Any]) -> Section:
     )
     title = f"Residuals of the control points in the images, {campaign.passes[0].name}"
     caption = "Titles: RMS of x and y. The residuals contain noise of the image and of the attitude."
-    along = _figure(
+    along = figure_of(
         run,
+        _along_figure,
         "residuals-along",
         "Residuals along the lines, all fields",
         "A mean that leaves zero over part of a line is an error that the parameters of the interior orientation do "
         "not describe.",
     )
-    return Section("Parameters", (text,), (along, table, steps, _figure(run, "residuals", title, caption)))
+    return Section(
+        "Parameters", (text,), (along, table, steps, figure_of(run, _residual_figure, "residuals", title, caption))
+    )
 
 
 def _fields(run: CalibrationRun) -> Section:
@@ -506,8 +293,9 @@ def _fields(run: CalibrationRun) -> Section:
 
 
 def _biases(run: CalibrationRun, data: Mapping[str, Any]) -> Section:
-    figure = _figure(
+    figure = figure_of(
         run,
+        _latitude_figure,
         "bias-latitude",
         "Bias of the attitude against latitude",
         "From the adjustment of all fields, which includes the orbit's offsets. The errors of yaw are mostly common to "
@@ -545,10 +333,9 @@ def _biases(run: CalibrationRun, data: Mapping[str, Any]) -> Section:
         f"The fields lie within {np.degrees(np.ptp(run.latitude[0].latitude)):.0f}° of latitude, where the sine "
         f"changes by {change:.2f}. Beside the drift, the season of each field remains, {remainders}: {seen} at two "
         f"sigmas.{truth}",
-        f"Roll and pitch of the fields scatter by {spread / ARCSEC:.2f} arcsec together, {metres:.1f} m on the "
-        f"ground. The bias of one field therefore causes errors of {np.sqrt(2.0) * metres:.1f} m RMS in plan in "
-        f"another field, and the mean bias of {largest} fields {np.sqrt(1.0 + 1.0 / largest) * metres:.1f} m, beside "
-        "noise.",
+        f"Roll and pitch of the fields scatter by {spread / ARCSEC:.2f} arcsec together, {metres:.1f} m on the ground. "
+        f"The bias of one field therefore causes errors of {np.sqrt(2.0) * metres:.1f} m RMS in plan in another field, "
+        f"and the mean bias of {largest} fields {np.sqrt(1.0 + 1.0 / largest) * metres:.1f} m, beside noise.",
     )
     return Section("Biases against latitude", text, (figure, table))
 
@@ -674,7 +461,11 @@ def _rank(run: CalibrationRun) -> Section:
         (None, None, 4),
     )
     caption = "Correlations of the simultaneous adjustment, held unknowns excluded."
-    return Section("Observability", tuple(text), (table, _figure(run, "correlation-matrix", "Correlations", caption)))
+    return Section(
+        "Observability",
+        tuple(text),
+        (table, figure_of(run, _correlation_figure, "correlation-matrix", "Correlations", caption)),
+    )
 
 
 def _data(run: CalibrationRun) -> Section:

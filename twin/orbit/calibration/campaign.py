@@ -30,15 +30,13 @@ from optics.numerics.number_tree import FrozenMap
 from scenes.specs.orbit.flight import OrbitSpec, PassingSpec
 from scenes.specs.orbit.three_line_camera import ThreeLineCameraSpec
 from twin.orbit.flight.earth import Earth, east_north_up
-from twin.orbit.flight.light_effects import NO_EFFECTS, LightEffects
 from twin.orbit.flight.line_camera import LineTimes, line_cameras, pixel_positions
 from twin.orbit.flight.platform_table import TabulatedTrajectory
-from twin.orbit.flight.sensor import Platform, Sensor
+from twin.orbit.flight.sensor import NO_EFFECTS, LightEffects, Platform, Sensor
 from twin.orbit.flight.trajectory import MeasurementErrors, Trajectory
 from twin.orbit.measured.pass_measurements import ImagePoints, PassMeasurements
 
 if TYPE_CHECKING:
-    from scenes.specs.orbit.angle import EffectsSpec
     from scenes.specs.orbit.calibration import OrbitCalibrationSpec
     from scenes.specs.orbit.flight import ErrorsSpec
     from scenes.specs.orbit.measurements import MeasuredCalibrationSpec, ReadingErrorsSpec
@@ -52,16 +50,6 @@ _DISTORTION_STEPS = 8
 """Number of fixed-point steps that invert the lens distortion; each reduces the error by a factor of the relative
 distortion, 1e-3 or less.
 """
-
-
-def light_effects(spec: EffectsSpec) -> LightEffects:
-    """Return the effects on the light (light time, aberration, refraction) that a file switches on."""
-    return LightEffects(spec.light_time, spec.aberration, spec.refraction, spec.wavelength)
-
-
-def any_effect(effects: LightEffects) -> bool:
-    """Return True if at least one effect on the light is on."""
-    return any(getattr(effects, name) for name in EFFECTS)
 
 
 def light_shift(
@@ -92,7 +80,7 @@ def light_shift(
     ValueError
         A point lies outside the image, or a line of sight misses the Earth.
     """
-    if sensor.effects == NO_EFFECTS or not any_effect(sensor.effects):
+    if not sensor.effects.names:
         return np.zeros((len(line), 2))
     ground = sensor.ground(line, pixel, height)
     if not np.all(np.isfinite(ground)):
@@ -189,9 +177,8 @@ class PassData:
         """
         sensor, model = self.sensors[name], self.models[name]
         middle = np.full(2, 0.5 * (sensor.lines - 1))
-        ground = sensor.ground(
-            middle + np.array([-0.5, 0.5]), np.full(2, 0.5 * (sensor.camera.pixels - 1)), self.height
-        )
+        pixel = np.full(2, 0.5 * (sensor.camera.pixels - 1))
+        ground = sensor.ground(middle + np.array([-0.5, 0.5]), pixel, self.height)
         seconds = sensor.time(middle)
         to_body = np.swapaxes(sensor.trajectory.body_to_itrs(seconds), 1, 2)
         arm = np.einsum("nij,nj->ni", to_body, ground - sensor.trajectory.position(seconds))
@@ -215,9 +202,8 @@ class PassData:
             station, attitude = sensor.trajectory.position(seconds), sensor.trajectory.body_to_itrs(seconds)
             # times relative to the readings, between which the model of shared noise interpolates
             rays = Rays.of(row.point, image, station, attitude, seconds - self.phase)
-            rays_by_line[name] = (
-                rays if self.unit is None else replace(rays, spread=self.spread(name, row) / self.unit**2)
-            )
+            spread = None if self.unit is None else self.spread(name, row) / self.unit**2
+            rays_by_line[name] = replace(rays, spread=spread)
         return rays_by_line
 
     def spread(self, name: str, row: ImagePoints) -> np.ndarray:
@@ -384,9 +370,8 @@ class PassTruth:
             Seconds from the field's middle.
         """
         latitude = self.trajectory.orbit.earth.geodetic(self.trajectory.position(time))[1]
-        rotation = (
-            self.errors.bias + np.sin(latitude - self.errors.reference) * self.errors.thermal + time * self.errors.rate
-        )
+        e = self.errors
+        rotation = e.bias + np.sin(latitude - e.reference) * e.thermal + time * e.rate
         return np.asarray(Rotation.from_rotvec(rotation).inv().as_euler("XYZ"))
 
 
@@ -570,9 +555,8 @@ class FieldPass:
     @property
     def seconds_apart(self) -> float:
         """Mean time from when the first line sees the control points to when the last line does, in seconds."""
-        times = [
-            float(np.mean(self.data.sensors[k].time(r.line))) for k, r in self.control_images.items() if len(r.line)
-        ]
+        sensors = self.data.sensors
+        times = [float(np.mean(sensors[k].time(r.line))) for k, r in self.control_images.items() if len(r.line)]
         return max(times) - min(times)
 
     @property
@@ -586,6 +570,15 @@ class FieldPass:
         lon, lat, _ = self.data.earth.geodetic(self.control_ground.mean(axis=0))
         ground = self.control_ground + np.array(datum) @ east_north_up(lon, lat)
         return replace(self, control_ground=ground, control=replace(self.control, ground=ground))
+
+    def without_effects(self, removed: LightEffects, noise: Noise) -> FieldPass:
+        """Return the pass with its image points corrected for these effects on the light."""
+        field = self.control_images, self.control_ground, self.control_covariance, removed, self.is_control
+        check, ties = (
+            FrozenMap(self.data.check_rays(images, removed, noise) if images else {})
+            for images in (self.check_images, self.tie_images)
+        )
+        return replace(self, control=self.data.control_field(*field), check=check, ties=ties)
 
     def later(self, seconds: float) -> FieldPass:
         """Return the pass with rays from the station and attitude `seconds` later, with the image points unchanged.
@@ -681,7 +674,7 @@ class Campaign:
     @property
     def effects(self) -> LightEffects:
         """Effects on the light (light time, aberration, refraction) that the file switches on."""
-        return light_effects(self.spec.effects)
+        return LightEffects.of(self.spec.effects)
 
     @property
     def independent(self) -> Campaign:
@@ -701,18 +694,7 @@ class Campaign:
         CalibrationError
             Control coordinates cannot be used, or check points cannot be intersected.
         """
-        passes = tuple(
-            replace(
-                p,
-                control=p.data.control_field(
-                    p.control_images, p.control_ground, p.control_covariance, removed, p.is_control
-                ),
-                check=FrozenMap(p.data.check_rays(p.check_images, removed, self.noise) if p.check_images else {}),
-                ties=FrozenMap(p.data.check_rays(p.tie_images, removed, self.noise) if p.tie_images else {}),
-            )
-            for p in self.passes
-        )
-        return replace(self, passes=passes)
+        return replace(self, passes=tuple(p.without_effects(removed, self.noise) for p in self.passes))
 
     def later(self, seconds: float) -> Campaign:
         """Return the campaign with all lines exposed `seconds` later, but the same image points."""
@@ -940,12 +922,10 @@ def _field_pass(measured: PassMeasurements, payload: ThreeLineCameraSpec, ties_a
         control_covariance=where.covariance,
         is_control=where.role == "control",
         control_ids=where.ids,
-        check_images=_numbered(measured.images, checks, len(role)) if len(checks) else FrozenMap({}),
+        check_images=_numbered(measured.images, checks, len(role)),
         check_ground=measured.ground.itrs[checks],
         check_ids=measured.ground.ids[checks],
-        tie_images=_numbered(measured.images, np.flatnonzero(tie), len(role))
-        if ties_apart and np.any(tie)
-        else FrozenMap({}),
+        tie_images=_numbered(measured.images, np.flatnonzero(tie & ties_apart), len(role)),
         control=empty,
         check=FrozenMap({}),
         ties=FrozenMap({}),
@@ -953,7 +933,9 @@ def _field_pass(measured: PassMeasurements, payload: ThreeLineCameraSpec, ties_a
 
 
 def _numbered(images: Mapping[str, ImagePoints], chosen: np.ndarray, count: int) -> FrozenMap[str, ImagePoints]:
-    """Return the image points of the chosen ground points by line, with the points renumbered from 0."""
+    """Return the image points of the chosen ground points by line, with the points renumbered from 0; none if empty."""
+    if not len(chosen):
+        return FrozenMap({})
     number = np.full(count, -1)
     number[chosen] = np.arange(len(chosen))
     images_by_line = {}

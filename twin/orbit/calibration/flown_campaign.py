@@ -36,17 +36,15 @@ from twin.orbit.calibration.campaign import (
     PassTruth,
     PatchRecord,
     campaign_of,
-    light_effects,
     line_model,
     pass_data,
     passing_orbit,
 )
 from twin.orbit.flight.earth import Earth, east_north_up
-from twin.orbit.flight.light_effects import LightEffects
 from twin.orbit.flight.line_camera import LineTimes, changed_payload, drifted_payload, line_cameras
 from twin.orbit.flight.orbit import propagate
 from twin.orbit.flight.platform_table import PlatformTable, TabulatedTrajectory
-from twin.orbit.flight.sensor import Sensor
+from twin.orbit.flight.sensor import LightEffects, Sensor
 from twin.orbit.flight.trajectory import TERMS, Trajectory
 from twin.orbit.images.image_points import POINTS_REMEDY, MatchedPoints, PointsError, measure_points
 from twin.orbit.images.line_optics import LineOptics, optics_of
@@ -197,12 +195,10 @@ class Imager:
                 ties.append(_SelectedPoints.of(tied, tied.in_all, record.judgements["tie"]))
         control_points, check_points, tie = (_joined(parts, data) for parts in (control, check, ties))
         if control_points.count < _LEAST_CONTROL or check_points.count < 2:
-            raise BenchError(
-                f"{data.name}: only {control_points.count} control and {check_points.count} check points were matched "
-                f"in every line; {_match_counts(records)}",
-                ("images", "points"),
-                f"{_LEAST_CONTROL} control and 2 check points or more: {POINTS_REMEDY}",
-            )
+            found = f"only {control_points.count} control and {check_points.count} check points"
+            problem = f"{data.name}: {found} were matched in every line; {_match_counts(records)}"
+            remedy = f"{_LEAST_CONTROL} control and 2 check points or more: {POINTS_REMEDY}"
+            raise BenchError(problem, ("images", "points"), remedy)
         # an error in plan is common to all points of a patch: each of n points gets n times the variance
         share = np.sqrt(control_points.count / len(patches))
         sigma = self.spec.control.sigma * share, self.spec.points.height_sigma
@@ -416,7 +412,7 @@ def _pass(
         errors.model_copy(update={"star_tracker": tracker}), int(rng_data.integers(2**31)), terms
     )
     platform = PlatformTable.sampled(measured, errors.gps.interval, errors.star_tracker.interval)
-    effects = light_effects(spec.effects)
+    effects = LightEffects.of(spec.effects)
     lines = max(int((trajectory.last - trajectory.first) / spec.line_time) - 1, 1)
     times = LineTimes.even(trajectory.first + 0.5 * spec.line_time, spec.line_time, lines)
     sensors = {k: Sensor.of_lines(cameras[k], trajectory, earth, times, effects) for k in LINES}
@@ -576,9 +572,6 @@ def _points(
     good = np.flatnonzero(np.all(inside, axis=0))[:wanted]
     if len(good) < wanted:
         key = ("span",) if not all(np.any(np.isfinite(line)) for line, _ in seen.values()) else ("points",)
-        raise BenchError(
-            f"over {name} only {len(good)} of {len(height)} candidate points are seen by all three lines",
-            key,
-            "a longer pass, and a field inside all three strips",
-        )
+        problem = f"over {name} only {len(good)} of {len(height)} candidate points are seen by all three lines"
+        raise BenchError(problem, key, "a longer pass, and a field inside all three strips")
     return points[good], {k: (line[good], at[good]) for k, (line, at) in seen.items()}

@@ -24,7 +24,7 @@ from scenes.specs.orbit.measurements import MeasuredCalibrationSpec
 from twin.orbit.calibration.campaign import EFFECTS, Campaign, DetectedDrift
 from twin.orbit.calibration.campaign_adjustment import calibrated_alone, simultaneous
 from twin.orbit.calibration.schemes import FieldErrors, laboratory_errors, scheme_errors
-from twin.orbit.flight.light_effects import NO_EFFECTS
+from twin.orbit.flight.sensor import NO_EFFECTS
 
 UNEXPECTED_SIGMAS = 4.0
 """Difference of an unknown from its expected value, in units of its expected standard deviation, beyond which it is
@@ -191,25 +191,13 @@ def light_rows(campaign: Campaign, sigma: Mapping[str, float]) -> tuple[LightRow
             removed = replace(campaign.effects, **dict.fromkeys(left, False))
             case = clean.without_effects(removed if len(left) < len(on) else NO_EFFECTS)
             fit = simultaneous(case)
-        moved = {
-            line: np.sqrt(
-                np.mean(
-                    np.concatenate(
-                        [
-                            (a.check[line].image - b.check[line].image) ** 2
-                            for a, b in zip(case.passes, clean.passes, strict=True)
-                            if line in b.check
-                        ]
-                    ),
-                    axis=0,
-                )
-            )
-            for line in campaign.lines
-        }
+        moved, pairs = {}, list(zip(case.passes, clean.passes, strict=True))
+        for line in campaign.lines:
+            square = [(a.check[line].image - b.check[line].image) ** 2 for a, b in pairs if line in b.check]
+            moved[line] = np.sqrt(np.mean(np.concatenate(square), axis=0))
         shift = dict(zip(fit.names, (fit.values - base.values).tolist(), strict=True))
-        rows.append(
-            LightRow(left, moved, FieldErrors.mean(laboratory_errors(case)), _after(case), shift, sigma, fit.p_value)
-        )
+        before = FieldErrors.mean(laboratory_errors(case))
+        rows.append(LightRow(left, moved, before, _after(case), shift, sigma, fit.p_value))
     return tuple(rows)
 
 
@@ -274,12 +262,9 @@ def _warned(campaign: Campaign, change: Mapping[str, float], size: float) -> flo
 def unexpected_changes(campaign: Campaign, adjustment: Adjustment) -> tuple[UnexpectedChange, ...]:
     """Return the estimates that differ from expectation by over `UNEXPECTED_SIGMAS` sigmas, largest ratio first."""
     expected = _expected(campaign)
-    all_of_them = [
-        UnexpectedChange(n, float(adjustment.value(n) - v), s)
-        for n, (v, s) in expected.items()
-        if n in adjustment.names
-    ]
-    return tuple(sorted((s for s in all_of_them if s.ratio > UNEXPECTED_SIGMAS), key=lambda s: -s.ratio))
+    known = [(name, *prior) for name, prior in expected.items() if name in adjustment.names]
+    changes = [UnexpectedChange(n, float(adjustment.value(n) - v), s) for n, v, s in known]
+    return tuple(sorted((s for s in changes if s.ratio > UNEXPECTED_SIGMAS), key=lambda s: -s.ratio))
 
 
 def _expected(campaign: Campaign) -> dict[str, tuple[float, float]]:
@@ -291,9 +276,8 @@ def _expected(campaign: Campaign) -> dict[str, tuple[float, float]]:
     for flight in campaign.passes:
         # the season's part is expected, too
         spread = np.hypot(launch.bias, np.array(errors.season))
-        expected |= {
-            f"{flight.name} {axis}": (0.0, s) for axis, s in zip(BIAS, spread.tolist(), strict=True) if s > 0.0
-        }
+        biases = zip(BIAS, spread.tolist(), strict=True)
+        expected |= {f"{flight.name} {axis}": (0.0, s) for axis, s in biases if s > 0.0}
         if errors.switched_on:
             drift = zip(OFFSET, errors.gps.drift, strict=True)
             expected |= {f"{flight.name} offset {axis}": (0.0, s) for axis, s in drift if s > 0.0}
@@ -386,11 +370,8 @@ def drift_warnings(campaign: Campaign, drift: AttitudeDrift) -> list[str]:
         ]
     name, ratio = drift.most
     spec, undetected = campaign.spec, drift.undetected_sigmas or 0.0
-    if (
-        isinstance(spec, MeasuredCalibrationSpec)
-        and spec.errors.star_tracker.drift is None
-        and undetected > UNDETECTED_SIGMAS
-    ):
+    unspecified = isinstance(spec, MeasuredCalibrationSpec) and spec.errors.star_tracker.drift is None
+    if unspecified and undetected > UNDETECTED_SIGMAS:
         least = float(np.min(drift.detectable)) / ARCSEC if drift.detectable is not None else np.inf
         return [
             f"the file specifies no drift of the attitude within a pass: 1 arcsec in {drift.seconds:.0f} s changes"

@@ -23,6 +23,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
@@ -196,16 +197,13 @@ def scheme_errors(campaign: Campaign, alone: Mapping[str, Adjustment]) -> Frozen
     alone : Mapping[str, Adjustment]
         Calibration of each field by itself, by field.
     """
-    return evaluate_schemes(
-        campaign, alone, lambda flight, cameras, bias: check_point_errors(campaign, flight, cameras, bias)
-    )
+    return evaluate_schemes(campaign, alone, partial(check_point_errors, campaign))
 
 
 def laboratory_errors(campaign: Campaign) -> FrozenMap[str, CheckErrors]:
     """Return the errors at the check points of each field with the laboratory's camera."""
-    return FrozenMap(
-        {p.name: check_point_errors(campaign, p, campaign.laboratory, np.zeros(3)) for p in campaign.passes}
-    )
+    cameras, bias = campaign.laboratory, np.zeros(3)
+    return FrozenMap({p.name: check_point_errors(campaign, p, cameras, bias) for p in campaign.passes})
 
 
 def check_point_errors(
@@ -389,12 +387,10 @@ def with_points(field: CalibrationField, rays: Mapping[str, Rays], ground: np.nd
     """Return a field with n further points (n, 3) without given coordinates, whose rays are numbered from zero."""
     more, joined = len(ground), {}
     for line, row in field.rays.items():
-        pairs = (
-            (getattr(rays_of, name) for rays_of in (row, rays[line]))
-            for name in ("image", "station", "attitude", "time")
-        )
+        names = ("image", "station", "attitude", "time")
+        pairs = [(getattr(row, name), getattr(rays[line], name)) for name in names]
         point = np.concatenate([row.point, rays[line].point + len(field.ground)])
-        joined[line] = Rays.of(point, *(np.concatenate(list(pair)) for pair in pairs))
+        joined[line] = Rays.of(point, *(np.concatenate(pair) for pair in pairs))
     return replace(
         field,
         rays=joined,
@@ -531,15 +527,13 @@ def fly_with_drift(setup: CalibrationSetup, factor: float, seed: np.random.SeedS
     All other random numbers are those of the campaign without drift; the object `seed` is not modified.
     """
     test = setup.test
-    drift = {
-        name: spec.model_copy(
-            update={
-                "angles": tuple(factor * v for v in spec.angles),
-                "principal_distance": factor * spec.principal_distance,
-            }
-        )
-        for name, spec in test.drift.items()
-    }
+    drift = {}
+    for name, spec in test.drift.items():
+        sizes = {
+            "angles": tuple(factor * v for v in spec.angles),
+            "principal_distance": factor * spec.principal_distance,
+        }
+        drift[name] = spec.model_copy(update=sizes)
     update: dict[str, object] = {"drift": FrozenMap(drift), "strip": None}
     if test.effects.corrected:
         update["effects"] = test.effects.model_copy(update=dict.fromkeys(EFFECTS, False))
@@ -549,11 +543,10 @@ def fly_with_drift(setup: CalibrationSetup, factor: float, seed: np.random.SeedS
 def _treatment(
     campaign: Campaign, adjustment: Adjustment, schemes: Mapping[str, Mapping[str, CheckErrors]]
 ) -> Treatment:
-    errors = (
-        check_point_errors(campaign, p, adjustment.cameras_of(p.name), adjustment.bias(p.name)) for p in campaign.passes
-    )
+    flown = ((p, adjustment.cameras_of(p.name), adjustment.bias(p.name)) for p in campaign.passes)
+    errors = FieldErrors.pooled(check_point_errors(campaign, *part) for part in flown)
     pooled = {name: FieldErrors.pooled(fields.values()) for name, fields in schemes.items()}
-    return Treatment(FieldErrors.pooled(errors), adjustment.p_value, FrozenMap(pooled))
+    return Treatment(errors, adjustment.p_value, FrozenMap(pooled))
 
 
 def without_monitor(campaign: Campaign) -> Treatment:
@@ -579,21 +572,15 @@ def with_monitor(campaign: Campaign) -> Treatment:
 
 def adjust_with_readings(campaign: Campaign) -> Adjustment:
     """Adjust all fields at once, with each camera's drift in each field as unknowns that the monitor observes."""
-    return simultaneous(
-        campaign, drift=True, monitor=tuple(p for flight in campaign.passes for p in _reading_priors(campaign, flight))
-    )
+    priors = tuple(p for flight in campaign.passes for p in _reading_priors(campaign, flight))
+    return simultaneous(campaign, drift=True, monitor=priors)
 
 
 def adjust_field_with_readings(campaign: Campaign, flight: FieldPass) -> Adjustment:
     """Adjust one field with the monitor's readings, for the interior orientation of the cameras without drift."""
-    return adjust(
-        [flight.control],
-        campaign.laboratory,
-        campaign.noise,
-        unknowns=Unknowns(drift=True),
-        priors=_reading_priors(campaign, flight),
-        gauge=gauge_of(campaign),
-    )
+    field, priors, gauge = [flight.control], _reading_priors(campaign, flight), gauge_of(campaign)
+    drift = Unknowns(drift=True)
+    return adjust(field, campaign.laboratory, campaign.noise, unknowns=drift, priors=priors, gauge=gauge)
 
 
 def height_per_arcsec(campaign: Campaign) -> float:

@@ -42,9 +42,7 @@ READING: Record[CheckedReading] = Record(
     Quantity(
         "changes", lambda of: dict(of[1].changes), "conventions that differ from the stated ones, with their values"
     ),
-    Quantity(
-        "possible", lambda of: of[1].fit is not None, "true if the points can have been imaged under this reading"
-    ),
+    Quantity("possible", lambda o: o[1].fit is not None, "true if the points can have been imaged under this reading"),
     Quantity("why_impossible", lambda of: of[1].why or None, "reason why they cannot"),
     Quantity("rms_m", _of_fit(lambda fit: fit.rms), "root mean square residual in plan", "rms", 1),
     Quantity("rms_px", _of_fit(lambda fit: fit.rms_pixels), "rms residual along the lines' own axes", "rms", 1),
@@ -72,13 +70,9 @@ VALUE_TEST: Record[ValueTest] = Record(
 )
 CONVENTION: Record[tuple[ValueTest, ...]] = Record(
     "A convention: its stated and its best value, and whether the points determine it.",
-    Quantity(
-        "stated", lambda answers: next(test.value for test in answers if test.specified), "value in the test's file"
-    ),
+    Quantity("stated", lambda a: next(test.value for test in a if test.specified), "value in the test's file"),
     Quantity("best", lambda answers: next(test.value for test in answers if test.best), "value in the best reading"),
-    Quantity(
-        "determined", lambda answers: sum(test.possible for test in answers) == 1, "true if one value is possible"
-    ),
+    Quantity("determined", lambda a: sum(test.possible for test in a) == 1, "true if one value is possible"),
     Quantity("values", lambda answers: answers, "test of each value", record=VALUE_TEST),
 )
 
@@ -128,16 +122,12 @@ CHECK: Record[Check] = Record(
     "check.json. Conventions under which a pass explains its ground points.",
     Quantity("result", lambda run: run.verdict, "confirmed (as stated), another (others fit) or none"),
     Quantity("best", lambda run: dict(run.best.changes), "changed conventions of the best reading"),
-    Quantity(
-        "equally_likely", lambda run: [dict(reading) for reading in run.equally_likely], "equally likely readings"
-    ),
+    Quantity("equally_likely", lambda r: [dict(reading) for reading in r.equally_likely], "equally likely readings"),
     Quantity("reading", _best, "every convention of the best reading"),
     Quantity("readings_tried", lambda run: run.count, "number of readings that were tried"),
     Quantity("decided_by_cost", lambda run: DECIDED, "difference of cost from which two readings are separated"),
     Quantity("factor_of_variance", lambda run: run.factor, "factor by which the variances are too small"),
-    Quantity(
-        "ground_accuracy_m", lambda run: run.readings.ground.accuracy, "accuracy of the transformation to the ITRS"
-    ),
+    Quantity("ground_accuracy_m", lambda r: r.readings.ground.accuracy, "accuracy of the transformation to the ITRS"),
     Quantity(
         "image_points",
         lambda run: {name: len(raw.line) for name, raw in run.readings.images.items()},
@@ -183,10 +173,12 @@ def _verdict(run: Check) -> tuple[str, tuple[str, ...]]:
     """Return the verdict of the check, and the sentences that follow it in the report."""
     best, specified = run.best.fit, run.specified_fit
     if run.verdict == "none" or best is None:
-        left = "the points cannot have been imaged under any of them" if best is None else (
-            f"the best of {run.count} readings ({changes_text(run.best.changes)}) leaves {_metres(best.rms)} rms, "
-            f"chi-square {best.chi_square / best.freedom:.3g} per degree of freedom"
-        )  # fmt: skip
+        left = "the points cannot have been imaged under any of them"
+        if best is not None:
+            left = (
+                f"the best of {run.count} readings ({changes_text(run.best.changes)}) leaves {_metres(best.rms)} rms, "
+                f"chi-square {best.chi_square / best.freedom:.3g} per degree of freedom"
+            )
         return answer(
             "No combination of conventions explains the ground points",
             left,
@@ -199,11 +191,8 @@ def _verdict(run: Check) -> tuple[str, tuple[str, ...]]:
         cannot = f"the points do not determine these conventions: {', '.join(undetermined)}"
     if run.verdict == "confirmed":
         return answer(f"The stated conventions are confirmed: they fit the ground points to {size}", cannot)
-    was = (
-        f"under them {specified.why}"
-        if specified.fit is None
-        else f"with residuals of {_metres(specified.fit.rms)} rms"
-    )
+    fit = specified.fit
+    was = f"under them {specified.why}" if fit is None else f"with residuals of {_metres(fit.rms)} rms"
     right = f"the points agree with {changes_text(run.best.changes)}, to {size}"
     return answer(f"The stated conventions are wrong, {was}", right, cannot)
 
@@ -262,10 +251,8 @@ def _row(tried: TriedReading, run: Check) -> tuple[Cell, ...]:
 
 def _ranking(run: Check) -> Table:
     """Return the table of the likeliest interpretations of the files."""
-    specified, single = (
-        run.specified_fit,
-        [tried for tried in run.tried if len(tried.changes) <= 1 and tried is not run.best],
-    )
+    specified = run.specified_fit
+    single = [tried for tried in run.tried if len(tried.changes) <= 1 and tried is not run.best]
     first = [run.best, *(tried for tried in run.tried if tried.changes in run.equally_likely)]
     first += [specified] if specified not in first else []
     rest = [tried for tried in single if tried not in first][: _LISTED - len(first)]
@@ -289,16 +276,8 @@ def _conventions(run: Check) -> Section:
         for test in answers:
             verdict = "best" if test.best else "not excluded" if test.possible else test.why or "excluded"
             cost = max(test.excess, 0.0) if np.isfinite(test.excess) else None
-            rows.append(
-                (
-                    convention.title,
-                    convention.text(test.value),
-                    "yes" if test.specified else "",
-                    test.moved,
-                    cost,
-                    verdict,
-                )
-            )
+            specified = "yes" if test.specified else ""
+            rows.append((convention.title, convention.text(test.value), specified, test.moved, cost, verdict))
     text = (
         "Each convention by itself, the others as in the best reading. A value is not excluded if it moves the points "
         "by no more than the uncertainty of camera and platform. If it matters, give smaller uncertainties after a "

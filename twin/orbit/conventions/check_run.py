@@ -7,7 +7,7 @@ names, a reading is one interpretation of the files' numbers under one set of co
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -18,23 +18,9 @@ from optics.numerics.number_tree import FrozenMap
 from scenes.yaml.errors import InputError, Issue
 from twin.framework.procedure import Advance, silent
 from twin.orbit.conventions import pass_readings
-from twin.orbit.conventions.pass_readings import (
-    TESTED_CONVENTIONS,
-    Changes,
-    Fit,
-    ImpossibleError,
-    PassBench,
-    PassConventions,
-    PassReadings,
-    changed,
-    line_of,
-    line_times,
-    pixel_of,
-    spread,
-)
-from twin.orbit.flight.light_effects import LightEffects
 from twin.orbit.flight.line_camera import LineTimes, line_cameras
-from twin.orbit.measured.clock import epoch_before
+from twin.orbit.flight.sensor import LightEffects
+from twin.orbit.measured.earth_orientation import epoch_before
 from twin.orbit.measured.measurement_tables import campaign_files
 from twin.orbit.measured.pass_measurements import ImagePoints, PassMeasurements
 from twin.orbit.measured.platform_files import platform_table
@@ -80,8 +66,8 @@ class TriedReading:
         Reason why the interpretation is impossible.
     """
 
-    changes: Changes
-    fit: Fit | None
+    changes: pass_readings.Changes
+    fit: pass_readings.Fit | None
     why: str = ""
 
     @property
@@ -158,15 +144,15 @@ class Check:
     """
 
     setup: CheckSetup
-    readings: PassReadings
-    specified: PassConventions
+    readings: pass_readings.PassReadings
+    specified: pass_readings.PassConventions
     tried: tuple[TriedReading, ...]
     best: TriedReading
     verdict: Verdict
     factor: float
     answers: dict[str, tuple[ValueTest, ...]]
     first_points: dict[str, np.ndarray]
-    positions: dict[Changes, dict[str, np.ndarray] | str]
+    positions: dict[pass_readings.Changes, dict[str, np.ndarray] | str]
     count: int
     wrong: dict[str, tuple[str, ...]]
 
@@ -179,7 +165,7 @@ class Check:
         return (tried.cost - self.best.cost) / self.factor
 
     @property
-    def equally_likely(self) -> tuple[Changes, ...]:
+    def equally_likely(self) -> tuple[pass_readings.Changes, ...]:
         """Interpretations that the points do not distinguish from the best one and that have no more changes."""
         return tuple(
             tried.changes
@@ -207,7 +193,7 @@ def run_check(setup: CheckSetup, backend: Backend | None, seed: int, advance: Ad
     readings, specified = pass_readings.read_pass(setup.test, setup.camera, Path())
     bench = _bench(setup, readings, specified)
     others = pass_readings.alternatives(specified, readings.platform.attitude.quaternion is not None)
-    best, tried, count = _best_reading(bench, specified, others)
+    best, tried, count = _best_reading(bench, others)
     advance("readings", 1, 3)
     wrong: dict[str, tuple[str, ...]] = dict.fromkeys(readings.images, ())
     if best.fit is not None:
@@ -217,14 +203,14 @@ def run_check(setup: CheckSetup, backend: Backend | None, seed: int, advance: Ad
             ids, images = readings.ground.points.ids, bench.readings.images
             wrong = {name: tuple(map(str, ids[images[name].point[mask]])) for name, mask in masks.items()}
             bench = bench.without(masks)
-            tried = [_tried(bench, specified, item.changes) for item in tried]
+            tried = [_tried(bench, item.changes) for item in tried]
             best = _best(tried)
     advance("readings", 2, 3)
     ratio = np.inf if best.fit is None else best.fit.chi_square / best.fit.freedom
     verdict: Verdict = "none" if ratio > _FITS else "another" if best.changes else "confirmed"
     factor = max(float(ratio), 1.0) if np.isfinite(ratio) else 1.0
-    answers = {name: _answers(bench, specified, best, name, values, factor) for name, values in others.items()}
-    positions = {item: _first_positions(bench, specified, item, setup.test.shown) for item in _shown(others, best)}
+    answers = {name: _answers(bench, best, name, values, factor) for name, values in others.items()}
+    positions = {item: _first_positions(bench, item, setup.test.shown) for item in _shown(others, best)}
     tried.sort(key=lambda item: (item.cost, len(item.changes)))
     advance("readings", 3, 3)
     first = {name: raw.point[: setup.test.shown] for name, raw in bench.readings.images.items()}
@@ -233,28 +219,29 @@ def run_check(setup: CheckSetup, backend: Backend | None, seed: int, advance: Ad
     )
 
 
-def _bench(setup: CheckSetup, readings: PassReadings, specified: PassConventions) -> PassBench:
+def _bench(
+    setup: CheckSetup, readings: pass_readings.PassReadings, specified: pass_readings.PassConventions
+) -> pass_readings.PassBench:
     """Return the object that fits interpretations of the files to at most the test's number of image points."""
     cameras = line_cameras(setup.camera)
     images = {}
     for name, raw in readings.images.items():
         order = np.lexsort((raw.line, raw.pixel))
-        images[name] = raw.taken(order[spread(len(order), setup.test.points)])
+        images[name] = raw.taken(order[pass_readings.spread(len(order), setup.test.points)])
     total = sum(len(raw.line) for raw in images.values())
     if total < 3:
         file = setup.test.image_points.file
         raise InputError(Issue("too few image points for a check", file, found=str(total), allowed="three or more"))
-    clock = next(iter(readings.lines.values())).clock
-    epoch = epoch_before(clock.instants("TAI"))
-    part = PassReadings(readings.platform, readings.lines, readings.ground, images)
-    return PassBench(part, cameras, setup.test.uncertainty, LightEffects.of(setup.test.effects), epoch)
+    epoch = epoch_before(next(iter(readings.lines.values())).clock.instants("TAI"))
+    part, effects = replace(readings, images=images), LightEffects.of(setup.test.effects)
+    return pass_readings.PassBench(part, specified, cameras, setup.test.uncertainty, effects, epoch)
 
 
 def _best_reading(
-    bench: PassBench, specified: PassConventions, others: dict[str, tuple[Any, ...]]
+    bench: pass_readings.PassBench, others: dict[str, tuple[Any, ...]]
 ) -> tuple[TriedReading, list[TriedReading], int]:
     """Return the best interpretation, those that were fitted, and the number of those that were compared."""
-    start: Changes = ()
+    start: pass_readings.Changes = ()
     fitted: dict[frozenset[str], TriedReading] = {}
     seen: set[frozenset[str]] = set()
     for _ in range(_ROUNDS):
@@ -264,12 +251,12 @@ def _best_reading(
             if key in seen:
                 continue
             seen.add(key)
-            size = _rough(bench, changed(specified, changes))
+            size = _rough(bench, pass_readings.changed(bench.specified, changes))
             if len(changes) <= 1 or np.isfinite(size):
                 rough.append((size, len(changes), changes))
         rough.sort(key=lambda item: item[:2])
         chosen = [item[2] for k, item in enumerate(rough) if k < _CANDIDATES or item[1] <= 1]
-        fitted |= {_key(changes): _tried(bench, specified, changes) for changes in chosen}
+        fitted |= {_key(changes): _tried(bench, changes) for changes in chosen}
         best = _best(list(fitted.values()))
         if best.fit is None or best.fit.chi_square / best.fit.freedom <= _FITS or best.changes == start:
             break
@@ -277,24 +264,24 @@ def _best_reading(
     return best, list(fitted.values()), len(seen)
 
 
-def _key(changes: Changes) -> frozenset[str]:
+def _key(changes: pass_readings.Changes) -> frozenset[str]:
     """Return a dictionary key for a set of changed conventions, independent of their order."""
     return frozenset(f"{name}={value}" for name, value in changes)
 
 
-def _rough(bench: PassBench, reading: PassConventions) -> float:
+def _rough(bench: pass_readings.PassBench, reading: pass_readings.PassConventions) -> float:
     """Return the root of the median squared residual of a few points, in metres; infinite if they have no position."""
     try:
         return float(np.sqrt(np.median(np.sum(bench.residuals(reading, _ROUGH_POINTS) ** 2, axis=1))))
-    except ImpossibleError:
+    except pass_readings.ImpossibleError:
         return np.inf
 
 
-def _tried(bench: PassBench, specified: PassConventions, changes: Changes) -> TriedReading:
+def _tried(bench: pass_readings.PassBench, changes: pass_readings.Changes) -> TriedReading:
     """Fit one interpretation of the files, the specified one with `changes`, to the points."""
     try:
-        return TriedReading(changes, bench.fit(changed(specified, changes)))
-    except ImpossibleError as error:
+        return TriedReading(changes, bench.fit(pass_readings.changed(bench.specified, changes)))
+    except pass_readings.ImpossibleError as error:
         return TriedReading(changes, None, str(error))
 
 
@@ -308,57 +295,52 @@ def _best(tried: Sequence[TriedReading]) -> TriedReading:
     return min(likely, key=lambda reading: (len(reading.changes), reading.cost))
 
 
-def _wrong(bench: PassBench, fit: Fit) -> dict[str, np.ndarray]:
+def _wrong(bench: pass_readings.PassBench, fit: pass_readings.Fit) -> dict[str, np.ndarray]:
     """Return masks of gross errors by line: residuals far beyond the noise and the scatter of the other points."""
     square = np.einsum("ni,nij,nj->n", fit.left, np.linalg.inv(fit.noise), fit.left)
     scale = max(float(np.median(square)) / float(chi2.median(2)), 1.0)
     bad = square > scale * chi2.isf(_WRONG_SHARE, 2)
-    masks, start = {}, 0
-    for name, raw in bench.readings.images.items():
-        masks[name] = bad[start : start + len(raw.line)]
-        start += len(raw.line)
-    return masks
+    images = bench.readings.images
+    parts = np.split(bad, np.cumsum([len(raw.line) for raw in images.values()])[:-1])
+    return dict(zip(images, parts, strict=True))
 
 
 def _answers(
-    bench: PassBench, specified: PassConventions, best: TriedReading, name: str, values: tuple[Any, ...], factor: float
+    bench: pass_readings.PassBench, best: TriedReading, name: str, values: tuple[Any, ...], factor: float
 ) -> tuple[ValueTest, ...]:
     """Test every value of a convention, with the others as in the best interpretation."""
-    convention, reading = TESTED_CONVENTIONS[name], changed(specified, best.changes)
-    specified_value, best_value = convention.get(specified), convention.get(reading)
+    convention = pass_readings.TESTED_CONVENTIONS[name]
+    reading = pass_readings.changed(bench.specified, best.changes)
+    specified_value, best_value = convention.get(bench.specified), convention.get(reading)
     answers = []
     for value in (specified_value, *values):
-        conventions = convention.put(reading, value)
+        excess, moved, why = np.inf, None, ""
         try:
-            fit = bench.fit(conventions)
-            moved = (
-                None
-                if best.fit is None
-                else float(np.sqrt(np.mean(np.sum((fit.residual - best.fit.residual) ** 2, 1))))
-            )
-            answers.append(
-                ValueTest(
-                    value, value == specified_value, value == best_value, (fit.cost - best.cost) / factor, moved, ""
-                )
-            )
-        except ImpossibleError as error:
-            answers.append(ValueTest(value, value == specified_value, value == best_value, np.inf, None, str(error)))
+            fit = bench.fit(convention.put(reading, value))
+            excess = (fit.cost - best.cost) / factor
+            if best.fit is not None:
+                moved = float(np.sqrt(np.mean(np.sum((fit.residual - best.fit.residual) ** 2, 1))))
+        except pass_readings.ImpossibleError as error:
+            why = str(error)
+        answers.append(ValueTest(value, value == specified_value, value == best_value, excess, moved, why))
     return tuple(answers)
 
 
-def _shown(others: dict[str, tuple[Any, ...]], best: TriedReading) -> list[Changes]:
+def _shown(others: dict[str, tuple[Any, ...]], best: TriedReading) -> list[pass_readings.Changes]:
     """Return the interpretations whose ground positions are listed: specified, best, and those with one change."""
     singles = [((name, value),) for name, values in others.items() for value in values]
     return list(dict.fromkeys([(), best.changes, *singles]))
 
 
 def _first_positions(
-    bench: PassBench, specified: PassConventions, changes: Changes, count: int
+    bench: pass_readings.PassBench, changes: pass_readings.Changes, count: int
 ) -> dict[str, np.ndarray] | str:
     """Return the ground positions of the first points of each line, or why there are none."""
     try:
-        return {name: at[:count] for name, at in bench.positions(changed(specified, changes)).items()}
-    except ImpossibleError as error:
+        return {
+            name: at[:count] for name, at in bench.positions(pass_readings.changed(bench.specified, changes)).items()
+        }
+    except pass_readings.ImpossibleError as error:
         return str(error)
 
 
@@ -383,12 +365,12 @@ def measurements(run: Check) -> PassMeasurements:
     times, images = {}, {}
     for name, raw in readings.images.items():
         clock = readings.lines[name]
-        middle, _ = line_times(clock, reading, table.epoch, clock.line)
+        middle, _ = pass_readings.line_times(clock, reading, table.epoch, clock.line)
         times[name] = LineTimes.of(clock.line - clock.line[0], middle)
         pixels = run.setup.camera.pixels_of(name)
         # A mirrored axis changes the sign of the correlation.
         signs = np.array([-1.0 if reading.backward else 1.0, 1.0 if reading.first_pixel_sees == "right" else -1.0])
         spread = raw.covariance * signs[:, None] * signs
-        line = line_of(reading, raw, clock) - clock.line[0]
-        images[name] = ImagePoints.of(raw.point, line, pixel_of(reading, raw, pixels), spread)
+        line = pass_readings.line_of(reading, raw, clock) - clock.line[0]
+        images[name] = ImagePoints.of(raw.point, line, pass_readings.pixel_of(reading, raw, pixels), spread)
     return PassMeasurements(run.setup.test.name, table, FrozenMap(times), readings.ground.points, FrozenMap(images))

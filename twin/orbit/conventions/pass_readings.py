@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from scipy.linalg import cho_factor, cho_solve
+from scipy.linalg import block_diag, cho_factor, cho_solve
 
 from optics.geometry.pose import rotation_matrix
 from optics.numerics.array_math import in_span
@@ -26,13 +26,11 @@ from scenes.yaml.csv_table import Column, read_table
 from scenes.yaml.errors import InputError, Problem, names_text, nearest, shown
 from scenes.yaml.units import TIME
 from twin.orbit.flight.earth import Earth, east_north_up
-from twin.orbit.flight.light_effects import LightEffects
 from twin.orbit.flight.line_camera import LineCamera, LineTimes
 from twin.orbit.flight.platform_table import TabulatedTrajectory
-from twin.orbit.flight.sensor import Sensor
-from twin.orbit.measured.clock import Readings
+from twin.orbit.flight.sensor import LightEffects, Sensor
 from twin.orbit.measured.dimap_file import is_dimap, read_dimap
-from twin.orbit.measured.earth_orientation import constant_orientation
+from twin.orbit.measured.earth_orientation import Readings, constant_orientation
 from twin.orbit.measured.ground_files import GroundFile, read_ground_points
 from twin.orbit.measured.measurement_tables import COLUMNS, image_covariance, require_known
 from twin.orbit.measured.pass_measurements import ImagePoints
@@ -153,16 +151,9 @@ def read_pass(spec: OrbitCheckSpec, camera: ThreeLineCameraSpec, folder: Path) -
         images = _gcp_points(spec, ground, lines, folder)
     else:
         images = _image_points(spec.image_points, ground, lines, folder)
-    half = 0.5 if spec.image_points.centre == "half" else 0.0
-    specified = PassConventions(
-        conventions,
-        spec.lines.time_scale,
-        0.0,
-        spec.lines.moment,
-        half,
-        half + spec.image_points.first_pixel,
-        spec.image_points.first_pixel_sees,
-    )
+    half, points = 0.5 if spec.image_points.centre == "half" else 0.0, spec.image_points
+    origins = (half, half + points.first_pixel, points.first_pixel_sees)
+    specified = PassConventions(conventions, spec.lines.time_scale, 0.0, spec.lines.moment, *origins)
     return PassReadings(_around(platform, lines), lines, ground, images), specified
 
 
@@ -259,9 +250,8 @@ def _gcp_points(
         if camera not in lines:
             problem, allowed = ("an image of none of the camera's lines", names_text(f"{name}.tif" for name in lines))
             raise spec.image_points.error(problem, ("file",), found=shown(image), allowed=allowed)
-        number = rows[:, 0].astype(np.intp)
         covariance = rows[:, 3:, None] ** 2 * np.eye(2)
-        points[camera] = ImagePoints.of(number, rows[:, 1], rows[:, 2], covariance)
+        points[camera] = ImagePoints.of(rows[:, 0].astype(np.intp), rows[:, 1], rows[:, 2], covariance)
     if not points:
         raise spec.image_points.error("a .gcp file without images", ("file",), allowed="image, column, row, two sigmas")
     return FrozenMap(points)
@@ -298,33 +288,29 @@ class TestedConvention:
     ----------
     title : str
         Name of the convention in reports.
-    get : callable
-        Function that returns the convention's value in an interpretation (`PassConventions`).
-    put : callable
-        Function of an interpretation and a value that returns the interpretation with this value.
-    values : callable
-        Function that returns the convention's possible values, given the specified interpretation.
+    key : str
+        Attribute of the conventions of a pass or, after ``platform.``, of those of its platform.
+    values : tuple
+        Possible values; empty if they depend on the specified one.
     text : callable
         Function that returns a value as text for reports.
     """
 
     title: str
-    get: Callable[[PassConventions], Any]
-    put: Callable[[PassConventions, Any], PassConventions]
-    values: Callable[[PassConventions], tuple[Any, ...]]
+    key: str
+    values: tuple[Any, ...]
     text: Callable[[Any], str] = str
 
+    def get(self, conventions: PassConventions) -> Any:
+        """Return the value of the convention."""
+        return attrgetter(self.key)(conventions)
 
-def _convention(title: str, key: str, values: tuple[Any, ...], text: Callable[[Any], str] = str) -> TestedConvention:
-    """Return the test of a convention of the pass, or of the platform where its key begins with ``platform.``."""
-    name = key.removeprefix("platform.")
-    if name == key:
-        return TestedConvention(title, attrgetter(key), lambda c, v: replace(c, **{key: v}), lambda c: values, text)
-
-    def put(conventions: PassConventions, value: Any) -> PassConventions:
+    def put(self, conventions: PassConventions, value: Any) -> PassConventions:
+        """Return the conventions with another value of this one."""
+        name = self.key.removeprefix("platform.")
+        if name == self.key:
+            return replace(conventions, **{name: value})
         return replace(conventions, platform=replace(conventions.platform, **{name: value}))
-
-    return TestedConvention(title, attrgetter(key), put, lambda c: values, text)
 
 
 def _turned(c: PassConventions) -> tuple[tuple[str, str, str], ...]:
@@ -341,33 +327,27 @@ def _seconds(value: float) -> str:
 
 TESTED_CONVENTIONS: Mapping[str, TestedConvention] = FrozenMap(
     {
-        "quaternion_scalar": _convention("scalar of the quaternion", "platform.scalar", ("last", "first")),
-        "quaternion_turns": _convention("quaternion turns", "platform.turns", ("body_to_frame", "frame_to_body")),
-        "body_axes": TestedConvention(
-            "body x, y, z point",
-            lambda c: c.platform.body_axes,
-            lambda c, v: replace(c, platform=replace(c.platform, body_axes=v)),
-            _turned,
-            ", ".join,
-        ),
-        "angle_sequence": _convention(
+        "quaternion_scalar": TestedConvention("scalar of the quaternion", "platform.scalar", ("last", "first")),
+        "quaternion_turns": TestedConvention("quaternion turns", "platform.turns", ("body_to_frame", "frame_to_body")),
+        "body_axes": TestedConvention("body x, y, z point", "platform.body_axes", (), ", ".join),
+        "angle_sequence": TestedConvention(
             "sequence of the angles", "platform.sequence", ("xyz", "xzy", "yxz", "yzx", "zxy", "zyx")
         ),
-        "attitude_frame": _convention("frame of the attitude", "platform.attitude_frame", _FRAMES),
-        "orbit_frame": _convention("frame of the orbit", "platform.orbit_frame", _FRAMES),
-        "orbit_time_scale": _convention("time scale of the orbit", "platform.orbit_scale", _SCALES),
-        "attitude_time_scale": _convention("time scale of the attitude", "platform.attitude_scale", _SCALES),
-        "line_time_scale": _convention("time scale of the lines", "line_scale", _SCALES),
-        "line_time_offset": _convention("offset of the line times", "line_offset", (0.0, -1.0, 1.0), _seconds),
-        "line_moment": _convention("moment of a line's time", "moment", ("start", "middle", "end")),
-        "line_origin": _convention(
+        "attitude_frame": TestedConvention("frame of the attitude", "platform.attitude_frame", _FRAMES),
+        "orbit_frame": TestedConvention("frame of the orbit", "platform.orbit_frame", _FRAMES),
+        "orbit_time_scale": TestedConvention("time scale of the orbit", "platform.orbit_scale", _SCALES),
+        "attitude_time_scale": TestedConvention("time scale of the attitude", "platform.attitude_scale", _SCALES),
+        "line_time_scale": TestedConvention("time scale of the lines", "line_scale", _SCALES),
+        "line_time_offset": TestedConvention("offset of the line times", "line_offset", (0.0, -1.0, 1.0), _seconds),
+        "line_moment": TestedConvention("moment of a line's time", "moment", ("start", "middle", "end")),
+        "line_origin": TestedConvention(
             "coordinate of the middle of line 0", "line_origin", (0.0, 0.5, 1.0), lambda v: f"{v:g}"
         ),
-        "pixel_origin": _convention(
+        "pixel_origin": TestedConvention(
             "coordinate of the middle of the first pixel", "pixel_origin", (0.0, 0.5, 1.0, 1.5), lambda v: f"{v:g}"
         ),
-        "first_pixel_sees": _convention("first pixel sees", "first_pixel_sees", ("right", "left")),
-        "line_axis": _convention(
+        "first_pixel_sees": TestedConvention("first pixel sees", "first_pixel_sees", ("right", "left")),
+        "line_axis": TestedConvention(
             "lines are counted", "backward", (False, True), lambda v: "from the last" if v else "from the first"
         ),
     }
@@ -391,7 +371,8 @@ def alternatives(specified: PassConventions, quaternions: bool) -> dict[str, tup
         here = convention.get(specified)
         if name in without or (name == "attitude_frame" and here == "orbital"):
             continue
-        values[name] = tuple(v for v in convention.values(specified) if v != here)
+        possible = convention.values or _turned(specified)
+        values[name] = tuple(v for v in possible if v != here)
     return values
 
 
@@ -505,6 +486,8 @@ class PassBench:
     ----------
     readings : PassReadings
         Content of the files before interpretation.
+    specified : PassConventions
+        Interpretation that the test file specifies.
     cameras : mapping of str to LineCamera
         Geometry of each line.
     uncertainty : UncertaintySpec
@@ -516,6 +499,7 @@ class PassBench:
     """
 
     readings: PassReadings
+    specified: PassConventions
     cameras: Mapping[str, LineCamera]
     uncertainty: UncertaintySpec
     effects: LightEffects
@@ -598,19 +582,16 @@ class PassBench:
         for name, raw in self.readings.images.items():
             steps, pixel_step, line_time = self._steps(name, reading, raw, path)
             known = self.readings.ground.points
-            itrs = known.itrs[raw.point]
-            base = steps[0]
-            here = _plan(itrs, base)
-            slope = [(_plan(itrs, step) - here) for step in steps[1:]]
+            here, *moved = (_plan(known.itrs[raw.point], step) for step in steps)
+            slope = [step - here for step in moved]
             rotation = np.stack(slope[:3], axis=-1) / _ROTATION * size.attitude
             shift = np.stack(slope[3:6], axis=-1) / _SHIFT * size.position
             delay = slope[6] / _DELAY
             line, pixel, rise = delay * line_time[:, None], slope[7] / pixel_step[:, None], slope[8] / _RISE
             rows.append(here)
             common.append(np.concatenate([rotation, shift, delay[..., None] * size.time], axis=-1))
-            camera = self.cameras[name]
-            from_middle = pixel_of(reading, raw, camera.pixels) - 0.5 * (camera.pixels - 1)
-            scale = size.scale * from_middle[:, None]
+            pixels = self.cameras[name].pixels
+            scale = size.scale * (pixel_of(reading, raw, pixels) - 0.5 * (pixels - 1))[:, None]
             line_terms.append(np.stack([line * size.interior, pixel * size.interior, pixel * scale], axis=-1))
             image = np.stack([line, pixel], axis=-1)
             noise.append(image @ raw.covariance @ np.swapaxes(image, 1, 2) + _ground_noise(known, raw.point, rise))
@@ -624,10 +605,9 @@ class PassBench:
         left = r - shared @ weighted
         logarithm = 2.0 * float(np.sum(np.log(np.diag(factor[0]))))
         square = np.sum(residual**2, axis=1)
-        pixels = float(np.sqrt(np.mean(square / np.concatenate(sizes) ** 2)))
-        rms = float(np.sqrt(np.mean(square)))
+        rms, rms_pixels = (float(np.sqrt(np.mean(v))) for v in (square, square / np.concatenate(sizes) ** 2))
         cost = chi_square + logarithm
-        return Fit(residual, rms, pixels, left.reshape(-1, 2), np.concatenate(noise), chi_square, cost, len(r))
+        return Fit(residual, rms, rms_pixels, left.reshape(-1, 2), np.concatenate(noise), chi_square, cost, len(r))
 
     def _steps(
         self, name: str, reading: PassConventions, raw: ImagePoints, path: TabulatedTrajectory
@@ -758,14 +738,6 @@ def _covariance(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the covariance of all residuals of n points, and its part due to shared errors, (2n, 2n), in m^2."""
     common_terms = np.concatenate(common).reshape(-1, common[0].shape[-1])
-    shared = common_terms @ common_terms.T
-    start = 0
-    for terms in line_terms:
-        flat = terms.reshape(-1, terms.shape[-1])
-        part = slice(start, start + len(flat))
-        shared[part, part] += flat @ flat.T
-        start += len(flat)
-    whole = shared.copy()
-    for k, block in enumerate(np.concatenate(noise)):
-        whole[2 * k : 2 * k + 2, 2 * k : 2 * k + 2] += block
-    return whole, shared
+    by_line = [terms.reshape(-1, terms.shape[-1]) for terms in line_terms]
+    shared = common_terms @ common_terms.T + block_diag(*(terms @ terms.T for terms in by_line))
+    return shared + block_diag(*np.concatenate(noise)), shared

@@ -14,14 +14,7 @@ from twin.framework.artefact import Cell, SvgFigure, Table, significant
 from twin.framework.data_files import FrameFacts, tiff
 from twin.framework.record import Quantity, Record
 from twin.framework.report import Report, Section, answer
-from twin.orbit.export.export_run import (
-    ControlledPolynomial,
-    Export,
-    ExportedLine,
-    ProductPolynomial,
-    Quality,
-    SceneSource,
-)
+from twin.orbit.export import export_run
 from twin.orbit.export.ground_accuracy import TOGETHER, AccuracyMap, GroundSigma
 from twin.orbit.export.line_scanner import ModelError
 from twin.orbit.export.rational_polynomial import residual_sigma
@@ -52,7 +45,7 @@ ACCURACY: Record[AccuracyMap] = Record(
     Quantity("common_m", lambda f: f.horizontal()[0], "error that points share, per axis", "shared", 3),
     Quantity("random_m", lambda f: f.horizontal()[1], "by measured positions, without heights", "random", 3),
 )
-CONTROL: Record[ControlledPolynomial] = Record(
+CONTROL: Record[export_run.ControlledPolynomial] = Record(
     "Correction of a line's polynomials by control points, measured minus predicted.",
     Quantity("kind", lambda c: c.correction.kind, "shift, or affine function of line and sample"),
     Quantity("points", lambda c: len(c.names), "number of control points"),
@@ -68,7 +61,7 @@ CONTROL: Record[ControlledPolynomial] = Record(
     Quantity("err_bias_m", lambda c: c.after.bias_m, "ERR_BIAS: sigma of the correction along a horizontal axis"),
     Quantity("err_rand_m", lambda c: c.after.random_m, "ERR_RAND: scatter beyond the covariances"),
 )
-PRODUCT: Record[ProductPolynomial] = Record(
+PRODUCT: Record[export_run.ProductPolynomial] = Record(
     "Rational polynomials that came with a scene, minus its rigorous model.",
     Quantity("file", lambda p: p.file, "file of the polynomials"),
     Quantity("mean_line_px", lambda p: p.mean[0], "mean difference along the track", "mean, line", 3),
@@ -80,7 +73,7 @@ PRODUCT: Record[ProductPolynomial] = Record(
 )
 
 
-def quality_sections(quality: Quality) -> tuple[Section, ...]:
+def quality_sections(quality: export_run.Quality) -> tuple[Section, ...]:
     """Return the sections on product polynomials, control points and accuracy maps that were requested."""
     parts: list[Section] = []
     if quality.products:
@@ -98,7 +91,7 @@ def quality_sections(quality: Quality) -> tuple[Section, ...]:
     return (*parts, *([_map_section(quality.maps)] if quality.maps else ()))
 
 
-def quality_answers(quality: Quality) -> tuple[str, ...]:
+def quality_answers(quality: export_run.Quality) -> tuple[str, ...]:
     """Return sentences on control points and accuracy for the beginning of a report."""
     sentences = []
     for name, controlled in quality.control.items():
@@ -121,7 +114,7 @@ def quality_answers(quality: Quality) -> tuple[str, ...]:
     return tuple(sentences)
 
 
-def quality_warnings(quality: Quality) -> tuple[str, ...]:
+def quality_warnings(quality: export_run.Quality) -> tuple[str, ...]:
     """Return warnings of product polynomials and control points."""
     warnings = []
     for name, product in quality.products.items():
@@ -148,7 +141,7 @@ def quality_warnings(quality: Quality) -> tuple[str, ...]:
     return tuple(warnings)
 
 
-def control_section(control: Mapping[str, ControlledPolynomial]) -> Section:
+def control_section(control: Mapping[str, export_run.ControlledPolynomial]) -> Section:
     """Return the report section with each line's correction by control points and its residuals."""
     rows: list[tuple[Cell, ...]] = []
     points: list[tuple[Cell, ...]] = []
@@ -233,7 +226,7 @@ FOLDER = "models"
 """Name of the folder of the camera models in the run folder."""
 
 
-def _names(line: ExportedLine) -> dict[str, str]:
+def _names(line: export_run.ExportedLine) -> dict[str, str]:
     """Return the paths in the run folder of a line's support data (ISD), and of its image and RPC if there are any."""
     stem = f"{FOLDER}/{line.window.name}"
     names = {"isd": f"{stem}.json"}
@@ -267,7 +260,7 @@ GROUND: Record[GroundSigma] = Record(
     Quantity("random_east_m", lambda sigma: sigma.random_east_m, "independent part to the east"),
     Quantity("random_north_m", lambda sigma: sigma.random_north_m, "independent part to the north"),
 )
-LINE: Record[ExportedLine] = Record(
+LINE: Record[export_run.ExportedLine] = Record(
     "Image and models of a line; files are paths in the run folder, null for those that were not written.",
     Quantity("lines", lambda line: line.window.sensor.lines, "number of image lines", "lines"),
     Quantity("pixels", lambda line: line.window.pixels, "number of pixels", "pixels"),
@@ -283,7 +276,7 @@ LINE: Record[ExportedLine] = Record(
     Quantity("rpc_refused", lambda line: line.refused or None, "reason why there are no polynomials"),
     Quantity("ground", lambda line: line.ground, "error by a camera's change", record=GROUND, where_known=True),
 )
-EXPORT: Record[Export] = Record(
+EXPORT: Record[export_run.Export] = Record(
     "Content of export.json: line cameras for other software.",
     Quantity("epoch_utc", lambda run: run.epoch, "second 0 of the orbit"),
     Quantity("truth", lambda run: run.truth, "true if camera and orbit are the true ones"),
@@ -295,7 +288,7 @@ EXPORT: Record[Export] = Record(
 )
 
 
-def export_files(run: Export) -> dict[str, bytes]:
+def export_files(run: export_run.Export) -> dict[str, bytes]:
     """Return the files of an export, path -> content.
 
     Each line has an ISD, an RPC file, and its image as a GeoTIFF with the RPC inside.
@@ -317,7 +310,7 @@ _ROUGH = 0.1
 """Difference of rational polynomials from the rigorous sensor, in pixels, above which there is a warning."""
 
 
-def export_report(run: Export) -> Report:
+def export_report(run: export_run.Export) -> Report:
     """Return the report of an export: its files, and their differences from the rigorous sensor."""
     isd = max((e.worst_px, name) for name, line in run.lines.items() for e in line.scanner.errors)
     rpc = [(max(line.polynomial.error_px), name) for name, line in run.lines.items() if line.polynomial is not None]
@@ -359,7 +352,7 @@ def export_report(run: Export) -> Report:
     )
     read = "the run folder of a simulation" if run.source.folder is not None else "a test without images"
     model = "true camera and orbit" if run.truth else "the laboratory's camera on the measured orbit"
-    if isinstance(run.source, SceneSource):
+    if isinstance(run.source, export_run.SceneSource):
         scene = run.source.scene.read
         model = f"the rigorous model of the file, {'with' if scene.refracted else 'without'} refraction"
         read = f"{scene.profile} {scene.name}, DIMAP {scene.version}"
@@ -380,11 +373,11 @@ def export_report(run: Export) -> Report:
     )
 
 
-def _warnings(run: Export) -> tuple[str, ...]:
+def _warnings(run: export_run.Export) -> tuple[str, ...]:
     warnings = []
-    if isinstance(run.source, SceneSource) and run.source.scene.read.inertial_velocity:
+    if isinstance(run.source, export_run.SceneSource) and run.source.scene.read.inertial_velocity:
         warnings.append("the file's velocities are inertial, in Earth-fixed axes: omega x P has been subtracted")
-    if isinstance(run.source, SceneSource) and run.source.scene.read.light_speed:
+    if isinstance(run.source, export_run.SceneSource) and run.source.scene.read.light_speed:
         warnings.append(
             "the file's LIGHT_SPEED_SETTING is true: light time and aberration are not in the model, up to 13 m along "
             "the track; compare it with the product's own polynomials"

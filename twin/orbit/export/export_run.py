@@ -12,18 +12,17 @@ model.
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 import tifffile
 from numpy.typing import NDArray
 
 from analysis.orbit.forward_intersection import CalibratedLine
-from analysis.orbit.image_correction import ImageCorrection, Kind
-from analysis.orbit.rational_polynomial import RationalPolynomial
+from analysis.orbit.rational_polynomial import ImageCorrection, Kind, RationalPolynomial
 from optics.numerics.number_tree import FrozenMap
 from scenes.models.instrument_builder import build_instrument
 from scenes.specs.file_kinds import kind_of
@@ -209,16 +208,8 @@ class SceneSource:
 
     scene: DimapScene
     config: str
-
-    @property
-    def folder(self) -> None:
-        """Run folder of a simulation, always None: a scene has none."""
-        return None
-
-    @property
-    def seed(self) -> int:
-        """Seed of random numbers, always 0 and not used: nothing is simulated."""
-        return 0
+    folder: ClassVar[None] = None
+    seed: ClassVar[int] = 0
 
 
 @dataclass(frozen=True, eq=False)
@@ -362,10 +353,7 @@ def read_source(path: Path, seed: int | None = None) -> ExportSource:
         allowed = "a simulation, a test of intersection angles, the run folder of one, or DIM_NAME.XML of a scene"
         hint = _PAYLOAD_HINT if kind is not None and kind.name in ("three_line_camera", "instrument") else allowed
         raise InputError(Issue("twin.orbit export does not read this", str(path), found=found, allowed=hint))
-    resolve: Callable[[Path], SimulateSetup | AngleSetup] = (
-        SimulateSetup.read if kind.name == "orbit_simulate" else AngleSetup.read
-    )
-    setup = resolve(path)
+    setup: SimulateSetup | AngleSetup = (SimulateSetup if kind.name == "orbit_simulate" else AngleSetup).read(path)
     return ExportSource(setup, setup.to_yaml(), None, setup.test.seed if seed is None else seed, FrozenMap())
 
 
@@ -380,20 +368,13 @@ def _of_run(folder: Path) -> ExportSource:
     setup = SimulateSetup.read(folder / "config.yaml")
     numbers = read_yaml(folder / "simulate.json").data
     try:
-        windows = {}
+        windows, keys = {}, ("first_line", "first_pixel", "lines", "pixels")
         for name in setup.test.lines:
-            image = numbers["lines"][name]
-            windows[name] = (
-                int(image["first_line"]),
-                int(image["first_pixel"]),
-                int(image["lines"]),
-                int(image["pixels"]),
-            )
+            first_line, first_pixel, lines, pixels = (int(numbers["lines"][name][key]) for key in keys)
+            windows[name] = first_line, first_pixel, lines, pixels
     except (KeyError, TypeError, ValueError):
-        where = str(folder / "simulate.json")
-        raise InputError(
-            Issue("the positions of the images are missing", where, allowed="as the run wrote it")
-        ) from None
+        problem, where = "the positions of the images are missing", str(folder / "simulate.json")
+        raise InputError(Issue(problem, where, allowed="as the run wrote it")) from None
     return ExportSource(setup, setup.to_yaml(), folder, manifest.seed, FrozenMap(windows))
 
 
@@ -437,12 +418,10 @@ def run_export(
         raise ValueError("only the cameras of an instrument, as their user knows them, have estimated changes")
     chosen = _heights(source, heights)
     epoch, windows = _windows(source, backend, truth, changes)
-    lines = {}
+    lines, level = {}, _level(source, chosen)
     for k, (name, window) in enumerate(windows.items()):
         advance("models", k, len(windows))
-        lines[name] = _exported(
-            window, epoch, chosen, None if changes is None else changes[name], _level(source, chosen)
-        )
+        lines[name] = _exported(window, epoch, chosen, None if changes is None else changes[name], level)
     advance("models", len(windows), len(windows))
     return Export(source, epoch, truth, chosen, FrozenMap(lines))
 
@@ -488,11 +467,9 @@ def _windows(
             first_line, first_pixel, lines, pixels = source.windows[name]
             frame = _image(source.folder, name)
             if frame.shape != (lines, pixels):
-                found = f"{frame.shape[0]} lines of {frame.shape[1]} pixels"
+                found, allowed = f"{frame.shape[0]} lines of {frame.shape[1]} pixels", f"{lines} lines of {pixels}"
                 where = str(_file(source.folder, name))
-                raise InputError(
-                    Issue("an image of another size", where, found=found, allowed=f"{lines} lines of {pixels}")
-                )
+                raise InputError(Issue("an image of another size", where, found=found, allowed=allowed))
         part = replace(sensor, first_line_time=float(sensor.time(np.array([first_line]))[0]), lines=lines)
         windows[name] = ImagedWindow(name, part, first_pixel, pixels, setup.camera.pitch_of(name), frame)
     return str(setup.test.orbit.epoch), windows

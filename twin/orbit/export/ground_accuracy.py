@@ -193,12 +193,10 @@ def _derivatives(sensor: Sensor, line: Array, pixel: Array, height: float, level
 
     by_line = (seen(line + _EDGE, pixel) - seen(line - _EDGE, pixel)) / (2.0 * _EDGE)
     by_pixel = (seen(line, pixel + _EDGE) - seen(line, pixel - _EDGE)) / (2.0 * _EDGE)
-    columns = []
-    for k in range(6):
-        step = _MOVED if k < 3 else _TURNED
-        move = np.zeros(6)
-        move[k] = step
-        columns.append((seen(line, pixel, moved=move) - seen(line, pixel, moved=-move)) / (2.0 * step))
+    columns = [
+        (seen(line, pixel, moved=step) - seen(line, pixel, moved=-step)) / (2.0 * step.max())
+        for step in np.diag([_MOVED] * 3 + [_TURNED] * 3)
+    ]
     raised = (seen(line, pixel, height + _RAISED) - seen(line, pixel, height - _RAISED)) / (2.0 * _RAISED)
     # a longer principal distance moves the ground positions of pixels toward the line's middle
     from_middle = pixel - 0.5 * (sensor.camera.pixels - 1)
@@ -241,9 +239,8 @@ def single_accuracy(
     longitude, latitude, level = _ground_positions(sensor, line, pixel, height)
     derivatives = _derivatives(sensor, line, pixel, height, level[:, :2])
     constant, random = np.zeros((2, len(line), 3, 3))
-    constant[:, :2, :2] = _propagate(derivatives.platform, uncertainty.platform) + _propagate(
-        derivatives.interior, uncertainty.interior
-    )
+    constant[:, :2, :2] = _propagate(derivatives.platform, uncertainty.platform)
+    constant[:, :2, :2] += _propagate(derivatives.interior, uncertainty.interior)
     tilt = np.concatenate([derivatives.height, np.ones((len(line), 1))], axis=1)
     heights = uncertainty.height**2 * tilt[:, :, None] * tilt[:, None, :]
     random[:, :2, :2] = _propagate(derivatives.image, uncertainty.image)
@@ -296,9 +293,8 @@ def intersected_accuracy(
         part = _derivatives(sensor, at[inside], which[inside], height, level[inside, :2])
         to_image = np.linalg.inv(part.image)
         # derivatives of image position by ground position, and by the errors there
-        by_ground = to_image @ np.concatenate(
-            [np.tile(np.eye(2), (int(np.sum(inside)), 1, 1)), -part.height[:, :, None]], axis=2
-        )
+        level_part = np.tile(np.eye(2), (len(part.height), 1, 1))
+        by_ground = to_image @ np.concatenate([level_part, -part.height[:, :, None]], axis=2)
         weighted = np.swapaxes(by_ground, 1, 2) @ weight
         normal[inside] += weighted @ by_ground
         platform[inside] += weighted @ to_image @ part.platform
@@ -354,15 +350,12 @@ def accuracy_maps(
     ValueError
         No line of sight meets the Earth.
     """
-    maps = {
-        name: single_accuracy(sensor, uncertainty, height, at, count) for name, (sensor, at, count) in sensors.items()
-    }
+    maps = {name: single_accuracy(of, uncertainty, height, at, count) for name, (of, at, count) in sensors.items()}
     if len(sensors) > 1 and np.any(uncertainty.image):
         _, at, count = next(iter(sensors.values()))
+        lines = FrozenMap({name: sensor for name, (sensor, _, _) in sensors.items()})
         try:
-            maps[TOGETHER] = intersected_accuracy(
-                FrozenMap({name: sensor for name, (sensor, _, _) in sensors.items()}), uncertainty, height, at, count
-            )
+            maps[TOGETHER] = intersected_accuracy(lines, uncertainty, height, at, count)
         except ValueError:
             pass  # images of different ground; each line has its own map
     return maps

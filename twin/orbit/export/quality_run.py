@@ -12,25 +12,15 @@ from pathlib import Path
 
 import numpy as np
 
-from analysis.orbit.image_correction import LEAST_POINTS
-from analysis.orbit.rational_polynomial import RationalPolynomial
+from analysis.orbit.rational_polynomial import LEAST_POINTS, RationalPolynomial
 from optics.numerics.number_tree import FrozenMap
 from scenes.yaml.errors import InputError, Issue, names_text
 from scenes.yaml.yaml_file import dump_yaml
 from twin.framework.artefact import Table
 from twin.framework.record import Quantity, Record
 from twin.framework.report import Report, answer
+from twin.orbit.export import export_run
 from twin.orbit.export.export_report import CONTROL, FOLDER, control_section, quality_answers, quality_warnings
-from twin.orbit.export.export_run import (
-    ControlledPolynomial,
-    ControlPoints,
-    Export,
-    ExportedLine,
-    ProductPolynomial,
-    Quality,
-    SceneSource,
-    band_error,
-)
 from twin.orbit.export.ground_accuracy import AccuracyMap, CameraUncertainty, accuracy_maps
 from twin.orbit.export.rational_polynomial import corrected_polynomial, is_rpc, polynomial_correction, read_rpc
 from twin.orbit.flight.sensor import Sensor
@@ -40,7 +30,9 @@ _COMPARED = (15, 15, 3)
 """Number of lines, pixels and heights of the grid on which polynomials are compared with the rigorous model."""
 
 
-def with_quality(run: Export, uncertainty: CameraUncertainty | None, points: ControlPoints | None) -> Export:
+def with_quality(
+    run: export_run.Export, uncertainty: CameraUncertainty | None, points: export_run.ControlPoints | None
+) -> export_run.Export:
     """Return the export with the requested corrections of its polynomials and errors (ERR_BIAS, ERR_RAND).
 
     Parameters
@@ -58,7 +50,7 @@ def with_quality(run: Export, uncertainty: CameraUncertainty | None, points: Con
         No control point lies in an image, or the points do not determine a correction.
     """
     lines = dict(run.lines)
-    products = _products(run, run.source.scene) if isinstance(run.source, SceneSource) else {}
+    products = _products(run, run.source.scene) if isinstance(run.source, export_run.SceneSource) else {}
     control = {} if points is None else _controlled(points, lines)
     for name, controlled in control.items():
         lines[name] = replace(lines[name], polynomial=controlled.after)
@@ -67,20 +59,19 @@ def with_quality(run: Export, uncertainty: CameraUncertainty | None, points: Con
         windows = {n: (x.window.sensor, x.window.first_pixel, x.window.pixels) for n, x in lines.items()}
         maps = accuracy_maps(windows, uncertainty, run.heights[1])
         lines = {name: _with_errors(line, maps[name], name in control) for name, line in lines.items()}
-    return replace(run, lines=FrozenMap(lines), quality=Quality(FrozenMap(maps), FrozenMap(control), products))
+    quality = export_run.Quality(FrozenMap(maps), FrozenMap(control), products)
+    return replace(run, lines=FrozenMap(lines), quality=quality)
 
 
-def _with_errors(line: ExportedLine, accuracy: AccuracyMap, is_controlled: bool) -> ExportedLine:
+def _with_errors(line: export_run.ExportedLine, accuracy: AccuracyMap, is_controlled: bool) -> export_run.ExportedLine:
     """Return a line whose models contain its errors on the ground (ERR_BIAS and ERR_RAND).
 
     Polynomials corrected by control points keep the errors of the correction.
     """
     polynomial, (bias, random) = line.polynomial, accuracy.horizontal()
     if polynomial is not None and not is_controlled:
-        before = (polynomial.bias_m or 0.0, polynomial.random_m or 0.0)
-        polynomial = replace(
-            polynomial, bias_m=float(np.hypot(bias, before[0])), random_m=float(np.hypot(random, before[1]))
-        )
+        all_bias, all_random = np.hypot((bias, random), (polynomial.bias_m or 0.0, polynomial.random_m or 0.0)).tolist()
+        polynomial = replace(polynomial, bias_m=all_bias, random_m=all_random)
     worst = np.nanargmax(accuracy.ce90)
     (a, b), (_, c) = accuracy.covariance[worst, :2, :2]
     notes = (
@@ -93,9 +84,11 @@ def _with_errors(line: ExportedLine, accuracy: AccuracyMap, is_controlled: bool)
     return replace(line, polynomial=polynomial, scanner=replace(line.scanner, isd=FrozenMap(isd)))
 
 
-def _controlled(control: ControlPoints, lines: Mapping[str, ExportedLine]) -> dict[str, ControlledPolynomial]:
+def _controlled(
+    control: export_run.ControlPoints, lines: Mapping[str, export_run.ExportedLine]
+) -> dict[str, export_run.ControlledPolynomial]:
     """Return the polynomials of each line corrected by control points."""
-    controlled: dict[str, ControlledPolynomial] = {}
+    controlled: dict[str, export_run.ControlledPolynomial] = {}
     for name, line in lines.items():
         if line.polynomial is not None:
             corrected = correct_line(control, name, line.polynomial, len(lines) == 1)
@@ -107,8 +100,8 @@ def _controlled(control: ControlPoints, lines: Mapping[str, ExportedLine]) -> di
 
 
 def correct_line(
-    control: ControlPoints, name: str, polynomial: RationalPolynomial, alone: bool
-) -> ControlledPolynomial | None:
+    control: export_run.ControlPoints, name: str, polynomial: RationalPolynomial, alone: bool
+) -> export_run.ControlledPolynomial | None:
     """Return the polynomials of an image corrected by control points; None where no point lies in it.
 
     Parameters
@@ -136,16 +129,15 @@ def correct_line(
     ground = control.read.points.taken(rows[:, 0].astype(np.intp))
     spread = rows[:, 3:, None] ** 2 * np.eye(2)
     try:
-        correction = polynomial_correction(
-            polynomial, ground.itrs, ground.covariance, rows[:, 1:3], spread, control.kind
-        )
-        return ControlledPolynomial(ground.ids, correction, corrected_polynomial(polynomial, correction))
+        points = ground.itrs, ground.covariance, rows[:, 1:3], spread
+        correction = polynomial_correction(polynomial, *points, control.kind)
+        return export_run.ControlledPolynomial(ground.ids, correction, corrected_polynomial(polynomial, correction))
     except ValueError as error:
         allowed = f"{LEAST_POINTS[control.kind]} points or more, spread over the image of {name}"
         raise InputError(Issue(str(error), control.file, allowed=allowed)) from None
 
 
-def _products(run: Export, scene: DimapScene) -> Mapping[str, ProductPolynomial]:
+def _products(run: export_run.Export, scene: DimapScene) -> Mapping[str, export_run.ProductPolynomial]:
     """Return the comparison of the polynomials that a scene's file names with its rigorous model; empty if none."""
     folder = Path(scene.read.file).parent
     (name, line), *_ = run.lines.items()
@@ -157,7 +149,7 @@ def _products(run: Export, scene: DimapScene) -> Mapping[str, ProductPolynomial]
     return FrozenMap()
 
 
-def compare_product(sensor: Sensor, model: RationalPolynomial, file: str) -> ProductPolynomial:
+def compare_product(sensor: Sensor, model: RationalPolynomial, file: str) -> export_run.ProductPolynomial:
     """Compare a product's polynomials with the rigorous sensor, over the heights for which they are valid."""
     low, high = (model.offset[4] + sign * model.scale[4] for sign in (-1.0, 1.0))
     axes = (
@@ -171,7 +163,7 @@ def compare_product(sensor: Sensor, model: RationalPolynomial, file: str) -> Pro
     difference = predicted - np.stack([line, pixel], axis=-1)
     (line_mean, sample_mean), (line_rms, sample_rms) = difference.mean(axis=0).tolist(), difference.std(axis=0).tolist()
     largest, heights = float(np.max(np.abs(difference))), (float(low), float(high))
-    return ProductPolynomial(file, (line_mean, sample_mean), (line_rms, sample_rms), largest, heights)
+    return export_run.ProductPolynomial(file, (line_mean, sample_mean), (line_rms, sample_rms), largest, heights)
 
 
 _ENDING = re.compile(r"(_RPC|_rpc)$")
@@ -213,7 +205,7 @@ class PolynomialExport:
     """
 
     source: PolynomialSource
-    control: ControlledPolynomial
+    control: export_run.ControlledPolynomial
 
 
 def read_polynomial_source(path: Path, band: str | None = None) -> PolynomialSource | None:
@@ -234,13 +226,13 @@ def read_polynomial_source(path: Path, band: str | None = None) -> PolynomialSou
     if not path.is_file() or not is_rpc(path):
         return None
     if band is not None:
-        raise band_error(path, band)
+        raise export_run.band_error(path, band)
     name = _UNSAFE.sub("_", _ENDING.sub("", path.stem)) or "image"
     return PolynomialSource(name, str(path), read_rpc(path), dump_yaml({"source": str(path)}))
 
 
 def run_polynomial_export(
-    source: PolynomialSource, uncertainty: CameraUncertainty | None, points: ControlPoints | None
+    source: PolynomialSource, uncertainty: CameraUncertainty | None, points: export_run.ControlPoints | None
 ) -> PolynomialExport:
     """Correct rational polynomials by control points.
 
@@ -289,7 +281,7 @@ def polynomial_files(run: PolynomialExport) -> dict[str, bytes]:
 
 def polynomial_report(run: PolynomialExport) -> Report:
     """Return the report of polynomials corrected by control points: correction, residuals and remaining errors."""
-    quality = Quality(control=FrozenMap({run.source.name: run.control}))
+    quality = export_run.Quality(control=FrozenMap({run.source.name: run.control}))
     verdict, more = answer(*quality_answers(quality))
     before, after = run.source.polynomial, run.control.after
     rows = list(zip(("line", "sample"), before.offset[:2].tolist(), after.offset[:2].tolist(), strict=True))

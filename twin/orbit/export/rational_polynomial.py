@@ -24,8 +24,14 @@ from pathlib import Path
 import numpy as np
 
 from analysis.arrays import Array
-from analysis.orbit.image_correction import ImageCorrection, Kind, image_correction
-from analysis.orbit.rational_polynomial import TERMS, RationalPolynomial, fit_rpc
+from analysis.orbit.rational_polynomial import (
+    TERMS,
+    ImageCorrection,
+    Kind,
+    RationalPolynomial,
+    fit_rpc,
+    image_correction,
+)
 from scenes.yaml.errors import InputError, Issue, names_text, nearest, shown
 from scenes.yaml.input_file import why_unreadable
 from twin.orbit.flight.earth import Earth, curvature_radii, east_north_up
@@ -57,11 +63,17 @@ def sensor_polynomial(
     ValueError
         A line of sight misses the Earth, or the ground crosses a pole or the 180th meridian.
     """
-    fit_points = _image_to_ground(sensor, first_pixel, pixels, heights, _GRID, at_ends=True)
-    check_points = _image_to_ground(
-        sensor, first_pixel, pixels, heights, tuple(count - 1 for count in _GRID), at_ends=False
-    )
-    return fit_rpc(fit_points[:, :2], fit_points[:, 2:], check=(check_points[:, :2], check_points[:, 2:]))
+    low, high = np.array([(-0.5, sensor.lines - 0.5), (-0.5, pixels - 0.5), heights]).T
+    grids = []
+    for at_ends in (True, False):
+        counts = _GRID if at_ends else tuple(count - 1 for count in _GRID)
+        line, sample, height = _chebyshev_grid(0.5 * (low + high), 0.5 * (high - low), counts, at_ends)
+        ground = sensor.ground(line, first_pixel + sample, height)
+        if not np.all(np.isfinite(ground)):
+            raise ValueError("a line of sight misses the Earth")
+        longitude, latitude, _ = (np.degrees(v) for v in sensor.earth.geodetic(ground))
+        grids.append((np.stack([line, sample], axis=-1), np.stack([latitude, longitude, height], axis=-1)))
+    return fit_rpc(*grids[0], check=grids[1])
 
 
 def axis_sigma(covariance: Array) -> float:
@@ -73,28 +85,6 @@ def axis_sigma(covariance: Array) -> float:
         Covariances of errors to the east and to the north at N points of an image, m^2.
     """
     return float(np.sqrt(0.5 * np.mean(np.trace(covariance, axis1=-2, axis2=-1))))
-
-
-def _image_to_ground(
-    sensor: Sensor,
-    first_pixel: int,
-    pixels: int,
-    heights: tuple[float, float],
-    counts: tuple[int, ...],
-    *,
-    at_ends: bool,
-) -> Array:
-    """Return line, sample, latitude, longitude (degrees) and height (metres) at N points over an image, (N, 5).
-
-    Image coordinates count from the window's first pixel.
-    """
-    low, high = np.array([(-0.5, sensor.lines - 0.5), (-0.5, pixels - 0.5), heights]).T
-    line, sample, height = _chebyshev_grid(0.5 * (low + high), 0.5 * (high - low), counts, at_ends)
-    ground = sensor.ground(line, first_pixel + sample, height)
-    if not np.all(np.isfinite(ground)):
-        raise ValueError("a line of sight misses the Earth")
-    longitude, latitude, _ = sensor.earth.geodetic(ground)
-    return np.stack([line, sample, np.degrees(latitude), np.degrees(longitude), height], axis=-1)
 
 
 def _chebyshev_grid(middle: Array, half: Array, counts: tuple[int, ...], at_ends: bool) -> list[Array]:

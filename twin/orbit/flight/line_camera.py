@@ -116,14 +116,12 @@ def changed_payload(
     payload : ThreeLineCameraSpec
         Payload as measured in the laboratory.
     """
-    lines = {}
-    for name, line in payload.lines.items():
-        if name in spec.perturb:
-            change = spec.perturb[name]
-            point = tuple(a + b for a, b in zip(line.principal_point, change.principal_point, strict=True))
-            focal = line.principal_distance + change.principal_distance
-            line = line.model_copy(update={"principal_distance": focal, "principal_point": point})
-        lines[name] = line
+    lines = dict(payload.lines)
+    for name, change in spec.perturb.items():
+        line = lines[name]
+        point = tuple(a + b for a, b in zip(line.principal_point, change.principal_point, strict=True))
+        focal = line.principal_distance + change.principal_distance
+        lines[name] = line.model_copy(update={"principal_distance": focal, "principal_point": point})
     return payload.model_copy(update={"lines": FrozenMap(lines)})
 
 
@@ -143,13 +141,10 @@ def drifted_payload(payload: ThreeLineCameraSpec, drift: Mapping[str, np.ndarray
     lines = dict(payload.lines)
     for name, (alpha, beta, gamma, d_f) in drift.items():
         line = lines[name]
-        rotation = (
-            rotation_matrix(np.array(line.rotate)) @ about_axis(0, beta) @ about_axis(1, alpha) @ about_axis(2, gamma)
-        )
-        rotate = tuple(Rotation.from_matrix(rotation).as_rotvec().tolist())
-        lines[name] = line.model_copy(
-            update={"rotate": rotate, "principal_distance": line.principal_distance + float(d_f)}
-        )
+        turned = rotation_matrix(np.array(line.rotate)) @ about_axis(0, beta) @ about_axis(1, alpha)
+        rotate = tuple(Rotation.from_matrix(turned @ about_axis(2, gamma)).as_rotvec().tolist())
+        focal = line.principal_distance + float(d_f)
+        lines[name] = line.model_copy(update={"rotate": rotate, "principal_distance": focal})
     return payload.model_copy(update={"lines": FrozenMap(lines)})
 
 

@@ -255,10 +255,7 @@ def _solve(state: np.ndarray, end: float, tolerance: float) -> Any:
     forces = tuple(FORCES.values())
 
     def derivative(t: float, y: np.ndarray) -> np.ndarray:
-        total = forces[0](t, y[:3], y[3:])
-        for force in forces[1:]:
-            total = total + force(t, y[:3], y[3:])
-        return np.concatenate([y[3:], total])
+        return np.concatenate([y[3:], np.sum([force(t, y[:3], y[3:]) for force in forces], axis=0)])
 
     def above_ground(_: float, y: np.ndarray) -> float:
         return float(np.linalg.norm(y[:3])) - _POLAR_RADIUS

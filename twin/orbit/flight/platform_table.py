@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from analysis.arrays import Array
 from optics.numerics.array_math import UnphysicalError, in_span
-from twin.orbit.flight.light_effects import earth_rotation_velocity
+from twin.orbit.flight.sensor import earth_rotation_velocity
 from twin.orbit.flight.trajectory import Attitude, Trajectory, readings
 
 Interpolation = Literal["spline", "lagrange"]
@@ -262,11 +262,10 @@ class TabulatedTrajectory:
     def _quaternion(self) -> CubicSpline:
         return CubicSpline(self.table.attitude_time, self.table.quaternion)
 
-    def _joined(self, values: Array) -> Any:
-        """Return a function that interpolates values (N, 3) given at the N orbit readings."""
-        if self.interpolation == "spline":
-            return CubicSpline(self.table.orbit_time, values)
-        return _Lagrange(self.table.orbit_time, values)
+    def _joined(self, values: Array, stride: int = 1) -> Any:
+        """Return a function that interpolates every `stride`-th of the values (N, 3) at the N orbit readings."""
+        method = CubicSpline if self.interpolation == "spline" else _Lagrange
+        return method(self.table.orbit_time[::stride], values[::stride])
 
     def _checked(self, seconds: Any) -> np.ndarray:
         """Return the times as an array, or raise UnphysicalError if one of them is not covered by readings."""
@@ -293,12 +292,7 @@ class TabulatedTrajectory:
             return 0.0
         errors = []
         for stride in (2, 4):
-            part = slice(0, None, stride)
-            joined = (
-                CubicSpline(time[part], positions[part])
-                if self.interpolation == "spline"
-                else _Lagrange(time[part], positions[part])
-            )
+            joined = self._joined(positions, stride)
             # Stay one interval from the ends, where any interpolation is worse.
             inner = (time > time[stride]) & (time < time[::stride][-2]) & (np.arange(len(time)) % stride == stride // 2)
             errors.append(float(np.sqrt(np.mean(np.sum((joined(time[inner]) - positions[inner]) ** 2, axis=1)))))

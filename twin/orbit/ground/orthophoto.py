@@ -72,23 +72,16 @@ class Extent:
 
         They are whole multiples of `spacing`, in metres; `spare` is the number of additional cells on every side.
         """
-        (west, south), (east, north) = (
-            [int(f(v / spacing)) for v in ends]
-            for f, ends in ((np.floor, (self.west, self.south)), (np.ceil, (self.east, self.north)))
-        )
-        return spacing * np.arange(west - spare, east + spare + 1), spacing * np.arange(
-            south - spare, north + spare + 1
-        )
+        ends = ((self.west, self.east), (self.south, self.north))
+        cells = [(int(np.floor(first / spacing)), int(np.ceil(last / spacing))) for first, last in ends]
+        east, north = (spacing * np.arange(first - spare, last + spare + 1) for first, last in cells)
+        return east, north
 
 
 def around(extents: Sequence[Extent]) -> Extent:
     """Return the smallest extent that contains all the given extents."""
-    return Extent(
-        min(e.west for e in extents),
-        max(e.east for e in extents),
-        min(e.south for e in extents),
-        max(e.north for e in extents),
-    )
+    west, east, south, north = zip(*((e.west, e.east, e.south, e.north) for e in extents), strict=True)
+    return Extent(min(west), max(east), min(south), max(north))
 
 
 def reflectance(extent: Extent, spec: TextureSpec, seed: np.random.SeedSequence, changed: float = 0.0) -> SplineGrid:

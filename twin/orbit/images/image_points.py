@@ -16,7 +16,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Literal, TypeAlias
 
 import numpy as np
 from scipy.ndimage import distance_transform_edt, gaussian_filter, map_coordinates, spline_filter, zoom
@@ -160,9 +160,13 @@ def in_frame(image: LineFrame, position: np.ndarray, border: float) -> np.ndarra
     return np.asarray(np.all((position >= border) & (position <= last), axis=-1))
 
 
+Samples: TypeAlias = tuple[np.ndarray, np.ndarray, np.ndarray]
+"""East, north and height, in metres, of the ground under n templates' pixels, (n, side, side) each."""
+
+
 def _ground_of_samples(
     image: LineFrame, frame: GroundFrame, heights: ReferenceHeights, points: np.ndarray, position: np.ndarray, side: int
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+) -> Samples:
     """Return east, north and height, in metres, of the ground under n templates' pixels, (n, side, side) each.
 
     Parameters
@@ -203,28 +207,8 @@ def _ground_of_samples(
     return e, n, height + above
 
 
-def _templates_of_map(photo: Map, samples: tuple[np.ndarray, np.ndarray, np.ndarray], sample: float) -> np.ndarray:
-    """Return n templates of k x k pixels, (n, k, k), sampled from an orthophoto.
-
-    Parameters
-    ----------
-    photo : Map
-        Orthophoto from which the templates are sampled.
-    samples : tuple of ndarray
-        East, north and height of the ground under the templates' pixels, from `_ground_of_samples`.
-    sample : float
-        Ground distance of the image's pixels, metres.
-    """
-    rows, columns = photo.row_column(samples[0], samples[1])
-    return resampled(photo.values, rows, columns, smoothing=SOFTENING * sample / photo.spacing)
-
-
 def _templates_of_image(
-    source: LineFrame,
-    frame: GroundFrame,
-    samples: tuple[np.ndarray, np.ndarray, np.ndarray],
-    points: np.ndarray,
-    position: np.ndarray,
+    source: LineFrame, frame: GroundFrame, samples: Samples, points: np.ndarray, position: np.ndarray
 ) -> np.ndarray:
     """Return n templates of k x k pixels, (n, k, k), sampled from another line's image.
 
@@ -465,13 +449,14 @@ def map_points(patch: ImagedGround, spec: ImagePointsSpec) -> MatchedPoints:
     heights = ReferenceHeights.of(patch.control.dem)
     wanted = spec.control + spec.check
     east, north = _distinct_map(patch, heights, wanted, border, spec)
-    height = heights(east, north)
+    height, photo = heights(east, north), patch.control.orthophoto
     ground = patch.frame.itrs(east, north, height)
     lines = {}
     for name, image in patch.images.items():
         at = predicted(image, ground)
         samples = _ground_of_samples(image, patch.frame, heights, ground, at, spec.template)
-        patterns = _templates_of_map(patch.control.orthophoto, samples, float(np.mean(image.sample)))
+        smoothing = SOFTENING * float(np.mean(image.sample)) / photo.spacing
+        patterns = resampled(photo.values, *photo.row_column(*samples[:2]), smoothing=smoothing)
         lines[name] = _matched(name, image, patterns, at, _rise(patch, image, ground, at), height, spec)
     which = np.arange(len(east))
     share = spec.check / max(wanted, 1)
@@ -551,9 +536,8 @@ def _distinct_map(
     row, column = np.meshgrid(*sides, indexing="ij")
     east, north = photo.east_north(row.ravel(), column.ravel())
     ground = patch.frame.itrs(east, north, heights(east, north))
-    seen = np.all([in_frame(im, predicted(im, ground), border) for im in patch.images.values()], axis=0).reshape(
-        row.shape
-    )
+    seen = np.all([in_frame(im, predicted(im, ground), border) for im in patch.images.values()], axis=0)
+    seen = seen.reshape(row.shape)
     if not seen.any():
         raise PointsError(f"no point of the orthophoto is seen by every line {border} pixels from the frames' borders")
     scale = float(np.mean([np.mean(im.sample) for im in patch.images.values()])) / photo.spacing
@@ -616,7 +600,8 @@ def _matched(
     match = match_windows(image.frame, patterns, at, search_radius=spec.reach, options=options)
     status = match.reason.astype(np.int64)
     good = match.accepted
-    degree = _degree(int(good.sum()))
+    # the smooth displacement field has at least four matches per term
+    degree = next((degree for degree, terms in ((2, 7), (1, 4), (0, 2)) if good.sum() >= 4 * terms), None)
     if degree is None:
         raise PointsError(f"{name}: too few matches for a consensus: {match.text}")
     position = np.where(good[:, None], match.position, np.nan)
@@ -634,25 +619,5 @@ def _matched(
     if not agreed.accepted.any():
         raise PointsError(f"{name}: {agreed.text}; {match.text}")
     status[good & ~agreed.accepted] = CONSENSUS
-    return MatchedLine(
-        at,
-        match.position,
-        match.covariance,
-        match.correlation,
-        status,
-        (image.window.first_line, image.window.first_pixel),
-        agreed.scatter,
-        agreed.text,
-        agreed.field,
-    )
-
-
-def _degree(count: int) -> int | None:
-    """Return the polynomial degree of the smooth displacement field that has at least four matches per term.
-
-    It is None for too few matches.
-    """
-    for degree, terms in ((2, 7), (1, 4), (0, 2)):
-        if count >= 4 * terms:
-            return degree
-    return None
+    first, shared = (image.window.first_line, image.window.first_pixel), (agreed.scatter, agreed.text, agreed.field)
+    return MatchedLine(at, match.position, match.covariance, match.correlation, status, first, *shared)

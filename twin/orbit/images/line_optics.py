@@ -17,6 +17,7 @@ faster than the exposure.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -201,10 +202,8 @@ class LineOptics:
         The function is real for an unobstructed pupil, because the pupil is even; it refers to the centroid of the
         image of a point.
         """
-        out: np.ndarray = np.ones(np.broadcast_shapes(np.shape(pixel), np.shape(line)))
-        for factor in self.factors(pixel, line, motion).values():
-            out = out * factor
-        return out
+        start = np.ones(np.broadcast_shapes(np.shape(pixel), np.shape(line)))
+        return np.asarray(math.prod(self.factors(pixel, line, motion).values(), start=start))
 
     def factors(self, pixel: np.ndarray, line: np.ndarray, motion: ImageMotion) -> dict[str, np.ndarray]:
         """Return the factors of the transfer function, by name, at frequencies in cycles per pixel and per line.

@@ -247,15 +247,11 @@ def imaged_lines(
     seed : SeedSequence
         Seed of the fixed-pattern noise, which is the same in all images of a line.
     """
-    return {
-        name: ImagedLine(
-            with_mean_jitter(sensor, optics[name]),
-            measured[name],
-            optics[name],
-            optics[name].ccd.pattern(stream(seed, k)),
-        )
-        for k, (name, sensor) in enumerate(sensors.items())
-    }
+    lines = {}
+    for k, (name, sensor) in enumerate(sensors.items()):
+        of, pattern = optics[name], optics[name].ccd.pattern(stream(seed, k))
+        lines[name] = ImagedLine(with_mean_jitter(sensor, of), measured[name], of, pattern)
+    return lines
 
 
 def window_of(name: str, sensor: Sensor, frame: GroundFrame, height: float, size: tuple[int, int]) -> Window:

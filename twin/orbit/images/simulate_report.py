@@ -1,76 +1,274 @@
-"""Report of a simulated pass over a patch: tables, figures, files."""
+"""Report of a simulated pass over a patch: tables, figures, files.
+
+Report of points measured in images: listing, tables and figures.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
+from matplotlib.lines import Line2D
+from matplotlib.patheffects import Normal, Stroke
 
+from scenes.specs.orbit.scene import ImagePointsSpec
 from scenes.yaml.units import ANGLE, LENGTH, format_quantity
-from twin.framework.artefact import Data, PngFigure, SvgFigure, Table
-from twin.framework.data_files import FrameFacts, MapGeoreference
+from twin.framework import svg
+from twin.framework.artefact import Artefact, Cell, Data, PngFigure, SvgFigure, Table, rounded_down
+from twin.framework.data_files import FrameFacts, MapGeoreference, csv_table
 from twin.framework.reference_frames import described
 from twin.framework.report import Report, Section, answer
-from twin.framework.svg import (
-    BLUE,
-    GREEN,
-    INK,
-    LIGHT,
-    ORANGE,
-    SKY,
-    VERMILION,
-    look,
-    new_figure,
-    plain_axes,
-    to_png,
-    to_svg,
-)
 from twin.orbit.ground.orthophoto import Raster
-from twin.orbit.images.patch import LineImage
-from twin.orbit.images.point_report import pixel_axes, points_section
-from twin.orbit.images.simulate_run import (
-    GEOREFERENCE,
-    LINE,
-    TRUTH,
-    Simulation,
-    camera_data,
-    georeference_data,
-    trajectory_data,
-)
+from twin.orbit.images import simulate_run
+from twin.orbit.images.image_points import CONSENSUS, ImagedGround, LineFrame, MatchedPoints, PatchPoints, status_text
+from twin.orbit.images.patch import WRONG, LineImage, Patch, judged
 
 if TYPE_CHECKING:
     from scenes.specs.orbit.scene import InteriorChangeSpec
     from scenes.specs.orbit.setup import SimulateSetup
 
 
+def pixel_axes(axes: Axes) -> None:
+    """Label the axes of an image in a figure with a few whole numbers of pixels and lines.
+
+    The limits of the axes must be set before.
+    """
+    axes.set(xlabel="pixel", ylabel="line")
+    axes.ticklabel_format(useOffset=False)
+    axes.locator_params(axis="x", nbins=4)
+    axes.locator_params(axis="y", nbins=6)
+    axes.tick_params(axis="y", labelrotation=90)
+    for label in axes.get_yticklabels():
+        label.set_verticalalignment("center")
+
+
+HEADS = (
+    "sort",
+    "point",
+    "line_name",
+    "longitude_deg",
+    "latitude_deg",
+    "height_m",
+    "x_itrs_m",
+    "y_itrs_m",
+    "z_itrs_m",
+    "predicted_line",
+    "predicted_pixel",
+    "line",
+    "pixel",
+    "line_sigma",
+    "pixel_sigma",
+    "correlation_of_sigmas",
+    "template_correlation",
+    "accepted",
+    "status",
+)
+"""Column headings of the listing of measured points."""
+
+
+@dataclass(frozen=True, eq=False)
+class PointListing(Data):
+    """CSV file of measured points, one row per point and line with the columns of `HEADS`, linked in the report."""
+
+    kind: ClassVar[str] = "csv"
+
+    def content(self) -> bytes:
+        """Return the rows as text of the CSV file, with all their digits; missing values are empty."""
+        return csv_table([HEADS, *self.data])
+
+
+def listing(patch: ImagedGround, points: PatchPoints) -> list[list[Any]]:
+    """Return the rows of the listing of points, one for each point and line, with the columns of `HEADS`."""
+    rows: list[list[Any]] = []
+    for sort, group in points.sorts.items():
+        degrees = np.degrees(patch.frame.geographic(group.east, group.north)).T
+        for name, line in group.lines.items():
+            image, expected = line.image, line.predicted + np.array(line.first)
+            sigma = np.sqrt(np.diagonal(line.covariance, axis1=1, axis2=2))
+            with np.errstate(invalid="ignore", divide="ignore"):
+                together = line.covariance[:, 0, 1] / np.prod(sigma, axis=1)
+            for k in range(len(group.ground)):
+                kind = "check" if group.check[k] else sort
+                numbers = (*expected[k], *image[k], *sigma[k], together[k], line.correlation[k])
+                shown = [float(v) if np.isfinite(v) else None for v in numbers]
+                code = int(line.status[k])
+                ground = [*map(float, degrees[k]), float(group.height[k]), *map(float, group.ground[k])]
+                rows.append([kind, k, name, *ground, *shown, int(line.accepted[k]), status_text(code)])
+    return rows
+
+
+T = TypeVar("T")
 _DPI = 110
 """Resolution of the figures, in dots per inch."""
-_PARTS = {"lens": BLUE, "pixel": GREEN, "diffusion": ORANGE, "step": SKY, "stages": VERMILION}
+SORTS = {"control": "orthophoto", "tie": "tie"}
+"""Names in reports of the kinds of points, by key."""
 
 
-def _images_png(run: Simulation) -> bytes:
+def how_measured(spec: ImagePointsSpec, known: str) -> str:
+    """Return a description of how points are measured in images.
+
+    Parameters
+    ----------
+    spec : ImagePointsSpec
+        Options of the measurement.
+    known : str
+        Description of the sensor that predicts the points' positions in each line's image.
+    """
+    return (
+        "Distinct points of the orthophoto, with heights of the elevation model, and distinct points of one line's "
+        f"image are transformed to each line's geometry by {known}. Templates of {spec.template} pixels are searched "
+        f"{spec.reach} pixels to each side and fitted by least squares. Points are rejected that fail a threshold of "
+        "the matching or do not follow the smooth displacement of their neighbours."
+    )
+
+
+def points_section(patch: Patch, points: PatchPoints, spec: ImagePointsSpec) -> Section:
+    """Return the report section on the points measured in a patch: numbers, figures and listing."""
+    shown = point_artefacts(patch, points, found_table(points), _true(patch, points))
+    return Section("Measured points", (how_measured(spec, "the measured sensor"),), shown)
+
+
+def point_artefacts(patch: ImagedGround, points: PatchPoints, *tables: Table) -> tuple[Artefact, ...]:
+    """Return the report's parts on measured points: tables, figures, reasons of rejections, and listing."""
+    figures = [
+        PngFigure(
+            f"points-{sort}",
+            f"Displacement from predicted to measured, {SORTS[sort]} points",
+            "Arrows: displacements less their median in the title, enlarged by the factor there; crosses: rejected "
+            "by the consensus of the neighbours; points: not matched.",
+            points_png(patch, group),
+        )
+        for sort, group in points.sorts.items()
+    ]
+    caption = "Each point in each line: ground coordinates, image coordinates, sigmas of the fit, status."
+    listed = PointListing("points", "Points", caption, listing(patch, points))
+    return *tables, *figures, _lost_table(points), listed
+
+
+def flat(points: PatchPoints, below: Callable[[MatchedPoints], Mapping[str, T]]) -> dict[str, T]:
+    """Return results by kind of point and line in one mapping, with names such as "tie, forward"."""
+    groups = ((sort, below(group)) for sort, group in points.sorts.items())
+    return {f"{SORTS[sort]}, {name}": line for sort, lines in groups for name, line in lines.items()}
+
+
+def found_table(points: PatchPoints) -> Table:
+    """Return the table of the points that were matched, by kind and line."""
+    matches = flat(points, lambda group: group.searched_lines)
+    rows = {name: simulate_run.MATCHED(line) for name, line in matches.items() if line.accepted.any()}
+    caption = (
+        "Displacement from predicted to measured and sigma: medians of the accepted, px along the track and the line."
+    )
+    displacement = ("displacement_lines_px", "displacement_pixels_px")
+    keys = ("found", "matched", "accepted", *displacement, *(f"{key}_sigma" for key in displacement))
+    return simulate_run.MATCHED.table("points-found", "Matching", caption, rows, keys, "points, line", digits=4)
+
+
+def _true(patch: Patch, points: PatchPoints) -> Table:
+    """Return the table that compares the measured points with their true image positions."""
+    rows = {
+        name: simulate_run.COMPARED(line)
+        for name, line in flat(points, lambda quantity: judged(patch, quantity)).items()
+    }
+    caption = (
+        f"Wrong: {WRONG}; counted among all measured points, those that passed the matching, and those that passed the "
+        "consensus. RMS and mean error, px, and chi-square of the right points."
+    )
+    keys = [quantity.key for quantity in simulate_run.COMPARED][:-1]
+    return simulate_run.COMPARED.table(
+        "points-truth", "Comparison with the truth", caption, rows, keys, "points, line", digits=4
+    )
+
+
+def _lost_table(points: PatchPoints) -> Table:
+    """Return the table of the reasons why points were not accepted."""
+    rows: list[tuple[Cell, ...]] = []
+    for sort, group in points.sorts.items():
+        count = {name: line.rejections for name, line in group.searched_lines.items()}
+        total: Counter[str] = Counter()
+        for reasons in count.values():
+            total.update(reasons)
+        for text, _ in total.most_common():
+            rows.append((SORTS[sort], text, ", ".join(f"{n} {c.get(text, 0)}" for n, c in count.items())))
+    return Table("points-lost", "Why points were not accepted", "", ("points", "reason", "number"), rows)
+
+
+def points_png(patch: ImagedGround, points: MatchedPoints) -> bytes:
+    """Return a PNG of every line's frame with its points and their displacements."""
+    with svg.look(f"points-{points.kind}"):
+        names = list(points.searched_lines)
+        figure = svg.new_figure(4.3 if len(names) > 2 else 5.6)
+        panels = np.atleast_1d(figure.subplots(1, len(names)))
+        for axes, name in zip(panels, names, strict=True):
+            _panel(axes, name, patch.images[name], points)
+        marks = [
+            Line2D([], [], color=svg.YELLOW, marker=r"$\rightarrow$", ls="", ms=9, label="accepted"),
+            Line2D([], [], color=svg.VERMILION, marker="x", ls="", label="rejected by consensus"),
+            Line2D([], [], color=svg.SKY, marker=".", ls="", label="not matched"),
+        ]
+        figure.legend(handles=marks, loc="outside lower center", ncols=3, labelcolor="black")
+        return svg.to_png(figure, _DPI)
+
+
+def _panel(axes: Axes, name: str, image: LineFrame, points: MatchedPoints) -> None:
+    """Draw one line's frame with its points and their displacements."""
+    line = points.lines[name]
+    low, high = np.percentile(image.frame, (0.5, 99.5))
+    row, column = line.first
+    rows, columns = image.frame.shape
+    ends = (column - 0.5, column + columns - 0.5, row + rows - 0.5, row - 0.5)
+    axes.imshow(image.frame, cmap="gray", vmin=low, vmax=high, extent=ends, interpolation="antialiased", alpha=0.75)
+    at, to = line.predicted + np.array(line.first), line.image
+    # Adding zero removes a minus before zero.
+    middle = np.round(line.median_shift, 1) + 0.0
+    rest = to - at - middle
+    good, against = line.accepted, line.status == CONSENSUS
+    longest = float(np.quantile(np.linalg.norm(rest[good], axis=1), 0.95))
+    enlarged = rounded_down(0.06 * min(rows, columns) / max(longest, 1e-3))
+    arrow: dict[str, Any] = {"angles": "xy", "scale_units": "xy", "scale": 1.0 / enlarged, "width": 0.004}
+    effects = [Stroke(linewidth=1.2, foreground="black"), Normal()]
+    axes.quiver(to[good, 1], to[good, 0], rest[good, 1], rest[good, 0], color=svg.YELLOW, path_effects=effects, **arrow)
+    axes.plot(to[against, 1], to[against, 0], "x", color=svg.VERMILION, ms=6, mew=1.6)
+    unmatched = ~good & ~against
+    # Points that were not matched are drawn at their expected position.
+    axes.plot(
+        at[unmatched, 1] + middle[1], at[unmatched, 0] + middle[0], ".", color=svg.SKY, ms=5, mec="black", mew=0.4
+    )
+    axes.set(
+        title=f"{name}: median {middle[0]:.1f} lines, {middle[1]:.1f} pixels\nresiduals enlarged {enlarged:g} ×",
+        xlim=ends[:2],
+        ylim=ends[2:],
+    )
+    pixel_axes(axes)
+
+
+_PARTS = {"lens": svg.BLUE, "pixel": svg.GREEN, "diffusion": svg.ORANGE, "step": svg.SKY, "stages": svg.VERMILION}
+
+
+def _images_png(run: simulate_run.Simulation) -> bytes:
     """Draw the lines' images side by side, each stretched between its 0.5% and 99.5% grey values."""
-    with look("simulate-images"):
+    with svg.look("simulate-images"):
         images = run.patch.images
         columns = min(len(images), 3)
         rows = -(-len(images) // columns)
-        figure = new_figure(0.35 + 3.5 * rows)
+        figure = svg.new_figure(0.35 + 3.5 * rows)
         panels = np.atleast_1d(figure.subplots(rows, columns)).ravel()
         for axes, (name, image) in zip(panels, images.items(), strict=False):
             _show_image(axes, name, image)
         for axes in panels[len(images) :]:
             axes.set_visible(False)
-        return to_png(figure, _DPI)
+        return svg.to_png(figure, _DPI)
 
 
-def _control_png(run: Simulation) -> bytes:
+def _control_png(run: simulate_run.Simulation) -> bytes:
     """Draw orthophoto and elevation model, and return the picture as PNG."""
-    with look("simulate-control"):
-        figure = new_figure(4.6)
+    with svg.look("simulate-control"):
+        figure = svg.new_figure(4.6)
         photo, heights = figure.subplots(1, 2)
         control = run.patch.control
         _show_raster(photo, control.orthophoto, "gray")
@@ -78,7 +276,7 @@ def _control_png(run: Simulation) -> bytes:
         photo.set(title="Orthophoto", ylabel="north [km]")
         heights.set(title="Elevation model, m above the ellipsoid")
         figure.colorbar(shown, ax=heights, fraction=0.045, pad=0.02)
-        return to_png(figure, _DPI)
+        return svg.to_png(figure, _DPI)
 
 
 def _modulus(values: np.ndarray) -> np.ndarray:
@@ -86,9 +284,9 @@ def _modulus(values: np.ndarray) -> np.ndarray:
     return np.abs(values) if np.iscomplexobj(values) else values
 
 
-def _transfer_figure(run: Simulation) -> Figure:
+def _transfer_figure(run: simulate_run.Simulation) -> Figure:
     """Draw each line's modulation transfer along the line and along the track, with its factors."""
-    figure = new_figure(3.4)
+    figure = svg.new_figure(3.4)
     panels = figure.subplots(1, 2, sharey=True)
     frequency = np.linspace(0.0, 0.5, 101)
     name, image = min(run.patch.images.items(), key=lambda item: item[1].motion.advance)
@@ -100,12 +298,12 @@ def _transfer_figure(run: Simulation) -> Figure:
         for part, values in optics.factors(*frequencies, image.motion).items():
             if np.ptp(values) > 1e-6:
                 axes.plot(frequency, _modulus(values), color=_PARTS[part], lw=1.0, label=_NAMES[part])
-        axes.plot(frequency, _modulus(optics.transfer(*frequencies, image.motion)), color=INK, lw=1.8, label="all")
+        axes.plot(frequency, _modulus(optics.transfer(*frequencies, image.motion)), color=svg.INK, lw=1.8, label="all")
         step = "pixel" if direction == "line" else "line"
         axes.set(title=f"Along the {direction}, {name}", xlabel=f"cycles per {step}", ylim=(0.0, 1.03), xlim=(0.0, 0.5))
         axes.legend(loc="lower left")
-        axes.grid(color=LIGHT, lw=0.5)
-        plain_axes(axes)
+        axes.grid(color=svg.LIGHT, lw=0.5)
+        svg.plain_axes(axes)
     panels[0].set_ylabel("modulation transfer")
     return figure
 
@@ -147,14 +345,14 @@ def _show_raster(axes: Axes, raster: Raster, colours: str) -> AxesImage:
     return shown
 
 
-def sections(run: Simulation) -> tuple[Section, ...]:
+def sections(run: simulate_run.Simulation) -> tuple[Section, ...]:
     """Return the report's sections: images, control data, measured points, sharpness, data."""
     points, spec = run.points, run.spec.points
     measured = () if points is None or spec is None else (points_section(run.patch, points, spec),)
     return _images(run), _control(run), *measured, _sharpness(run), _data(run)
 
 
-def _images(run: Simulation) -> Section:
+def _images(run: simulate_run.Simulation) -> Section:
     worst = max(image.error for image in run.patch.images.values())
     text = (
         "Each line's window of the same size has the patch in its middle. Interpolation of the rigorous geometry is in "
@@ -169,13 +367,13 @@ def _images(run: Simulation) -> Section:
     return Section("Images", text, (figure, _lines(run, "windows", "Windows and grey values", caption, keys)))
 
 
-def _lines(run: Simulation, name: str, title: str, caption: str, keys: Sequence[str]) -> Table:
+def _lines(run: simulate_run.Simulation, name: str, title: str, caption: str, keys: Sequence[str]) -> Table:
     """Return the report table of the quantities `keys`, a row for each line's image."""
-    rows = {line: LINE(image) for line, image in run.patch.images.items()}
-    return LINE.table(name, title, caption, rows, keys, "line", digits=4)
+    rows = {line: simulate_run.LINE(image) for line, image in run.patch.images.items()}
+    return simulate_run.LINE.table(name, title, caption, rows, keys, "line", digits=4)
 
 
-def _control(run: Simulation) -> Section:
+def _control(run: simulate_run.Simulation) -> Section:
     spec = run.spec.control
     text = (
         f"The orthophoto has pixels of {spec.spacing:g} m and another date: another sun, and {spec.changed:.0%} of the "
@@ -189,18 +387,18 @@ def _control(run: Simulation) -> Section:
     return Section("Orthophoto and elevation model", text, (figure,))
 
 
-def _sharpness(run: Simulation) -> Section:
-    with look("simulate-transfer"):
-        drawing = to_svg(_transfer_figure(run))
+def _sharpness(run: simulate_run.Simulation) -> Section:
+    with svg.look("simulate-transfer"):
+        drawing = svg.to_svg(_transfer_figure(run))
     caption = "Up to half a cycle per sample."
     return Section("Sharpness", (), (SvgFigure("transfer", "Modulation transfer", caption, drawing),))
 
 
-def _data(run: Simulation) -> Section:
-    camera = described("camera", camera_data(run.laboratory))
-    path = described("trajectory", trajectory_data(run, run.measured))
-    rasters = described("georeference", georeference_data(run))
-    truth = described("simulate-truth", TRUTH(run))
+def _data(run: simulate_run.Simulation) -> Section:
+    camera = described("camera", simulate_run.camera_data(run.laboratory))
+    path = described("trajectory", simulate_run.trajectory_data(run, run.measured))
+    rasters = described("georeference", simulate_run.georeference_data(run))
+    truth = described("simulate-truth", simulate_run.TRUTH(run))
     parts = (
         Data("camera", "Camera", "Camera as measured in the laboratory.", camera),
         Data("trajectory", "Orbit and attitude", "Measured orbit and attitude.", path),
@@ -215,7 +413,7 @@ def _data(run: Simulation) -> Section:
     return Section("Data", text, parts)
 
 
-def simulation_report(run: Simulation) -> Report:
+def simulation_report(run: simulate_run.Simulation) -> Report:
     """Return the report of a simulated pass over a patch: images, control, measured points and sharpness."""
     patch = run.spec.patch
     longitude, latitude = np.degrees(run.position)
@@ -249,11 +447,11 @@ def simulation_report(run: Simulation) -> Report:
 
 def map_facts(raster: Raster, note: str, heights: bool = False) -> FrameFacts:
     """Return the text tags that are written into the GeoTIFF of a map."""
-    longitude, latitude, *steps = list(GEOREFERENCE(raster).values())[3:]
+    longitude, latitude, *steps = list(simulate_run.GEOREFERENCE(raster).values())[3:]
     return FrameFacts(note=note, georeference=MapGeoreference(longitude, latitude, steps[0], steps[1], heights))
 
 
-def _summary(run: Simulation) -> Table:
+def _summary(run: simulate_run.Simulation) -> Table:
     """Return the summary table of the images."""
     caption = "Distance of samples on the ground and modulation transfer at half a cycle per sample, in the middle."
     keys = ("sample_along_line_m", "sample_along_track_m", "mtf_nyquist_along_line", "mtf_nyquist_along_track")
@@ -290,7 +488,7 @@ def _facts(setup: SimulateSetup) -> tuple[tuple[str, str], ...]:
     )
 
 
-def _warnings(run: Simulation) -> tuple[str, ...]:
+def _warnings(run: simulate_run.Simulation) -> tuple[str, ...]:
     """Return warnings about saturated images."""
     full = [name for name, image in run.patch.images.items() if image.saturated]
     return (f"saturated pixels in {', '.join(full)}; lower ground.texture.mean or the line time",) if full else ()

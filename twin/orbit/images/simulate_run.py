@@ -31,34 +31,15 @@ from twin.framework.random_streams import stream
 from twin.framework.record import Quantity, Record, plain_data
 from twin.framework.reference_frames import described
 from twin.orbit.flight.earth import Earth
-from twin.orbit.flight.light_effects import LightEffects
 from twin.orbit.flight.line_camera import LineCamera, LineTimes, changed_payload, line_cameras
 from twin.orbit.flight.orbit import propagate
 from twin.orbit.flight.platform_table import PlatformTable, continuous_quaternions
-from twin.orbit.flight.sensor import Sensor
+from twin.orbit.flight.sensor import LightEffects, Sensor
 from twin.orbit.flight.trajectory import Trajectory, readings
 from twin.orbit.ground.orthophoto import Raster
-from twin.orbit.images.image_points import (
-    CONSENSUS,
-    POINTS_REMEDY,
-    MatchedLine,
-    MatchedPoints,
-    PatchPoints,
-    PointsError,
-    measure_points,
-)
+from twin.orbit.images import image_points
+from twin.orbit.images import patch as patch_images
 from twin.orbit.images.line_optics import optics_of
-from twin.orbit.images.patch import (
-    ImagedLine,
-    LineComparison,
-    LineImage,
-    Patch,
-    PatchError,
-    fly_patch,
-    imaged_lines,
-    judged,
-    true_ground,
-)
 from twin.orbit.measured.measurement_tables import CAMERA_FILE, TEST_FILE, campaign_files
 from twin.orbit.measured.pass_measurements import GroundPoints, ImagePoints, PassMeasurements, point_names
 
@@ -127,10 +108,10 @@ class Simulation(SimulatedFlight):
 
     setup: SimulateSetup
     seed: int
-    lines: Mapping[str, ImagedLine]
+    lines: Mapping[str, patch_images.ImagedLine]
     position: tuple[float, float]
-    patch: Patch
-    points: PatchPoints | None
+    patch: patch_images.Patch
+    points: image_points.PatchPoints | None
 
     @property
     def spec(self) -> OrbitSimulateSpec:
@@ -178,7 +159,7 @@ def run_simulation(setup: SimulateSetup, backend: Backend | None, seed: int, adv
     spec, root = setup.test, np.random.SeedSequence(seed)
     flight = fly_simulation(setup, seed)
     optics = optics_of(setup.camera, spec.lines, spec.line_time, setup.detectors)
-    lines = imaged_lines(flight.sensors, flight.users, optics, stream(root, 1))
+    lines = patch_images.imaged_lines(flight.sensors, flight.users, optics, stream(root, 1))
     looking = _sensor(line_cameras(flight.truth)[spec.patch.line], flight.trajectory, flight.earth, spec)
     position = _patch_position(looking, spec)
     size, parts = (spec.patch.lines, spec.patch.pixels), len(lines) + 1
@@ -188,10 +169,10 @@ def run_simulation(setup: SimulateSetup, backend: Backend | None, seed: int, adv
 
     imaged(0)
     try:
-        done = fly_patch(
+        done = patch_images.fly_patch(
             lines, position, size, spec.ground, spec.control, stream(root, 2), spec.oversampling, advance=imaged
         )
-    except PatchError as error:
+    except patch_images.PatchError as error:
         key, remedy = _REMEDIES[error.part]
         raise BenchError(str(error), key, remedy) from error
     points = _points(done, spec)
@@ -201,14 +182,14 @@ def run_simulation(setup: SimulateSetup, backend: Backend | None, seed: int, adv
     )
 
 
-def _points(patch: Patch, spec: OrbitSimulateSpec) -> PatchPoints | None:
+def _points(patch: patch_images.Patch, spec: OrbitSimulateSpec) -> image_points.PatchPoints | None:
     """Return the points measured in a patch; None where the test requests none."""
     if spec.points is None:
         return None
     try:
-        return measure_points(patch, spec.points)
-    except PointsError as error:
-        raise BenchError(str(error), ("points",), POINTS_REMEDY) from error
+        return image_points.measure_points(patch, spec.points)
+    except image_points.PointsError as error:
+        raise BenchError(str(error), ("points",), image_points.POINTS_REMEDY) from error
 
 
 def _sensor(camera: LineCamera, trajectory: Trajectory, earth: Earth, spec: OrbitSimulateSpec) -> Sensor:
@@ -236,21 +217,19 @@ _LOOK = (
 """Formula of a pixel's line of sight, for readers of camera.json."""
 
 
-def _line_time(image: LineImage, row: int) -> float:
+def _line_time(image: patch_images.LineImage, row: int) -> float:
     """Return the time of exposure of a row of the window, in seconds from the epoch."""
     return float(image.measured.time(np.array([image.window.first_line + row]))[0])
 
 
-LINE: Record[LineImage] = Record(
+LINE: Record[patch_images.LineImage] = Record(
     "Image of one line.",
     Quantity("first_line", lambda image: image.window.first_line, "first line of the window in the line's whole image"),
     Quantity("first_pixel", lambda image: image.window.first_pixel, "first pixel of the window on the line"),
     Quantity("lines", lambda image: image.window.lines, "number of lines"),
     Quantity("pixels", lambda image: image.window.pixels, "number of pixels"),
     Quantity("first_line_time_s", lambda image: _line_time(image, 0), "mid-exposure of the first line, from the epoch"),
-    Quantity(
-        "last_line_time_s", lambda image: _line_time(image, image.window.lines - 1), "mid-exposure of the last line"
-    ),
+    Quantity("last_line_time_s", lambda i: _line_time(i, i.window.lines - 1), "mid-exposure of the last line"),
     Quantity("line_time_s", lambda image: image.measured.line_time, "time from one line to the next"),
     Quantity("mean_dn", lambda image: image.frame.mean(), "mean grey value", "mean [DN]"),
     Quantity("smallest_dn", lambda image: image.frame.min(), "smallest grey value", "smallest [DN]"),
@@ -300,13 +279,17 @@ GEOREFERENCE: Record[Raster] = Record(
     Quantity("longitude_per_column_deg", lambda raster: _per_pixel(raster)[0], "step from one column to the next"),
     Quantity("latitude_per_row_deg", lambda raster: _per_pixel(raster)[1], "step from one row to the next, negative"),
 )
-MATCHED: Record[MatchedLine] = Record(
+MATCHED: Record[image_points.MatchedLine] = Record(
     "Points of one kind in one line. Shifts, measured minus predicted, and sigmas of the fit, are medians of "
     "the accepted points.",
     Quantity("found", lambda line: np.isfinite(line.position[:, 0]).sum(), "points for which the fit gave a position"),
     Quantity("matched", lambda line: line.matched.sum(), "of these, points that passed the thresholds of the matching"),
     Quantity("accepted", lambda line: line.accepted.sum(), "of these, points that agree with their neighbours"),
-    Quantity("rejected_by_consensus", lambda line: (line.status == CONSENSUS).sum(), "contradicted by neighbours"),
+    Quantity(
+        "rejected_by_consensus",
+        lambda line: (line.status == image_points.CONSENSUS).sum(),
+        "contradicted by neighbours",
+    ),
     Quantity("not_accepted", lambda line: line.rejections, "number of points by reason, the most frequent first"),
     Quantity("displacement_lines_px", lambda line: line.median_shift[0], "shift along the track", "shift, track"),
     Quantity("displacement_pixels_px", lambda line: line.median_shift[1], "shift along the line", "shift, line"),
@@ -318,7 +301,7 @@ MATCHED: Record[MatchedLine] = Record(
         "scatter of the shifts beyond their covariances; none where these explain it",
     ),
 )
-POINTS: Record[MatchedPoints] = Record(
+POINTS: Record[image_points.MatchedPoints] = Record(
     "Points of one kind; for ties without the line in which they are chosen.",
     Quantity("sought", lambda points: len(points.ground), "number of points"),
     Quantity("in_all_lines", lambda points: points.in_all.sum(), "points accepted in every line"),
@@ -362,12 +345,8 @@ def trajectory_data(run: Simulation, path: Trajectory) -> dict[str, Any]:
     describes. Quaternions are (x, y, z, w), with continuous signs so that they can be interpolated.
     """
     errors = run.spec.errors
-    fixes, looks = (
-        times[in_span(times, path.first, path.last)]
-        for times in (
-            readings(path.first, path.last, instrument.interval) for instrument in (errors.gps, errors.star_tracker)
-        )
-    )
+    times = (readings(path.first, path.last, of.interval) for of in (errors.gps, errors.star_tracker))
+    fixes, looks = (t[in_span(t, path.first, path.last)] for t in times)
     quaternion = Rotation.from_matrix(path.body_to_itrs(looks)).as_quat(canonical=False)
     data = {
         "epoch_utc": str(path.orbit.epoch),
@@ -387,7 +366,7 @@ def georeference_data(run: Simulation) -> dict[str, Any]:
     return {"orthophoto": GEOREFERENCE(control.orthophoto), "dem": GEOREFERENCE(control.dem)}
 
 
-def _errors(judgement: LineComparison) -> list[list[float | None]]:
+def _errors(judgement: patch_images.LineComparison) -> list[list[float | None]]:
     """Return the image errors of every point (line, pixel), measured minus true; None where not measured."""
     return [[float(v) if np.isfinite(v) else None for v in row] for row in judgement.error]
 
@@ -403,25 +382,21 @@ MATCH_COUNTS = {
 }
 """Meaning of each count of matched points in one line, by its result key."""
 
-COMPARED: Record[LineComparison] = Record(
+COMPARED: Record[patch_images.LineComparison] = Record(
     "Points of one kind in one line compared with the truth; RMS and mean of those that are not wrong.",
     *(Quantity(key, attrgetter(key), meaning) for key, meaning in MATCH_COUNTS.items()),
-    Quantity(
-        "rms_lines_px", lambda comparison: comparison.rms[0], "root mean square error along the track", "RMS track"
-    ),
-    Quantity(
-        "rms_pixels_px", lambda comparison: comparison.rms[1], "root mean square error along the line", "RMS line"
-    ),
+    Quantity("rms_lines_px", lambda c: c.rms[0], "root mean square error along the track", "RMS track"),
+    Quantity("rms_pixels_px", lambda c: c.rms[1], "root mean square error along the line", "RMS line"),
     Quantity("mean_lines_px", lambda comparison: comparison.mean[0], "mean error along the track", "mean track"),
     Quantity("mean_pixels_px", lambda comparison: comparison.mean[1], "mean error along the line", "mean line"),
     Quantity("chi_square", lambda comparison: comparison.chi_square, "of their errors under their covariances", "χ²"),
     Quantity("degrees_of_freedom", lambda comparison: comparison.degrees_of_freedom, "two for each point"),
     Quantity("error_px", _errors, "measured minus true, lines and pixels, of each point"),
 )
-TRUE_POINTS: Record[tuple[Patch, MatchedPoints]] = Record(
+TRUE_POINTS: Record[tuple[patch_images.Patch, image_points.MatchedPoints]] = Record(
     "True ground positions of the points of one kind, in the order of points.csv.",
-    Quantity("itrs_m", lambda of: true_ground(*of), "ITRS coordinates"),
-    Quantity("lines", lambda of: judged(*of), "each line that was searched", record=COMPARED),
+    Quantity("itrs_m", lambda of: patch_images.true_ground(*of), "ITRS coordinates"),
+    Quantity("lines", lambda of: patch_images.judged(*of), "each line that was searched", record=COMPARED),
 )
 
 
@@ -431,14 +406,14 @@ def _grid(shape: tuple[int, ...]) -> tuple[Array, Array]:
     return row.ravel(), column.ravel()
 
 
-def _true_grid(patch: Patch, name: str) -> dict[str, Any]:
+def _true_grid(patch: patch_images.Patch, name: str) -> dict[str, Any]:
     """Return the true ground points that a grid of positions in a line's image sees."""
     row, column = _grid(patch.images[name].frame.shape)
     line, pixel = patch.images[name].image_point(row, column)
     return {"line": line, "pixel": pixel, "itrs_m": patch.true_point(name, row, column)}
 
 
-def _control_error(patch: Patch) -> dict[str, Any]:
+def _control_error(patch: patch_images.Patch) -> dict[str, Any]:
     """Return the orthophoto's error in plan, map minus true, east and north, in metres, at a grid of its pixels."""
     photo = patch.control.orthophoto
     row, column = _grid(photo.values.shape)
@@ -479,11 +454,8 @@ def simulation_exported(run: Simulation) -> dict[str, str]:
     """
     spec = run.spec
     if run.points is None or run.points.control is None or spec.points is None:
-        raise spec.error(
-            "only measured points can be exported as tables",
-            ("points",),
-            allowed="`points:` with control and check points",
-        )
+        allowed = "`points:` with control and check points"
+        raise spec.error("only measured points can be exported as tables", ("points",), allowed=allowed)
     errors = spec.errors
     plain = spec.plain()
     platform = PlatformTable.sampled(run.measured, errors.gps.interval, errors.star_tracker.interval)

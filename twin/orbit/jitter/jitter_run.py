@@ -18,11 +18,10 @@ from twin.framework.procedure import Advance, BenchError, silent
 from twin.framework.random_streams import stream
 from twin.framework.record import Quantity, Record
 from twin.orbit.flight.earth import Earth
-from twin.orbit.flight.light_effects import NO_EFFECTS, LightEffects
 from twin.orbit.flight.line_camera import LineTimes, line_cameras
 from twin.orbit.flight.orbit import propagate
 from twin.orbit.flight.platform_table import PlatformTable
-from twin.orbit.flight.sensor import Sensor
+from twin.orbit.flight.sensor import NO_EFFECTS, LightEffects, Sensor
 from twin.orbit.flight.trajectory import Jitter, Trajectory
 from twin.orbit.jitter.sights import Sights, SightsError, sights_of
 from twin.orbit.measured.measurement_tables import CAMERA_FILE, campaign_files, read_measurements
@@ -137,9 +136,8 @@ class Oscillation:
         if not len(distance) or distance.min() > 1.0 / self.jitter.sights.observations.span:
             return None
         k = int(np.argmin(distance))
-        return float(true_jitter.frequency[k]), np.hypot(true_jitter.sine[k], true_jitter.cosine[k])[
-            self.jitter.columns
-        ]
+        amplitude = np.hypot(true_jitter.sine[k], true_jitter.cosine[k])
+        return float(true_jitter.frequency[k]), amplitude[self.jitter.columns]
 
     @property
     def frequency(self) -> tuple[float, float]:
@@ -200,9 +198,7 @@ def run_jitter(setup: AnyJitter, backend: Backend | None, seed: int, advance: Ad
     passes: list[tuple[PassMeasurements, Jitter | None]] = []
     if isinstance(setup, MeasuredJitterSetup):
         effects = LightEffects.of(setup.test.effects) if setup.test.effects.corrected else NO_EFFECTS
-        passes = [
-            (measurements, None) for measurements in read_measurements(setup.data, setup.camera, advance, needed={})
-        ]
+        passes = [(each, None) for each in read_measurements(setup.data, setup.camera, advance, needed={})]
     else:
         effects = LightEffects.of(setup.test.effects)
         passes = [fly_strip(setup, seed)]
@@ -211,12 +207,10 @@ def run_jitter(setup: AnyJitter, backend: Backend | None, seed: int, advance: Ad
         advance("search", k, len(passes))
         try:
             sights = sights_of(measurements, cameras, spec.lines, spec.search, effects)
-            observations = sights.observations
-            sought = spec.search
+            observations, sought = sights.observations, spec.search
             fastest = 0.5 / max(measurements.line_times[name].line_time for name in sights.lines)
             lines = search(observations, sought.lowest, sought.highest, sought.false_alarm, fastest)
-            spline = spec.search.spline
-            used = observations.taken(lines.used)
+            used, spline = observations.taken(lines.used), sought.spline
             course = None if spline is None else fit_spline(used, spline.interval, spline.sigma)
         except (JitterError, SightsError, ValueError) as error:
             key = "points" if isinstance(setup, JitterSetup) else "data"
@@ -253,10 +247,8 @@ def fly_strip(setup: JitterSetup, seed: int) -> tuple[PassMeasurements, Jitter |
     first = sensors[names[0]]
     delay = wanted.duration * (rng_point.uniform(size=many) - 0.5)
     if wanted.rows is not None:
-        spread = wanted.row_spread * np.clip(rng_point.standard_normal(many), -3.0, 3.0)
-        delay = np.clip(
-            wanted.rows * np.rint(delay / wanted.rows) + spread, *(0.5 * wanted.duration * np.array([-1, 1]))
-        )
+        spread, half = wanted.row_spread * np.clip(rng_point.standard_normal(many), -3.0, 3.0), 0.5 * wanted.duration
+        delay = np.clip(wanted.rows * np.rint(delay / wanted.rows) + spread, -half, half)
     seconds = spec.time + delay
     pixel = rng_point.uniform(0.0, first.camera.pixels - 1.0, many)
     height = wanted.height + wanted.relief * rng_point.uniform(-1.0, 1.0, many)
@@ -345,9 +337,8 @@ def blind_multiples(jitter: PassJitter) -> list[BlindMultiple]:
             if frequency < before.frequency[0]:
                 continue
             k = int(np.argmin(np.abs(before.frequency - frequency)))
-            multiples.append(
-                BlindMultiple(first, second, gap, order, frequency, float(share[k]), bool(before.blind[k]))
-            )
+            response = float(share[k]), bool(before.blind[k])
+            multiples.append(BlindMultiple(first, second, gap, order, frequency, *response))
     return multiples
 
 
@@ -427,9 +418,7 @@ PASS: Record[PassJitter] = Record(
     Quantity("detectable_arcsec", _detectable, "axis -> least detectable amplitude, median over frequencies"),
     Quantity("blind_hz", lambda jitter: jitter.result.before.intervals(), "first and last of blind frequencies"),
     Quantity("blind_multiples", blind_multiples, "blind frequencies of every pair alone", record=MULTIPLE),
-    Quantity(
-        "mtf_at_nyquist", lambda jitter: transfers(jitter) or None, "line -> transfer, rms of phases", where_known=True
-    ),
+    Quantity("mtf_at_nyquist", lambda j: transfers(j) or None, "line -> transfer, rms of phases", where_known=True),
 )
 JITTER: Record[JitterRun] = Record(
     "Content of jitter.json: jitter detected in points that several lines see one after the other.",

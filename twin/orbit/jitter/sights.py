@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from itertools import combinations
+from itertools import combinations, pairwise
 from typing import Any
 
 import numpy as np
@@ -26,10 +26,9 @@ from analysis.statistics import robust_sigma
 from optics.numerics.array_math import PhysicalError, in_span
 from scenes.specs.orbit.jitter_search import AXES, JitterSearchSpec
 from twin.orbit.flight.earth import Earth, east_north_up
-from twin.orbit.flight.light_effects import LightEffects, earth_rotation_velocity
 from twin.orbit.flight.line_camera import LineCamera, LineTimes
 from twin.orbit.flight.platform_table import TabulatedTrajectory
-from twin.orbit.flight.sensor import OffsetPlatform, Sensor
+from twin.orbit.flight.sensor import LightEffects, OffsetPlatform, Sensor, earth_rotation_velocity
 from twin.orbit.flight.trajectory import Attitude
 from twin.orbit.measured.pass_measurements import PassMeasurements
 
@@ -105,11 +104,8 @@ class SteadyPlatform:
     def body_to_itrs(self, seconds: Any) -> np.ndarray:
         """Return the axes of the body as columns at times (...), (..., 3, 3): x_itrs = matrix @ x_body."""
         t = np.asarray(seconds, np.float64)
-        rotation = (
-            Rotation.from_rotvec(self._series(self.rotation_series, t).reshape(-1, 3))
-            .as_matrix()
-            .reshape(*t.shape, 3, 3)
-        )
+        vectors = self._series(self.rotation_series, t).reshape(-1, 3)
+        rotation = Rotation.from_rotvec(vectors).as_matrix().reshape(*t.shape, 3, 3)
         return np.asarray(self._orbital(t) @ self.middle @ rotation)
 
     def _orbital(self, seconds: Any) -> np.ndarray:
@@ -238,13 +234,14 @@ def sights_of(
     if len(names) < 2 or len(shared) < _LEAST_POINTS:
         raise SightsError(f"{len(shared)} points are seen by two lines or more; at least {_LEAST_POINTS} are needed")
     lines = _lines(measurements, cameras, names, shared, search, effects)
-    order = sorted(names, key=lambda name: _moment(lines[name], lines))
     prior = _prior_of(measurements, lines, shared, search)
     ground = _improved_positions(lines, shared, prior)
-    observations, residual = _whitened_observations(lines, order, shared, ground, prior, search)
-    pixel = float(np.median([_pixel(cameras[name]) for name in order]))
-    gaps, pairs = _pairs(lines, order, len(measurements.ground), residual)
-    return Sights(observations, tuple(order), gaps, pixel, len(shared), pairs)
+    ordered = {name: lines[name] for name in sorted(names, key=lambda name: _moment(lines[name], lines))}
+    observations, residual = _whitened_observations(ordered, shared, ground, prior, search)
+    middles = [cameras[name].look_and_slope(np.array([0.5 * (cameras[name].pixels - 1)]))[1][0] for name in ordered]
+    pixel = float(np.median(np.linalg.norm(middles, axis=1)))
+    gaps, pairs = _pairs(ordered, residual)
+    return Sights(observations, tuple(ordered), gaps, pixel, len(shared), pairs)
 
 
 def _lines(
@@ -373,18 +370,13 @@ def _residual_and_slope(line: _Line, ground: np.ndarray) -> tuple[np.ndarray, np
 
 
 def _whitened_observations(
-    lines: Mapping[str, _Line],
-    order: list[str],
-    shared: np.ndarray,
-    ground: np.ndarray,
-    prior: _Prior,
-    search: JitterSearchSpec,
+    lines: Mapping[str, _Line], shared: np.ndarray, ground: np.ndarray, prior: _Prior, search: JitterSearchSpec
 ) -> tuple[Observations, dict[str, np.ndarray]]:
     """Return whitened observations of the attitude, and measured minus expected positions by line, in pixels.
 
     Positions are (n, 2), line and pixel, for n points.
     """
-    axes, count = len(search.axes), len(order)
+    axes, count = len(search.axes), len(lines)
     size, width = len(shared), (search.interior + 1) + search.trend
     value, by = np.zeros((size, count, 2)), np.zeros((size, count, 2, 3))
     rotation, time = np.zeros((size, count, 2, axes)), np.zeros((size, count))
@@ -392,16 +384,13 @@ def _whitened_observations(
     basis = _basis(lines, shared, search)
     seen = np.zeros((size, count), bool)
     residual = {}
-    for k, name in enumerate(order):
-        line = lines[name]
+    for k, (name, line) in enumerate(lines.items()):
         which = np.searchsorted(shared, line.point)
         positions = ground[which]
         difference, slope = _residual_and_slope(line, positions)
         expected = line.image - difference
         rotations = [(np.stack(s.image(positions), axis=-1) - expected) / _ROTATION for s in line.axes]
-        good = np.all(np.isfinite(difference), axis=1) & (
-            np.max(np.abs(np.nan_to_num(difference, nan=np.inf)), axis=1) < _FAR
-        )
+        good = np.max(np.abs(np.nan_to_num(difference, nan=np.inf)), axis=1) < _FAR
         for derivative in (slope, *rotations):
             good &= np.all(np.isfinite(derivative.reshape(len(derivative), -1)), axis=1)
         rows = which[good]
@@ -506,28 +495,23 @@ def _basis(lines: Mapping[str, _Line], shared: np.ndarray, search: JitterSearchS
     return np.concatenate([legendre(x, search.interior), legendre(u, search.trend)[:, 1:]], axis=1)
 
 
-def _pixel(camera: LineCamera) -> float:
-    return float(np.linalg.norm(camera.look_and_slope(np.array([0.5 * (camera.pixels - 1)]))[1]))
-
-
 def _pairs(
-    lines: Mapping[str, _Line], order: list[str], count: int, residual: Mapping[str, np.ndarray]
+    lines: Mapping[str, _Line], residual: Mapping[str, np.ndarray]
 ) -> tuple[dict[tuple[str, str], tuple[float, float, float]], dict[tuple[str, str], tuple[np.ndarray, np.ndarray]]]:
     """Return time gaps of all pairs of lines, and disparities of neighbouring lines without their smooth parts."""
     gaps, pairs = {}, {}
-    for a, b in combinations(order, 2):
+    for a, b in combinations(lines, 2):
         _, mine, theirs = np.intersect1d(lines[a].point, lines[b].point, return_indices=True)
         if not len(mine):
             continue
         seconds = lines[b].seconds[theirs] - lines[a].seconds[mine]
         low, middle, high = np.quantile(seconds, (0.05, 0.5, 0.95))
         gaps[a, b] = float(low), float(middle), float(high)
-        if order.index(b) != order.index(a) + 1:
+        if (a, b) not in pairwise(lines):
             continue
         moved = (residual[b][theirs] - residual[a][mine])[:, ::-1]
         at = lines[a].seconds[mine]
-        x = lines[a].image[mine, 1]
-        scaled = [(2.0 * v - v.min() - v.max()) / max(float(np.ptp(v)), 1e-9) for v in (x, at)]
+        scaled = [(2.0 * v - v.min() - v.max()) / max(float(np.ptp(v)), 1e-9) for v in (lines[a].image[mine, 1], at)]
         smooth = np.stack([scaled[0] ** i * scaled[1] ** j for i in range(4) for j in range(3 - min(i, 2))], axis=-1)
         good = np.all(np.isfinite(moved), axis=1)
         fit = np.linalg.lstsq(smooth[good], moved[good], rcond=None)[0]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from twin.framework.report import Report, Section, answer
-from twin.orbit.images.point_report import found_table, how_measured, point_artefacts
+from twin.orbit.images.simulate_report import found_table, how_measured, point_artefacts
 from twin.orbit.matching.match_run import IMAGE, Match
 from twin.orbit.matching.rational_match import RationalMatch, rational_report
 

@@ -28,10 +28,9 @@ from twin.orbit.conventions.pass_readings import (
     read_line_clocks,
 )
 from twin.orbit.flight.earth import Earth
-from twin.orbit.flight.light_effects import LightEffects
 from twin.orbit.flight.line_camera import LineCamera, LineTimes, line_cameras
 from twin.orbit.flight.platform_table import TabulatedTrajectory
-from twin.orbit.flight.sensor import Sensor
+from twin.orbit.flight.sensor import LightEffects, Sensor
 from twin.orbit.ground.grid import GroundFrame
 from twin.orbit.ground.orthophoto import Maps
 from twin.orbit.images.image_points import (

@@ -36,18 +36,11 @@ from analysis.arrays import Array
 from optics.numerics.array_math import in_span
 from optics.numerics.number_tree import FrozenMap
 from scenes.yaml.errors import InputError, Issue, names_text, shown
-from twin.orbit.flight.light_effects import earth_rotation_velocity
 from twin.orbit.flight.platform_table import continuous_quaternions
-from twin.orbit.measured.clock import Readings
-from twin.orbit.measured.orbit_files import (
-    SPEED_TOLERANCE,
-    AttitudeReadings,
-    OrbitReadings,
-    require_orbit,
-    require_unit,
-    velocity_misfit,
-)
-from twin.orbit.measured.xml_file import Element, read_xml, readings, require_increasing
+from twin.orbit.flight.sensor import earth_rotation_velocity
+from twin.orbit.measured import orbit_files
+from twin.orbit.measured.earth_orientation import Readings, readings, require_increasing
+from twin.orbit.measured.xml_file import Element, read_xml
 
 PROFILES = ("PHR_SENSOR", "PNEO_SENSOR", "S6_SENSOR", "S7_SENSOR")
 """Metadata profiles of the products for which a rigorous model can be read."""
@@ -153,8 +146,8 @@ class DimapPass:
     pixels: int
     first_line: Readings
     line_time: float
-    orbit: OrbitReadings
-    attitude: AttitudeReadings | AttitudePolynomial
+    orbit: orbit_files.OrbitReadings
+    attitude: orbit_files.AttitudeReadings | AttitudePolynomial
     forward: Array
     right: Array
     pitch: float | None
@@ -168,13 +161,13 @@ class DimapPass:
         """Time from the first line to the last, seconds."""
         return (self.lines - 1) * self.line_time
 
-    def samples(self) -> AttitudeReadings:
+    def samples(self) -> orbit_files.AttitudeReadings:
         """Return the attitude as readings; polynomials are sampled over the time of the image.
 
         Samples that begin and end with the first and the last line do not cover the outer halves of these lines; there
         the spline through them is extrapolated by at most one interval of the samples.
         """
-        if isinstance(self.attitude, AttitudeReadings):
+        if isinstance(self.attitude, orbit_files.AttitudeReadings):
             return self._spanning_samples(self.attitude)
         start, span = float(self.first_line.second[0]), max(self.duration, self.line_time)
         second = start + span * np.linspace(-_MARGIN, 1.0 + _MARGIN, _SAMPLES + 1)
@@ -183,9 +176,9 @@ class DimapPass:
         day = np.floor(second / _DAY)
         clock = Readings(self.attitude.day + day.astype(np.int64), second - _DAY * day)
         quaternion = self.attitude.at(second)
-        return AttitudeReadings(self.file, clock, quaternion, None, "ITRS", "UTC", "first", "body_to_frame")
+        return orbit_files.AttitudeReadings(self.file, clock, quaternion, None, "ITRS", "UTC", "first", "body_to_frame")
 
-    def spanning_orbit(self) -> OrbitReadings:
+    def spanning_orbit(self) -> orbit_files.OrbitReadings:
         """Return the orbit's readings, extrapolated by one at each end where the image extends slightly beyond them.
 
         Raises
@@ -209,9 +202,9 @@ class DimapPass:
             position = np.insert(position, index, position[end] + velocity[end] * step + 0.5 * rate * step**2, axis=0)
             velocity = np.insert(velocity, index, velocity[end] + rate * step, axis=0)
             time = np.insert(time, index, at)
-        return OrbitReadings(self.file, self._clock(time), position, velocity, "ITRS", "UTC")
+        return orbit_files.OrbitReadings(self.file, self._clock(time), position, velocity, "ITRS", "UTC")
 
-    def _spanning_samples(self, attitude: AttitudeReadings) -> AttitudeReadings:
+    def _spanning_samples(self, attitude: orbit_files.AttitudeReadings) -> orbit_files.AttitudeReadings:
         """Return the attitude samples, extrapolated by one at each end where the image extends slightly beyond them."""
         assert attitude.quaternion is not None
         time = self._since(attitude.clock)
@@ -379,7 +372,7 @@ def _clock(items: list[Element], file: str) -> Readings:
     return clock
 
 
-def _orbit(ephemeris: Element, file: str) -> tuple[OrbitReadings, bool]:
+def _orbit(ephemeris: Element, file: str) -> tuple[orbit_files.OrbitReadings, bool]:
     """Return the orbit readings, and whether the file's velocities were inertial."""
     points = ephemeris.all("Point_List", "Point")
     if len(points) < 4:
@@ -387,17 +380,17 @@ def _orbit(ephemeris: Element, file: str) -> tuple[OrbitReadings, bool]:
     clock, lines = _clock(points, file), [point.line for point in points]
     position = np.stack([point.single("LOCATION_XYZ").floats(3) for point in points])
     velocity = np.stack([point.single("VELOCITY_XYZ").floats(3) for point in points])
-    require_orbit(file, position, lines)
-    share, inertial = velocity_misfit((clock.day - clock.day[0]) * _DAY + clock.second, position, velocity)
+    orbit_files.require_orbit(file, position, lines)
+    share, inertial = orbit_files.velocity_misfit((clock.day - clock.day[0]) * _DAY + clock.second, position, velocity)
     if inertial:
         velocity = velocity - earth_rotation_velocity(position)
-    elif np.median(share) > SPEED_TOLERANCE:
+    elif np.median(share) > orbit_files.SPEED_TOLERANCE:
         found = f"they differ by {100.0 * np.median(share):.3g} % in the median"
         points[0].single("VELOCITY_XYZ").wrong("not the velocity of these positions", found, "Earth-fixed, m/s")
-    return OrbitReadings(file, clock, position, velocity, "ITRS", "UTC"), inertial
+    return orbit_files.OrbitReadings(file, clock, position, velocity, "ITRS", "UTC"), inertial
 
 
-def _attitude(attitudes: Element, file: str, day: int) -> AttitudeReadings | AttitudePolynomial:
+def _attitude(attitudes: Element, file: str, day: int) -> orbit_files.AttitudeReadings | AttitudePolynomial:
     """Return the attitude, as samples or as polynomials."""
     polynomial = attitudes.maybe("Polynomial_Quaternions")
     samples = attitudes.all("Quaternion_List", "Quaternion")
@@ -409,8 +402,8 @@ def _attitude(attitudes: Element, file: str, day: int) -> AttitudeReadings | Att
             attitudes.wrong("too few quaternions", str(len(samples)), "4 or more in Quaternion_List")
         clock = _clock(samples, file)
         values = np.array([[sample.number(f"Q{k}") for k in range(4)] for sample in samples])
-        require_unit(file, values, [sample.line for sample in samples])
-        return AttitudeReadings(file, clock, values, None, "ITRS", "UTC", "first", "body_to_frame")
+        orbit_files.require_unit(file, values, [sample.line for sample in samples])
+        return orbit_files.AttitudeReadings(file, clock, values, None, "ITRS", "UTC", "first", "body_to_frame")
     offset = polynomial.number("OFFSET", least=0.0, most=2.0 * _DAY)
     scale = polynomial.number("SCALE", least=1e-6, most=1e6)
     rows = []
@@ -421,7 +414,7 @@ def _attitude(attitudes: Element, file: str, day: int) -> AttitudeReadings | Att
         rows[-1][: degree + 1] = part.single("COEFFICIENTS").floats(degree + 1)
     fitted = AttitudePolynomial(day, offset, scale, np.array(rows))
     # It is normalised where it is used; at the middle of its range it has unit length but for the fit.
-    require_unit(file, fitted.coefficients[None, :, 0], [polynomial.line])
+    orbit_files.require_unit(file, fitted.coefficients[None, :, 0], [polynomial.line])
     return fitted
 
 

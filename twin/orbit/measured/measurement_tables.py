@@ -17,13 +17,7 @@ from numpy.typing import NDArray
 from analysis.arrays import Array
 from analysis.orbit.calibration_parameters import level_covariance
 from optics.numerics.array_math import in_span
-from scenes.specs.orbit.measurements import (
-    ConventionsSpec,
-    OrbitDataSpec,
-    PassFilesSpec,
-    PlatformFilesSpec,
-    body_axes_matrix,
-)
+from scenes.specs.orbit import measurements
 from scenes.specs.orbit.setup import DATA_FILE
 from scenes.specs.orbit.three_line_camera import ThreeLineCameraSpec
 from scenes.yaml.csv_table import Column, Table, read_table
@@ -82,8 +76,8 @@ CALIBRATING: Mapping[str, int] = {"control": 1, "check": 2}
 
 def read_pass(
     name: str,
-    spec: PassFilesSpec,
-    conventions: ConventionsSpec,
+    spec: measurements.PassFilesSpec,
+    conventions: measurements.ConventionsSpec,
     camera: ThreeLineCameraSpec,
     needed: Mapping[str, int] = CALIBRATING,
 ) -> PassMeasurements:
@@ -147,9 +141,9 @@ def read_pass(
     return PassMeasurements(name, platform, {line: times[line] for line in images}, ground, images)
 
 
-def _platform(spec: PassFilesSpec, conventions: ConventionsSpec) -> PlatformTable:
+def _platform(spec: measurements.PassFilesSpec, conventions: measurements.ConventionsSpec) -> PlatformTable:
     """Return orbit and attitude of a pass, from tables or from files of other formats."""
-    if isinstance(spec.platform, PlatformFilesSpec):
+    if isinstance(spec.platform, measurements.PlatformFilesSpec):
         # Import only here, because tables do not need these libraries.
         from twin.orbit.measured.platform_files import platform_table, read_platform
 
@@ -160,7 +154,10 @@ def _platform(spec: PassFilesSpec, conventions: ConventionsSpec) -> PlatformTabl
 
 
 def read_measurements(
-    data: OrbitDataSpec, camera: ThreeLineCameraSpec, advance: Advance = silent, needed: Mapping[str, int] = CALIBRATING
+    data: measurements.OrbitDataSpec,
+    camera: ThreeLineCameraSpec,
+    advance: Advance = silent,
+    needed: Mapping[str, int] = CALIBRATING,
 ) -> tuple[PassMeasurements, ...]:
     """Read all passes of a test.
 
@@ -188,7 +185,7 @@ def read_measurements(
 
 
 def _line_times_of(
-    table: Table, conventions: ConventionsSpec, camera: ThreeLineCameraSpec, platform: PlatformTable
+    table: Table, conventions: measurements.ConventionsSpec, camera: ThreeLineCameraSpec, platform: PlatformTable
 ) -> tuple[dict[str, LineTimes], dict[str, float]]:
     """Return each line camera's line times, with lines counted from its first, and the file's number of that line.
 
@@ -299,7 +296,7 @@ def _image_points_of(
     names: Mapping[str, int],
     times: Mapping[str, LineTimes],
     origins: Mapping[str, float],
-    conventions: ConventionsSpec,
+    conventions: measurements.ConventionsSpec,
     camera: ThreeLineCameraSpec,
     trajectory: TabulatedTrajectory,
 ) -> dict[str, ImagePoints]:
@@ -523,7 +520,7 @@ higher than that of agile satellites.
 """
 
 
-def platform_of(epoch: str, orbit: Table, attitude: Table, conventions: ConventionsSpec) -> PlatformTable:
+def platform_of(epoch: str, orbit: Table, attitude: Table, conventions: measurements.ConventionsSpec) -> PlatformTable:
     """Return orbit and attitude from their tables.
 
     Parameters
@@ -572,7 +569,7 @@ def platform_of(epoch: str, orbit: Table, attitude: Table, conventions: Conventi
     return PlatformTable.of(epoch, time, position, speed, attitude["time"][looks], quaternion)
 
 
-def _quaternions_of(numbers: Array, conventions: ConventionsSpec) -> Array:
+def _quaternions_of(numbers: Array, conventions: measurements.ConventionsSpec) -> Array:
     """Return quaternions x, y, z, w that rotate the project's body axes into those of the frame.
 
     Parameters
@@ -588,7 +585,7 @@ def _quaternions_of(numbers: Array, conventions: ConventionsSpec) -> Array:
     xyzw = numbers if convention.scalar == "last" else np.roll(numbers, -1, axis=1)
     if convention.turns == "frame_to_body":
         xyzw = xyzw * np.array([-1.0, -1.0, -1.0, 1.0])
-    axes = np.array(body_axes_matrix(conventions.body_axes), np.float64)
+    axes = np.array(measurements.body_axes_matrix(conventions.body_axes), np.float64)
     if np.array_equal(axes, np.eye(3)):
         return np.asarray(xyzw, np.float64)
     from scipy.spatial.transform import Rotation

@@ -21,9 +21,9 @@ import numpy as np
 
 from analysis.arrays import Array
 from scenes.yaml.errors import InputError, Issue, Problem, names_text, nearest, shown
-from twin.orbit.flight.light_effects import earth_rotation_velocity
-from twin.orbit.measured.clock import Readings, known_scale
-from twin.orbit.measured.xml_file import numbers, parsed_xml, readings, require_increasing, text_lines
+from twin.orbit.flight.sensor import earth_rotation_velocity
+from twin.orbit.measured.earth_orientation import Readings, known_scale, readings, require_increasing
+from twin.orbit.measured.xml_file import numbers, parsed_xml, text_lines
 
 Frame = Literal["ITRS", "GCRS", "EME2000", "TEME"]
 Scalar = Literal["last", "first"]

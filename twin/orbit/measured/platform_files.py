@@ -21,23 +21,13 @@ from scenes.yaml.csv_table import Column, Table, read_table
 from scenes.yaml.errors import InputError, Issue, Problem
 from scenes.yaml.units import ANGLE, DISTANCE, SPEED, TIME
 from twin.orbit.flight.earth import Earth
-from twin.orbit.flight.light_effects import NO_EFFECTS, LightEffects
 from twin.orbit.flight.line_camera import polynomial_line
 from twin.orbit.flight.platform_table import PlatformTable, TabulatedTrajectory
-from twin.orbit.flight.sensor import Sensor
+from twin.orbit.flight.sensor import NO_EFFECTS, LightEffects, Sensor
 from twin.orbit.flight.trajectory import Attitude
 from twin.orbit.measured import earth_orientation, orbit_files
-from twin.orbit.measured.clock import Instants, Readings, calendar_reading, epoch_before, tai_minus_utc
 from twin.orbit.measured.dimap_file import DimapPass, is_dimap, read_dimap
-from twin.orbit.measured.earth_orientation import EarthOrientation, TableRotation
-from twin.orbit.measured.orbit_files import (
-    AttitudeReadings,
-    OrbitReadings,
-    require_earth_fixed_velocity,
-    require_orbit,
-    require_unit,
-)
-from twin.orbit.measured.xml_file import first_lines, require_increasing
+from twin.orbit.measured.xml_file import first_lines
 
 if TYPE_CHECKING:
     from scenes.specs.orbit.measurements import AttitudeFileSpec, LineTimesFileSpec, OrbitFileSpec, PlatformFilesSpec
@@ -108,9 +98,9 @@ class PlatformReadings:
         Table of Earth orientation; None where there is none.
     """
 
-    orbit: OrbitReadings
-    attitude: AttitudeReadings
-    earth: EarthOrientation | None
+    orbit: orbit_files.OrbitReadings
+    attitude: orbit_files.AttitudeReadings
+    earth: earth_orientation.EarthOrientation | None
 
 
 def read_platform(spec: PlatformFilesSpec, folder: Path) -> tuple[PlatformReadings, Conventions]:
@@ -155,7 +145,7 @@ def read_platform(spec: PlatformFilesSpec, folder: Path) -> tuple[PlatformReadin
         Attitude(spec_of.nadir != "geocentric", spec_of.steering == "yaw"),
     )
     if conventions.orbit_frame == "ITRS":
-        require_earth_fixed_velocity(orbit)
+        orbit_files.require_earth_fixed_velocity(orbit)
     return PlatformReadings(orbit, attitude, _earth(spec, folder, orbit, conventions)), conventions
 
 
@@ -178,12 +168,12 @@ def platform_table(readings: PlatformReadings, conventions: Conventions, epoch: 
         orbital frame has times without orbit.
     """
     orbit, attitude = readings.orbit, readings.attitude
-    usable: Instants | None = None
+    usable: earth_orientation.Instants | None = None
     if orbit.segments:
         orbit, usable = _single_segment(readings, conventions)
     fixes = _instants(orbit.file, orbit.clock, conventions.orbit_scale, conventions.orbit_offset)
     looks = _instants(attitude.file, attitude.clock, conventions.attitude_scale, conventions.attitude_offset)
-    epoch = epoch or epoch_before(fixes)
+    epoch = epoch or earth_orientation.epoch_before(fixes)
     time, attitude_time = fixes.since(epoch), looks.since(epoch)
     inertial = {conventions.orbit_frame, conventions.attitude_frame} - {"ITRS", "orbital"}
     rotation = None
@@ -229,12 +219,14 @@ def platform_table(readings: PlatformReadings, conventions: Conventions, epoch: 
     return replace(table, usable=(float(first), float(last)))
 
 
-def _single_segment(readings: PlatformReadings, conventions: Conventions) -> tuple[OrbitReadings, Instants | None]:
+def _single_segment(
+    readings: PlatformReadings, conventions: Conventions
+) -> tuple[orbit_files.OrbitReadings, earth_orientation.Instants | None]:
     """Return the orbit segment that covers most attitude readings, and the instants between which it may be used."""
     orbit, attitude = readings.orbit, readings.attitude
     looks = _instants(attitude.file, attitude.clock, conventions.attitude_scale, conventions.attitude_offset)
     fixes = _instants(orbit.file, orbit.clock, conventions.orbit_scale, conventions.orbit_offset)
-    start = epoch_before(fixes)
+    start = earth_orientation.epoch_before(fixes)
     time, attitude_time = fixes.since(start), looks.since(start)
     best, best_count, best_usable = orbit.segments[0], -1, None
     for segment in orbit.segments:
@@ -251,7 +243,7 @@ def _single_segment(readings: PlatformReadings, conventions: Conventions) -> tup
 
 
 def _in_itrs(
-    orbit: OrbitReadings, frame: str, time: np.ndarray, rotation: TableRotation | None
+    orbit: orbit_files.OrbitReadings, frame: str, time: np.ndarray, rotation: earth_orientation.TableRotation | None
 ) -> tuple[np.ndarray, np.ndarray | None]:
     """Return N positions, in metres, and velocities, in m/s, of an orbit in the ITRS, (N, 3) each."""
     if frame == "ITRS" or rotation is None:
@@ -265,7 +257,7 @@ def _in_itrs(
     return position, np.einsum("nij,nj->ni", matrix, orbit.velocity) - carried
 
 
-def to_itrs(frame: str, rotation: TableRotation) -> Any:
+def to_itrs(frame: str, rotation: earth_orientation.TableRotation) -> Any:
     """Return a function from N times, in seconds, to rotations (N, 3, 3) from an inertial frame to the ITRS."""
     if frame == "TEME":
         return rotation.teme_to_itrs
@@ -274,7 +266,7 @@ def to_itrs(frame: str, rotation: TableRotation) -> Any:
     return rotation.matrix
 
 
-def _body(attitude: AttitudeReadings, conventions: Conventions) -> np.ndarray:
+def _body(attitude: orbit_files.AttitudeReadings, conventions: Conventions) -> np.ndarray:
     """Return rotations (M, 3, 3) from the body to the attitude's frame at M readings."""
     if attitude.quaternion is not None:
         q = attitude.quaternion if conventions.scalar == "last" else np.roll(attitude.quaternion, -1, axis=1)
@@ -288,7 +280,7 @@ def _body(attitude: AttitudeReadings, conventions: Conventions) -> np.ndarray:
     return matrix @ np.array(body_axes_matrix(conventions.body_axes), dtype=np.float64)
 
 
-def _instants(file: str, clock: Readings, scale: str, offset: float) -> Instants:
+def _instants(file: str, clock: earth_orientation.Readings, scale: str, offset: float) -> earth_orientation.Instants:
     """Return the instants of clock readings, shifted by the offset in seconds."""
     try:
         return clock.instants(scale).later(offset)
@@ -306,18 +298,20 @@ def _of_file_or_test(spec: Any, key: str, in_spec: str | None, in_file: str | No
 
 
 def _earth(
-    spec: PlatformFilesSpec, folder: Path, orbit: OrbitReadings, conventions: Conventions
-) -> EarthOrientation | None:
+    spec: PlatformFilesSpec, folder: Path, orbit: orbit_files.OrbitReadings, conventions: Conventions
+) -> earth_orientation.EarthOrientation | None:
     """Return the Earth orientation from a table or from constant values; None where neither is given."""
     if spec.earth_orientation is not None:
         return earth_orientation.read_earth_orientation(folder / spec.earth_orientation)
     if spec.earth is not None:
-        first = epoch_before(_instants(orbit.file, orbit.clock, conventions.orbit_scale, conventions.orbit_offset))
+        first = earth_orientation.epoch_before(
+            _instants(orbit.file, orbit.clock, conventions.orbit_scale, conventions.orbit_offset)
+        )
         return earth_orientation.constant_orientation(first, spec.earth.ut1_utc, spec.earth.polar_motion)
     return None
 
 
-def _orbit(spec: OrbitFileSpec, folder: Path) -> OrbitReadings:
+def _orbit(spec: OrbitFileSpec, folder: Path) -> orbit_files.OrbitReadings:
     """Read the orbit from a file of any format."""
     path = folder / spec.file
     head = list(first_lines(path, "an orbit: SP3, CCSDS OEM, DIMAP, or CSV"))
@@ -335,12 +329,12 @@ def _orbit(spec: OrbitFileSpec, folder: Path) -> OrbitReadings:
     if len(have) in (1, 2):
         raise InputError(Issue("incomplete velocities", str(path), None, (), ", ".join(have), "vx, vy, vz or none"))
     position, lines = table.stacked("x", "y", "z"), [int(v) for v in table.lines]
-    require_orbit(str(path), position, lines)
+    orbit_files.require_orbit(str(path), position, lines)
     velocity = table.stacked("vx", "vy", "vz") if have else None
-    return OrbitReadings(str(path), clock, position, velocity, None, scale)
+    return orbit_files.OrbitReadings(str(path), clock, position, velocity, None, scale)
 
 
-def _attitude(spec: AttitudeFileSpec, folder: Path) -> AttitudeReadings:
+def _attitude(spec: AttitudeFileSpec, folder: Path) -> orbit_files.AttitudeReadings:
     """Read the attitude from a file of any format."""
     path = folder / spec.file
     head = list(first_lines(path, "an attitude: CCSDS AEM, DIMAP, or CSV"))
@@ -359,12 +353,14 @@ def _attitude(spec: AttitudeFileSpec, folder: Path) -> AttitudeReadings:
         raise InputError(Issue("not one complete set of columns", str(path), None, (), found, allowed))
     values, lines = table.stacked(*sets[0]), [int(v) for v in table.lines]
     if sets[0] == _ANGLES:
-        return AttitudeReadings(str(path), clock, None, values, None, scale)
-    require_unit(str(path), values, lines)
-    return AttitudeReadings(str(path), clock, values, None, None, scale, "last" if sets[0] == _NAMED else None)
+        return orbit_files.AttitudeReadings(str(path), clock, None, values, None, scale)
+    orbit_files.require_unit(str(path), values, lines)
+    return orbit_files.AttitudeReadings(
+        str(path), clock, values, None, None, scale, "last" if sets[0] == _NAMED else None
+    )
 
 
-def clock_of(table: Table, spec: OrbitFileSpec | AttitudeFileSpec | LineTimesFileSpec) -> Readings:
+def clock_of(table: Table, spec: OrbitFileSpec | AttitudeFileSpec | LineTimesFileSpec) -> earth_orientation.Readings:
     """Return the clock readings of a table's rows, from its column time or date_time.
 
     Raises
@@ -377,10 +373,10 @@ def clock_of(table: Table, spec: OrbitFileSpec | AttitudeFileSpec | LineTimesFil
         raise InputError(Issue("times must be given exactly once", table.file, None, (), found, allowed))
     try:
         if "date_time" in table:
-            return Readings.of_texts(table["date_time"].tolist())
+            return earth_orientation.Readings.of_texts(table["date_time"].tolist())
         if spec.epoch is None:
             raise spec.error("times in seconds without their epoch", ("epoch",), allowed="reading of the clock at 0 s")
-        return Readings.after(spec.epoch, table["time"])
+        return earth_orientation.Readings.after(spec.epoch, table["time"])
     except Problem as problem:
         if problem.within:
             row = int(problem.within[0])
@@ -388,7 +384,7 @@ def clock_of(table: Table, spec: OrbitFileSpec | AttitudeFileSpec | LineTimesFil
         raise spec.error(problem.problem, ("epoch",), found=problem.found, allowed=problem.allowed) from None
 
 
-def _clock(table: Table, spec: OrbitFileSpec | AttitudeFileSpec) -> tuple[Readings, str | None]:
+def _clock(table: Table, spec: OrbitFileSpec | AttitudeFileSpec) -> tuple[earth_orientation.Readings, str | None]:
     """Return the clock readings of a table, checked to increase, and the scale UTC if all their texts end in Z."""
     clock = clock_of(table, spec)
     if "date_time" in table:
@@ -399,23 +395,25 @@ def _clock(table: Table, spec: OrbitFileSpec | AttitudeFileSpec) -> tuple[Readin
         zoned = "UTC" if str(spec.epoch).endswith("Z") else None
         if (spec.time_scale or zoned) == "UTC":
             clock = _counted(spec, clock)
-    require_increasing(table.file, clock, [int(v) for v in table.lines])
+    earth_orientation.require_increasing(table.file, clock, [int(v) for v in table.lines])
     return clock, zoned
 
 
-def _counted(spec: OrbitFileSpec | AttitudeFileSpec, clock: Readings) -> Readings:
+def _counted(spec: OrbitFileSpec | AttitudeFileSpec, clock: earth_orientation.Readings) -> earth_orientation.Readings:
     """Return UTC clock readings, corrected where the file's seconds since the epoch include leap seconds."""
     try:
         days, where = np.unique(clock.day, return_inverse=True)
-        start = tai_minus_utc(calendar_reading(str(spec.epoch))[0])
-        since = np.array([tai_minus_utc(int(day)) for day in days]) - start
+        start = earth_orientation.tai_minus_utc(earth_orientation.calendar_reading(str(spec.epoch))[0])
+        since = np.array([earth_orientation.tai_minus_utc(int(day)) for day in days]) - start
     except Problem as problem:
         raise spec.error(problem, ("epoch",)) from None
     between = float(np.max(np.abs(since)))
     if between and spec.leap_seconds is None:
         count = f"{between:g} leap seconds lie between the epoch and the times"
         raise spec.error(count, ("leap_seconds",), allowed="counted or skipped")
-    return Readings(clock.day, clock.second - since[where]) if spec.leap_seconds == "counted" else clock
+    return (
+        earth_orientation.Readings(clock.day, clock.second - since[where]) if spec.leap_seconds == "counted" else clock
+    )
 
 
 _ITRS = Conventions("ITRS", "UTC", "ITRS", "UTC", scalar="first", turns="body_to_frame")

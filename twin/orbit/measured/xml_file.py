@@ -17,8 +17,7 @@ import numpy as np
 
 from optics.numerics.number_tree import FrozenMap
 from scenes.yaml.csv_table import LARGEST_NUMBER, table_text
-from scenes.yaml.errors import InputError, Issue, Problem, names_text, nearest, shown
-from twin.orbit.measured.clock import Readings
+from scenes.yaml.errors import InputError, Issue, names_text, nearest, shown
 
 
 def text_lines(path: str | Path, what: str) -> list[str]:
@@ -75,25 +74,6 @@ def numbers(file: str, cells: Sequence[Sequence[str]], lines: Sequence[int], hea
         for k, j in np.argwhere(bad)[:1].tolist():
             raise InputError(Issue(problem, file, lines[k], (heads[j],), shown(cells[k][j]), "a number"))
     return values
-
-
-def readings(file: str, texts: Sequence[str], lines: Sequence[int]) -> Readings:
-    """Parse clock readings from N calendar texts on these lines; raise InputError if one is not a date and time."""
-    try:
-        return Readings.of_texts(texts)
-    except Problem as problem:
-        (row,) = problem.within
-        raise InputError(
-            Issue(problem.problem, file, lines[int(row)], ("time",), problem.found, problem.allowed)
-        ) from None
-
-
-def require_increasing(file: str, clock: Readings, lines: Sequence[int]) -> None:
-    """Raise InputError unless each of N clock readings on these lines is later than the one before it."""
-    back = (np.diff(clock.day) * 86400.0 + np.diff(clock.second)) <= 0.0
-    for row in np.flatnonzero(back)[:1]:
-        problem = "a time that is not later than the one before it"
-        raise InputError(Issue(problem, file, lines[row + 1], allowed="times in increasing order, each once"))
 
 
 def _is_number(text: str) -> bool:

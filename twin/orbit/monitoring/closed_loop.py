@@ -16,7 +16,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 
@@ -239,8 +239,8 @@ def loop_model(setup: MonitorSetup, experiment: MonitorExperiment) -> LoopModel:
             k += 1
             if abs(effect[row]) < _SMALL:
                 problem = f"{spec.mechanism} has no effect on {spec.quantity} of {spec.camera}"
-                allowed = "a motion that changes it"
-                raise test.error(problem, ("mechanisms", "corrections", name, "mechanism"), allowed=allowed)
+                key = ("mechanisms", "corrections", name, "mechanism")
+                raise test.error(problem, key, allowed="a motion that changes it")
         correctors.append(Corrector(name, spec, motion, row, effect, shift))
     whole = replace(prior, parameters=np.concatenate([prior.parameters, per_sigma]))
     return LoopModel(experiment, whole, tuple(correctors))
@@ -396,10 +396,9 @@ def reader(model: LoopModel, spec: OrbitMonitorSpec, seed: int) -> Read:
     experiment, errors = model.experiment, spec.errors
     frames = spec.frames or experiment.instrument.spec.autocollimator.frames
     noisy = errors.switched_on and errors.monitor
+    before = experiment.expected_frames(experiment.nominal_photons)
     if noisy:
         before = mean_frames(experiment.frames_before(frames, seed))
-    else:
-        before = experiment.expected_frames(experiment.nominal_photons)
     centroid = spec.analysis.centroid
     with one_blas_thread():
         first = judged_spots(before, frames, experiment.calibration, centroid, cores())
@@ -447,8 +446,8 @@ def simulate_course(
         Callback that receives the number of moments finished.
     """
     commands = Commands.none(model, open_loop)
-    rows: list[tuple[np.ndarray, ...]] = []
-    chi_square, jumps, moved_states = [], [], []
+    rows: list[tuple[Any, ...]] = []
+    jumps, moved_states = [], []
     evidence: tuple[SpotEvidence, ...] = ()
     for k, state in enumerate(states):
         positions_now = commands.positions_now
@@ -460,29 +459,17 @@ def simulate_course(
             series_filter = SeriesFilter(model.prior, before)
             filter_state = series_filter.start(reading.time)
         filter_state, innovation = series_filter.update(filter_state, reading)
-        chi_square.append(innovation.chi_square)
-        if innovation.jump is not None:
-            jumps.append(innovation.jump)
+        jumps += [] if innovation.jump is None else [innovation.jump]
         mean, covariance = series_filter.parameters(series_filter.mixture(filter_state), reading.time)
         commands = commands.after_reading(mean)
         position = commands.positions_now
-        rows.append((position, commands.held, mean + model.effects @ position, covariance))
+        rows.append((position, commands.held, mean + model.effects @ position, covariance, innovation.chi_square))
         moved_states.append(model.moved(state, position))
         advance(k + 1)
-    positions, held, expected, spread = (np.array(column) for column in zip(*rows, strict=True))
-    times = np.array(spec.times)
-    return LoopCourse(
-        model,
-        times,
-        positions,
-        held,
-        expected,
-        spread,
-        np.array(chi_square),
-        tuple(jumps),
-        tuple(moved_states),
-        SpotEvidence.joined(evidence) if evidence else None,
-    )
+    positions, held, expected, covariances, square = (np.array(column) for column in zip(*rows, strict=True))
+    measured = np.array(spec.times), positions, held, expected, covariances, square
+    joined = SpotEvidence.joined(evidence) if evidence else None
+    return LoopCourse(model, *measured, tuple(jumps), tuple(moved_states), joined)
 
 
 @dataclass(frozen=True, eq=False)

@@ -35,25 +35,13 @@ from twin.framework.procedure import Advance, BenchError
 from twin.framework.random_streams import stream
 from twin.monitor.image_quality import image_quality
 from twin.monitor.monitor_experiment import MonitorExperiment
-from twin.orbit.flight.light_effects import NO_EFFECTS
 from twin.orbit.flight.line_camera import LineCamera, calibrated_line, corrected_line
-from twin.orbit.flight.sensor import Sensor
+from twin.orbit.flight.sensor import NO_EFFECTS, Sensor
 from twin.orbit.images.image_points import POINTS_REMEDY, PointsError, tie_points
 from twin.orbit.images.line_optics import LineOptics
 from twin.orbit.images.patch import PatchError, fly_patch, imaged_lines
-from twin.orbit.monitoring import closed_loop
+from twin.orbit.monitoring import closed_loop, pair_flight
 from twin.orbit.monitoring.closed_loop import FOCUS_FIELDS, Corrector, LoopCourse, LoopModel, defocus
-from twin.orbit.monitoring.pair_flight import (
-    HALF_SPAN,
-    CaseErrors,
-    OrbitAndAttitude,
-    PairFlight,
-    fly,
-    second_view,
-    sightings,
-    traced_pair,
-    view_check_points,
-)
 
 if TYPE_CHECKING:
     from optics.numerics.backend import Backend
@@ -98,12 +86,12 @@ class ImagedPair:
 
 def imaged_pair(
     setup: MonitorSetup,
-    flight: PairFlight,
+    flight: pair_flight.PairFlight,
     moment: int,
     nominal: Mapping[str, LineCamera],
     changes: Mapping[str, np.ndarray],
     foci: Mapping[str, float],
-    flown: OrbitAndAttitude,
+    flown: pair_flight.OrbitAndAttitude,
     seed: np.random.SeedSequence,
 ) -> ImagedPair:
     """Render a pair of line images, match points in them, and intersect the points to ground coordinates.
@@ -135,7 +123,7 @@ def imaged_pair(
     spec, pair, images = setup.test, setup.pair, setup.test.loop.images
     assert images is not None
     time, lines, calibrated = spec.times[moment], flight.lines[moment], flight.calibrated
-    begin, count = time - HALF_SPAN, int(2.0 * HALF_SPAN / spec.line_time)
+    begin, count = time - pair_flight.HALF_SPAN, int(2.0 * pair_flight.HALF_SPAN / spec.line_time)
 
     def sensor(line: LineCamera, measured: bool) -> Sensor:
         trajectory = flown.measured if measured else flown.true
@@ -146,7 +134,7 @@ def imaged_pair(
     optics = {name: _optics(setup, name, foci[name]) for name in pair}
     middle = 0.5 * (spec.ground.first + spec.ground.last)
     height = images.ground.terrain.height
-    at = second_view([true[name] for name in pair], time, middle, height)
+    at = pair_flight.second_view([true[name] for name in pair], time, middle, height)
     point = true[pair[1]].ground(np.array([(at - begin) / spec.line_time]), np.array([middle]), height)
     longitude, latitude, _ = flown.earth.geodetic(point[0])
     recording = imaged_lines(true, users, optics, stream(seed, 0))
@@ -162,15 +150,13 @@ def imaged_pair(
         raise BenchError(problem, ("mechanisms", "images"), POINTS_REMEDY)
     ground = patch.true_point(pair[1], *ties.lines[pair[1]].position[good].T)
     should = np.stack(true[pair[0]].image(ground), axis=1)
-    first_points, second_points = (
-        (calibrated[name].corrected(changes[name]), ties.lines[name].image[good]) for name in pair
-    )
+    points = [ties.lines[name].image[good] for name in pair]
+    a, b = (calibrated[name].corrected(changes[name]) for name in pair)
     first, second = (
-        sightings(users[name], users[name].trajectory, *points.T)
-        for name, (_, points) in zip(pair, (first_points, second_points), strict=True)
+        pair_flight.sightings(users[n], users[n].trajectory, *p.T) for n, p in zip(pair, points, strict=True)
     )
-    errors = check_errors(intersect_pair(first_points[0], second_points[0], first, second).ground, ground).error
-    return ImagedPair(moment, errors, first_points[1] - should, ties.lines[pair[0]].median_sigma, len(good))
+    errors = check_errors(intersect_pair(a, b, first, second).ground, ground).error
+    return ImagedPair(moment, errors, points[0] - should, ties.lines[pair[0]].median_sigma, len(good))
 
 
 _FEWEST = 8
@@ -244,9 +230,9 @@ class LoopOutcome:
     """
 
     course: LoopCourse
-    flight: PairFlight
+    flight: pair_flight.PairFlight
     truth: np.ndarray
-    heights: CaseErrors
+    heights: pair_flight.CaseErrors
     slopes: np.ndarray
     angle: np.ndarray
     mtf: Mapping[str, np.ndarray]
@@ -368,12 +354,8 @@ class LoopRun:
         Angle and quantities are in rad and m, height in m; for the MTF at the Nyquist frequency the largest difference
         from 1 is given.
         """
-        open_errors, closed_errors = self._errors(self.open), self._errors(self.closed)
-        return {
-            n: (open_errors[n], v)
-            for n, v in closed_errors.items()
-            if v > max((1.0 + WORSE) * open_errors[n], _NOTHING)
-        }
+        before, after = self._errors(self.open), self._errors(self.closed)
+        return {n: (before[n], v) for n, v in after.items() if v > max((1.0 + WORSE) * before[n], _NOTHING)}
 
     def _errors(self, outcome: LoopOutcome) -> dict[str, float]:
         names = [(name, key) for name in self.model.cameras for key in (*PARAMETERS, "defocus")]
@@ -389,12 +371,10 @@ class LoopRun:
     @property
     def ratios(self) -> dict[str, float]:
         """Largest error of each quantity's posterior mean divided by its sigma, with the loop closed and open."""
-        rows = {f"defocus of {name}": self.model.unit(name, "defocus") for name in self.pair}
-        rows_of = {"angle": (self.open.angle,) * 2, "height": (self.closed.slopes, self.open.slopes)}
-        rows_of |= {name: (row, row) for name, row in rows.items()}
+        rows = {"angle": (self.open.angle,) * 2, "height": (self.closed.slopes, self.open.slopes)}
+        rows |= {f"defocus of {name}": (self.model.unit(name, "defocus"),) * 2 for name in self.pair}
         return {
-            name: max(self.closed.ratio(closed_rows), self.open.ratio(open_rows))
-            for name, (closed_rows, open_rows) in rows_of.items()
+            name: max(self.closed.ratio(closed), self.open.ratio(opened)) for name, (closed, opened) in rows.items()
         }
 
     @property
@@ -405,10 +385,8 @@ class LoopRun:
     @property
     def phase_deg(self) -> float:
         """Smallest phase margin of the control loops, in degrees; NaN where no loop has a phase margin."""
-        margins = [
-            analysis.margins.phase_deg for analysis in self.loops.values() if math.isfinite(analysis.margins.phase_deg)
-        ]
-        return min(margins, default=math.nan)
+        phases = (analysis.margins.phase_deg for analysis in self.loops.values())
+        return min(filter(math.isfinite, phases), default=math.nan)
 
 
 _SCALE = np.array([1.0, FOCUS_SCALE, FOCUS_SCALE])
@@ -445,7 +423,7 @@ def run_loop(setup: MonitorSetup, backend: Backend, seed: int, advance: Advance)
             advance(part, done, len(states))
 
         courses.append(closed_loop.simulate_course(model, spec, states, read, still, report))
-    nominal = traced_pair(experiment, {}, pair)
+    nominal = pair_flight.traced_pair(experiment, {}, pair)
     closed, opened = (_outcome_of(setup, course, nominal, ground_seed, advance) for course in courses)
     # height and foci of the pair
     rows = np.stack([opened.slopes.mean(axis=0), *(model.unit(name, "defocus") for name in pair)])
@@ -455,20 +433,11 @@ def run_loop(setup: MonitorSetup, backend: Backend, seed: int, advance: Advance)
         [corrector.spec.delay for corrector in model.correctors],
         [corrector.row for corrector in model.correctors],
     )
-    return LoopRun(
-        setup,
-        seed,
-        model,
-        closed,
-        opened,
-        FrozenMap(analyses),
-        control_loop.spectral_radius(model.coupling, *loops),
-        control_loop.common_margin(model.coupling, *loops),
-        unobservable_modes(model.prior, rows, _SCALE),
-        np.stack(
-            [_floor(model, opened.slopes), *(np.full(len(states), _floor(model, row[None])[0]) for row in rows[1:])]
-        ),
-    )
+    radius, margin = (f(model.coupling, *loops) for f in (control_loop.spectral_radius, control_loop.common_margin))
+    modes = unobservable_modes(model.prior, rows, _SCALE)
+    foci = (np.full(len(states), _floor(model, row[None])[0]) for row in rows[1:])
+    floors = np.stack([_floor(model, opened.slopes), *foci])
+    return LoopRun(setup, seed, model, closed, opened, FrozenMap(analyses), radius, margin, modes, floors)
 
 
 def _analyse_loop(model: LoopModel, k: int, course: LoopCourse) -> LoopAnalysis:
@@ -478,13 +447,8 @@ def _analyse_loop(model: LoopModel, k: int, course: LoopCourse) -> LoopAnalysis:
     cycle = None
     if step is not None and spec.gain:
         cycle = control_loop.limit_cycle(spec.gain, spec.delay, spec.band / abs(step * corrector.sensitivity))
-    return LoopAnalysis(
-        corrector,
-        gain,
-        control_loop.margins(gain, spec.delay),
-        cycle,
-        tuple(np.flatnonzero(course.held[:, k]).tolist()),
-    )
+    ends = tuple(np.flatnonzero(course.held[:, k]).tolist())
+    return LoopAnalysis(corrector, gain, control_loop.margins(gain, spec.delay), cycle, ends)
 
 
 def _floor(model: LoopModel, rows: np.ndarray) -> np.ndarray:
@@ -501,10 +465,10 @@ def _outcome_of(
     """Compute the true errors of cameras, foci and heights that result from a simulated time series of states."""
     model, pair, experiment, test = course.model, setup.pair, course.model.experiment, setup.test
     axes, distance = experiment.sight.axes, experiment.nominal_truth.principal_distance
-    lines = tuple(traced_pair(experiment, state, pair) for state in course.states)
-    views = view_check_points(test, pair, lines, seed, advance)
+    lines = tuple(pair_flight.traced_pair(experiment, state, pair) for state in course.states)
+    views = pair_flight.view_check_points(test, pair, lines, seed, advance)
     calibrated = FrozenMap({name: calibrated_line(nominal[name], axes[name], distance[name]) for name in pair})
-    flight = PairFlight(pair, course.times, lines, calibrated, views)
+    flight = pair_flight.PairFlight(pair, course.times, lines, calibrated, views)
     changes = {name: np.array([model.on_ground(name, row) for row in course.positions]) for name in model.cameras}
     truth = experiment.sight.truth(list(course.states))
     advance("image quality", 0, 1)
@@ -523,10 +487,8 @@ def _outcome_of(
     angle = np.zeros(quantities.shape[1])
     angle[[model.row(name, "d_alpha") for name in pair]] = [1.0, -1.0] if looks[0] > looks[1] else [-1.0, 1.0]
     mtf = {
-        name: np.stack(
-            [camera_quality.mtf_along_line.mean(axis=1), camera_quality.mtf_along_track.mean(axis=1)], axis=1
-        )
-        for name, camera_quality in quality.cameras.items()
+        name: np.stack([of.mtf_along_line.mean(axis=1), of.mtf_along_track.mean(axis=1)], axis=1)
+        for name, of in quality.cameras.items()
     }
     images = []
     times = test.loop.images.times if test.loop.images is not None else ()
@@ -536,7 +498,9 @@ def _outcome_of(
         assert k is not None  # the file was checked
         now = {name: values[k] for name, values in changes.items()}
         foci = {name: float(quantities[k, model.row(name, "defocus")]) for name in pair}
-        images.append(imaged_pair(setup, flight, k, nominal, now, foci, fly(test, seed), stream(seed, _IMAGES, k)))
+        images.append(
+            imaged_pair(setup, flight, k, nominal, now, foci, pair_flight.fly(test, seed), stream(seed, _IMAGES, k))
+        )
     return LoopOutcome(course, flight, quantities, flight.case(changes), slopes, angle, FrozenMap(mtf), tuple(images))
 
 

@@ -16,15 +16,7 @@ from analysis.statistics import rms
 from scenes.specs.course import moment
 from twin.framework.artefact import significant
 from twin.framework.record import Quantity, Record
-from twin.orbit.monitoring.loop_run import (
-    GAIN_MARGIN,
-    PHASE_MARGIN_DEG,
-    ImagedPair,
-    LoopAnalysis,
-    LoopOutcome,
-    LoopRun,
-    height_rms,
-)
+from twin.orbit.monitoring import loop_run
 from twin.orbit.monitoring.monitoring_run import Cause, MonitorRun, Smoothing
 from twin.orbit.monitoring.pair_flight import CaseErrors
 
@@ -225,28 +217,24 @@ def _known(value: float) -> float | None:
     return value if np.isfinite(value) else None
 
 
-def _defocus(of: tuple[LoopRun, LoopOutcome, str]) -> Array:
+def _defocus(of: tuple[loop_run.LoopRun, loop_run.LoopOutcome, str]) -> Array:
     return of[1].true(of[0].model.unit(of[2], "defocus"))
 
 
-def _posterior_defocus(of: tuple[LoopRun, LoopOutcome, str]) -> tuple[Array, Array]:
+def _posterior_defocus(of: tuple[loop_run.LoopRun, loop_run.LoopOutcome, str]) -> tuple[Array, Array]:
     return of[1].posterior(of[0].model.unit(of[2], "defocus"))
 
 
-FOCUS: Record[tuple[LoopRun, LoopOutcome, str]] = Record(
+FOCUS: Record[tuple[loop_run.LoopRun, loop_run.LoopOutcome, str]] = Record(
     "Focus of one camera, best focus less line CCD, over the moments.",
     Quantity("defocus_um", _defocus, "true defocus"),
     Quantity("estimated_um", lambda of: _posterior_defocus(of)[0], "posterior mean"),
     Quantity("estimated_um_sigma", lambda of: _posterior_defocus(of)[1], "posterior standard deviation"),
     Quantity("defocus_rms_um", lambda of: rms(_defocus(of)), "RMS over the moments"),
-    Quantity(
-        "mtf_along_line", lambda of: of[1].mtf[of[2]][:, 0], "MTF with the pixel at Nyquist, mean over the fields"
-    ),
-    Quantity(
-        "mtf_along_track", lambda of: of[1].mtf[of[2]][:, 1], "MTF with the pixel at Nyquist, mean over the fields"
-    ),
+    Quantity("mtf_along_line", lambda o: o[1].mtf[o[2]][:, 0], "MTF with the pixel at Nyquist, mean over the fields"),
+    Quantity("mtf_along_track", lambda o: o[1].mtf[o[2]][:, 1], "MTF with the pixel at Nyquist, mean over the fields"),
 )
-MOMENTS: Record[LoopOutcome] = Record(
+MOMENTS: Record[loop_run.LoopOutcome] = Record(
     "Errors of each moment.",
     Quantity("angle_arcsec", lambda o: o.true(o.angle) + 0.0, "true error of the angle"),
     Quantity("angle_estimated_arcsec", lambda o: o.posterior(o.angle)[0] + 0.0, "posterior mean"),
@@ -259,7 +247,7 @@ MOMENTS: Record[LoopOutcome] = Record(
 )
 
 
-IMAGES: Record[tuple[LoopOutcome, ImagedPair]] = Record(
+IMAGES: Record[tuple[loop_run.LoopOutcome, loop_run.ImagedPair]] = Record(
     "Points of a pair of rendered line images, matched and intersected.",
     Quantity("time_s", lambda of: float(of[0].course.times[of[1].moment]), "time of the reading before", "time", 0),
     Quantity("points", lambda of: len(of[1].errors), "number of matched points", "points"),
@@ -275,11 +263,11 @@ IMAGES: Record[tuple[LoopOutcome, ImagedPair]] = Record(
 )
 
 
-def _foci(of: tuple[LoopRun, LoopOutcome]) -> float:
+def _foci(of: tuple[loop_run.LoopRun, loop_run.LoopOutcome]) -> float:
     return rms(np.concatenate([_defocus((*of, name)) for name in of[0].pair]))
 
 
-def _contradicted(of: tuple[LoopRun, LoopOutcome]) -> str:
+def _contradicted(of: tuple[loop_run.LoopRun, loop_run.LoopOutcome]) -> str:
     course, label = of[1].course, "closed" if of[1] is of[0].closed else "open"
     where = "" if (at := course.contradiction) is None else f", first at {moment(float(course.times[at]))}"
     return (
@@ -289,11 +277,13 @@ def _contradicted(of: tuple[LoopRun, LoopOutcome]) -> str:
     )
 
 
-PASS: Record[tuple[LoopRun, LoopOutcome]] = Record(
+PASS: Record[tuple[loop_run.LoopRun, loop_run.LoopOutcome]] = Record(
     "Errors over the moments with the loop closed or open.",
     Quantity("angle_rms_arcsec", lambda of: rms(of[1].true(of[1].angle)), "RMS error of the angle", "angle", 3),
     Quantity("angle_sigma_rms_arcsec", lambda of: rms(of[1].posterior(of[1].angle)[1]), "by the posterior", "σ", 3),
-    Quantity("height_camera_rms_m", lambda of: height_rms(of[1]), "mean height error by the cameras", "height", 3),
+    Quantity(
+        "height_camera_rms_m", lambda of: loop_run.height_rms(of[1]), "mean height error by the cameras", "height", 3
+    ),
     Quantity("height_sigma_rms_m", lambda of: rms(of[1].posterior(of[1].slopes)[1]), "by the posterior", "σ", 3),
     Quantity("height_rms_m", lambda of: of[1].heights.height_rms, "RMS of all errors in height", "all errors", 3),
     Quantity("defocus_rms_um", _foci, "defocus of the pair's cameras together", "defocus", 2),
@@ -315,13 +305,13 @@ PASS: Record[tuple[LoopRun, LoopOutcome]] = Record(
 )
 
 
-def positions(run: LoopRun, name: str) -> Array:
+def positions(run: loop_run.LoopRun, name: str) -> Array:
     """Return the commanded positions of a mechanism when images are taken, (T,) for T moments, in its unit."""
     k = [corrector.name for corrector in run.model.correctors].index(name)
     return np.asarray(run.closed.course.positions[:, k] / run.model.correctors[k].unit[1] + 0.0)
 
 
-def _unstable_alone(of: tuple[LoopRun, str, LoopAnalysis]) -> str:
+def _unstable_alone(of: tuple[loop_run.LoopRun, str, loop_run.LoopAnalysis]) -> str:
     limit, delay = of[2].margins.limit, of[2].corrector.spec.delay
     return (
         f"{of[1]} is unstable by itself: its loop gain of {of[2].loop_gain:.3g} is not below {limit:.3g}, the limit of "
@@ -329,7 +319,7 @@ def _unstable_alone(of: tuple[LoopRun, str, LoopAnalysis]) -> str:
     )
 
 
-CORRECTION: Record[tuple[LoopRun, str, LoopAnalysis]] = Record(
+CORRECTION: Record[tuple[loop_run.LoopRun, str, loop_run.LoopAnalysis]] = Record(
     "One correction as a loop.",
     Quantity("camera", lambda of: of[2].corrector.spec.camera, "camera of the corrected quantity"),
     Quantity("quantity", lambda of: of[2].corrector.spec.quantity, "corrected quantity"),
@@ -337,9 +327,7 @@ CORRECTION: Record[tuple[LoopRun, str, LoopAnalysis]] = Record(
     Quantity("gain", lambda of: of[2].corrector.spec.gain, "stated gain", "gain", 3),
     Quantity("delay", lambda of: of[2].corrector.spec.delay, "delay in readings"),
     Quantity("loop_gain", lambda of: of[2].loop_gain, "gain with the observed response of the mechanism"),
-    Quantity(
-        "observed_share", lambda of: _observed_share(*of), "share of its response error", "observed", 3, None, True
-    ),
+    Quantity("observed_share", lambda o: _observed_share(*o), "share of its response error", "observed", 3, None, True),
     Quantity("gain_limit", lambda of: of[2].margins.limit, "below which this loop is stable", "limit", 4),
     Quantity("gain_margin", lambda of: _known(of[2].margins.gain), "limit over loop gain; null for gain 0", decimals=2),
     Quantity("phase_margin_deg", lambda of: _known(of[2].margins.phase_deg), "", "phase margin", 1, converted=False),
@@ -347,18 +335,16 @@ CORRECTION: Record[tuple[LoopRun, str, LoopAnalysis]] = Record(
     Quantity("cycle_steps", lambda of: of[2].cycle and of[2].cycle.steps, "of the limit cycle, peak to peak", "cycle"),
     Quantity("unit", lambda of: of[2].corrector.unit[0], "unit of positions"),
     Quantity("positions", lambda of: positions(of[0], of[1]), "when images are taken", converted=False),
-    Quantity(
-        "held_s", lambda of: [float(of[0].closed.course.times[k]) for k in of[2].ends], "times at its range's end"
-    ),
+    Quantity("held_s", lambda o: [float(o[0].closed.course.times[k]) for k in o[2].ends], "times at its range's end"),
 )
 
 
-def _observed_share(run: LoopRun, name: str, facts: LoopAnalysis) -> float | None:
+def _observed_share(run: loop_run.LoopRun, name: str, facts: loop_run.LoopAnalysis) -> float | None:
     k = [corrector.name for corrector in run.model.correctors].index(name)
     return None if facts.corrector.motion is None else float(run.model.observed_share[k])
 
 
-def motions_of(run: LoopRun, mode: UnobservableMode) -> list[dict[str, Any]]:
+def motions_of(run: loop_run.LoopRun, mode: UnobservableMode) -> list[dict[str, Any]]:
     """Return the largest motions in an unobservable mode, with their sizes for one standard deviation of the mode."""
     prior = run.model.prior
     order = np.argsort(-np.abs(mode.motions), kind="stable")[:MOST_MOTIONS]
@@ -368,7 +354,7 @@ def motions_of(run: LoopRun, mode: UnobservableMode) -> list[dict[str, Any]]:
     ]
 
 
-MODE: Record[tuple[LoopRun, UnobservableMode]] = Record(
+MODE: Record[tuple[loop_run.LoopRun, UnobservableMode]] = Record(
     "Unobservable mode: a combination of motions that moves no spot, for one standard deviation.",
     Quantity("height_m", lambda of: float(of[1].quantities[0]), "height error", "height", 3),
     Quantity("angle_arcsec", lambda of: angle_of(*of), "change of the angle", "angle", 4),
@@ -380,27 +366,27 @@ MODE: Record[tuple[LoopRun, UnobservableMode]] = Record(
 )
 
 
-def angle_of(run: LoopRun, mode: UnobservableMode) -> float:
+def angle_of(run: loop_run.LoopRun, mode: UnobservableMode) -> float:
     """Return the change of the intersection angle for one standard deviation of an unobservable mode, in radians."""
     return float(run.open.angle @ run.model.prior.parameters @ mode.motions)
 
 
-def _near_limit(run: LoopRun) -> str:
+def _near_limit(run: loop_run.LoopRun) -> str:
     gains = f"{significant(run.margin, 3)} times the stated ones"
     if not run.stable:
         return f"the loops together are unstable: largest eigenvalue {run.radius:.3g}; gains below {gains} are stable"
     nearest = min(run.loops, key=lambda name: run.loops[name].margins.gain)
     return (
         f"the loop is barely stable: gains of {gains} make it unstable, phase margin {run.phase_deg:.0f} deg; it "
-        f"amplifies disturbances near its crossover. Usual are {GAIN_MARGIN:g} times and {PHASE_MARGIN_DEG:g} deg at "
-        f"least: lower the gains, that of {nearest} first"
+        f"amplifies disturbances near its crossover. Usual are {loop_run.GAIN_MARGIN:g} times and "
+        f"{loop_run.PHASE_MARGIN_DEG:g} deg at least: lower the gains, that of {nearest} first"
     )
 
 
-LOOP: Record[LoopRun] = Record(
+LOOP: Record[loop_run.LoopRun] = Record(
     "Results with the loop closed and open.",
-    Quantity("height_closed_rms_m", lambda run: height_rms(run.closed), "by the cameras, loop closed"),
-    Quantity("height_open_rms_m", lambda run: height_rms(run.open), "by the cameras, loop open"),
+    Quantity("height_closed_rms_m", lambda run: loop_run.height_rms(run.closed), "by the cameras, loop closed"),
+    Quantity("height_open_rms_m", lambda run: loop_run.height_rms(run.open), "by the cameras, loop open"),
     Quantity("height_sigma_rms_m", lambda run: rms(run.closed.posterior(run.closed.slopes)[1]), "by the posterior"),
     Quantity(
         "height_unobservable_rms_m",
@@ -425,7 +411,7 @@ LOOP: Record[LoopRun] = Record(
     Quantity("unobservable_height_m", lambda run: run.unobservable_sigma[0], "1σ, over the moments"),
     Quantity("unobservable_defocus_um", lambda run: run.unobservable_sigma[1:, 0], "1σ, of the pair"),
 )
-CLOSED: Record[LoopRun] = Record(
+CLOSED: Record[loop_run.LoopRun] = Record(
     "Content of monitor.json with mechanisms.",
     Quantity("seed", lambda run: run.seed, "seed of all random numbers"),
     Quantity("times_s", lambda run: run.closed.course.times, "times of the readings"),
@@ -433,6 +419,6 @@ CLOSED: Record[LoopRun] = Record(
 )
 
 
-def monitor_numbers(run: MonitorRun | LoopRun) -> dict[str, Any]:
+def monitor_numbers(run: MonitorRun | loop_run.LoopRun) -> dict[str, Any]:
     """Return the numbers that monitor.json contains: changes, angle, heights and their errors."""
-    return CLOSED(run) if isinstance(run, LoopRun) else MONITOR(run)
+    return CLOSED(run) if isinstance(run, loop_run.LoopRun) else MONITOR(run)

@@ -30,17 +30,9 @@ from twin.framework.procedure import Advance, BenchError, silent
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.monitor.truth import Truth
 from twin.orbit.flight.line_camera import LineCamera, calibrated_line, look_angle
+from twin.orbit.monitoring import pair_flight
 from twin.orbit.monitoring.loop_run import LoopRun, run_loop
 from twin.orbit.monitoring.monitor_series import MonitorSeries, Readings, SmoothedReadings, states_of
-from twin.orbit.monitoring.pair_flight import (
-    TOO_FAR,
-    CaseErrors,
-    PairFlight,
-    in_calibrated_form,
-    point_errors,
-    traced_pair,
-    view_check_points,
-)
 
 if TYPE_CHECKING:
     from optics.numerics.backend import Backend
@@ -157,8 +149,8 @@ class Smoothing:
         Chi-square test of the measured shifts against the prior.
     """
 
-    case: CaseErrors
-    interpolated: CaseErrors
+    case: pair_flight.CaseErrors
+    interpolated: pair_flight.CaseErrors
     error: np.ndarray
     sigma: np.ndarray
     consistency: Consistency
@@ -191,7 +183,7 @@ class Smoothing:
 
 
 @dataclass(frozen=True, eq=False)
-class MonitorRun(PairFlight):
+class MonitorRun(pair_flight.PairFlight):
     """Results of a monitored orbit: truth and measurements at T times, and the resulting heights.
 
     Changes are relative to the reference, at which the lines were calibrated.
@@ -260,8 +252,7 @@ class MonitorRun(PairFlight):
 
     def height(self, values: Mapping[str, np.ndarray]) -> np.ndarray:
         """Return the mean height errors at T times, (T,), in m, due to errors (T, 4) of each camera's parameters."""
-        heights = [np.sum(self.slopes[n] * values[n], axis=1) for n in self.pair]
-        return np.asarray(np.sum(heights, axis=0))
+        return np.asarray(np.sum([np.sum(self.slopes[n] * values[n], axis=1) for n in self.pair], axis=0))
 
     def variance(self, covariance: np.ndarray, at: int | None = None) -> np.ndarray:
         """Return the variance of the mean height due to the pair's parameters, for S covariances, (S,), in m^2.
@@ -281,13 +272,13 @@ class MonitorRun(PairFlight):
         """Return the values that correct each camera in S states, (S, 4); 0 for parameters that are not applied."""
         return {name: readings[name].vector * self.mask for name in self.pair}
 
-    def _interpolated(self, interval: float) -> CaseErrors:
+    def _interpolated(self, interval: float) -> pair_flight.CaseErrors:
         at = self.spec.measured(interval)
         applied = self.applied(self.monitored)
         return self.case({name: between(self.times, self.times[at], v[at]) for name, v in applied.items()})
 
     @cached_property
-    def cases(self) -> Mapping[str, CaseErrors]:
+    def cases(self) -> Mapping[str, pair_flight.CaseErrors]:
         """Errors at the check points, by name of the method with which the cameras are corrected.
 
         none: cameras as calibrated; monitored: corrected with the monitor's readings at every time; interval: corrected
@@ -305,7 +296,7 @@ class MonitorRun(PairFlight):
         return FrozenMap(cases | {"parameters": self.case(self.truth), "true": self.true_case})
 
     @cached_property
-    def intervals(self) -> Mapping[float, CaseErrors]:
+    def intervals(self) -> Mapping[float, pair_flight.CaseErrors]:
         """Errors at the check points with interpolated readings, by interval between measurements, in seconds."""
         return FrozenMap({interval: self._interpolated(interval) for interval in self.spec.compared})
 
@@ -377,13 +368,13 @@ class MonitorRun(PairFlight):
         k = self.spec.reference_index
         view, traced = self.views[k], {}
         first, second = self.pair
-        calm = point_errors(self.true_pair(k), view, exact_data=True)[:, 2].mean()
+        calm = pair_flight.point_errors(self.true_pair(k), view, exact_data=True)[:, 2].mean()
         slant, incidence = {}, {}
         up = view.ground / np.linalg.norm(view.ground, axis=1, keepdims=True)
         for i, name in enumerate(self.pair):
             pair = self.true_pair(k)
-            pair[i] = in_calibrated_form(self.rotated[name], self.calibrated[name])
-            traced[name] = float(point_errors(pair, view, exact_data=True)[:, 2].mean() - calm)
+            pair[i] = pair_flight.in_calibrated_form(self.rotated[name], self.calibrated[name])
+            traced[name] = float(pair_flight.point_errors(pair, view, exact_data=True)[:, 2].mean() - calm)
             arm = view.exact[i].station - view.ground
             slant[name] = np.linalg.norm(arm, axis=1)
             forward = np.cross(up, view.exact[i].attitude[:, :, 1])  # along the track, level
@@ -406,7 +397,7 @@ class MonitorRun(PairFlight):
         monitored, heights = self.applied(self.repeated), []
         for row in range(self.spec.repeats):
             pair = [self.calibrated[n].corrected(monitored[n][row]) for n in self.pair]
-            heights.append(point_errors(pair, self.views[self.worst], exact_data=True)[:, 2].mean())
+            heights.append(pair_flight.point_errors(pair, self.views[self.worst], exact_data=True)[:, 2].mean())
         variance = self.variance(self.repeated.noise, self.worst)
         return Scatter(np.array(heights), float(np.sqrt(np.mean(variance))))
 
@@ -452,7 +443,7 @@ def run_monitor(setup: MonitorSetup, backend: Backend, seed: int, advance: Advan
         run.cases, run.intervals, run.conversion, run.scatter  # noqa: B018
         return run
     except (AimError, BeamMissedError) as error:
-        raise BenchError(f"the instrument cannot be rendered: {error}", spec.times_key, TOO_FAR) from error
+        raise BenchError(f"the instrument cannot be rendered: {error}", spec.times_key, pair_flight.TOO_FAR) from error
     except IntersectionError as error:
         raise BenchError(str(error), ("cameras",), "cameras with different look angles") from error
 
@@ -478,21 +469,19 @@ def simulate_monitoring(setup: MonitorSetup, backend: Backend, seed: int, advanc
     spec.check_nodes(experiment.instrument.nodes)
     states = states_of(experiment, spec)
     advance("monitor", 1, parts)
-    reference, bodies = (
-        states[spec.reference_index],
-        {body.path: body for body in experiment.instrument.assembly.tree.bodies},
-    )
+    reference = states[spec.reference_index]
+    bodies = {body.path: body for body in experiment.instrument.assembly.tree.bodies}
 
     def rotated_state(camera: str) -> State:
         return compose(reference, {f"{BASE}/{camera}": Motion((0.0, ARCSEC, 0.0))}, bodies)
 
-    lines = tuple(traced_pair(experiment, state, pair) for state in states)
-    by_arcsec = {name: traced_pair(experiment, rotated_state(name), pair)[name] for name in pair}
+    lines = tuple(pair_flight.traced_pair(experiment, state, pair) for state in states)
+    by_arcsec = {name: pair_flight.traced_pair(experiment, rotated_state(name), pair)[name] for name in pair}
     advance("monitor", 2, parts)
     angle = np.array([look_angle(line[pair[0]], line[pair[1]]) for line in lines])
     worst = int(np.argmax(np.abs(angle - angle[spec.reference_index])))
     # computed before the images, which take longer, so that errors appear early
-    views = view_check_points(spec, pair, lines, ground_seed, advance)
+    views = pair_flight.view_check_points(spec, pair, lines, ground_seed, advance)
     monitor = MonitorSeries(experiment, spec, reference, pair)
     noisy, clean = monitor.measured(states, number)
     truth, distance = _changes(clean.truth, spec.reference_index)

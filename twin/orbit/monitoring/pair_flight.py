@@ -23,10 +23,9 @@ from twin.framework.procedure import Advance, BenchError
 from twin.framework.random_streams import stream
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.orbit.flight.earth import Earth
-from twin.orbit.flight.light_effects import NO_EFFECTS
 from twin.orbit.flight.line_camera import LineCamera, calibrated_line, traced_line_cameras
 from twin.orbit.flight.orbit import propagate
-from twin.orbit.flight.sensor import Platform, Sensor
+from twin.orbit.flight.sensor import NO_EFFECTS, Platform, Sensor
 from twin.orbit.flight.trajectory import Trajectory
 
 if TYPE_CHECKING:
@@ -256,15 +255,12 @@ def case_errors(errors: np.ndarray, true: np.ndarray) -> CaseErrors:
     true : (T, n, 3) ndarray
         Errors with the true cameras and the same image points, orbit and attitude, in metres.
     """
-    alone = errors - true
-    return CaseErrors(
-        plan=np.sqrt(np.mean(np.sum(errors[..., :2] ** 2, axis=-1), axis=1)),
-        height=np.sqrt(np.mean(errors[..., 2] ** 2, axis=1)),
-        bias=errors[..., 2].mean(axis=1),
-        camera=alone[..., 2].mean(axis=1),
-        camera_plan=np.sqrt(np.mean(np.sum(alone[..., :2] ** 2, axis=-1), axis=1)),
-        camera_height=np.sqrt(np.mean(alone[..., 2] ** 2, axis=1)),
+    all_errors, by_cameras = (
+        (np.sqrt(np.mean(np.sum(e[..., :2] ** 2, axis=-1), axis=1)), np.sqrt(np.mean(e[..., 2] ** 2, axis=1)))
+        for e in (errors, errors - true)
     )
+    bias, camera = (e[..., 2].mean(axis=1) for e in (errors, errors - true))
+    return CaseErrors(*all_errors, bias, camera, *by_cameras)
 
 
 def view_check_points(

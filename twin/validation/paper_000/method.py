@@ -41,8 +41,8 @@ from twin.orbit.angle.angle_run import (
     resect_measurement,
     values_of,
 )
-from twin.orbit.flight.light_effects import NO_EFFECTS, SPEED_OF_LIGHT, standard_refractivity
 from twin.orbit.flight.line_camera import dihedral_angle
+from twin.orbit.flight.sensor import NO_EFFECTS, SPEED_OF_LIGHT, standard_refractivity
 from twin.validation.check import CheckResult, mean_of
 from twin.validation.group import Context, group_of
 

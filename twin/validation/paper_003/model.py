@@ -35,9 +35,8 @@ from twin.orbit.calibration.calibration_run import source_of
 from twin.orbit.calibration.campaign import Campaign, FieldPass, line_model
 from twin.orbit.calibration.campaign_adjustment import GAUGE, calibrated_alone
 from twin.orbit.calibration.schemes import check_point_errors, laboratory_errors
-from twin.orbit.flight.light_effects import NO_EFFECTS
 from twin.orbit.flight.line_camera import changed_payload, line_cameras
-from twin.orbit.flight.sensor import Platform, Sensor
+from twin.orbit.flight.sensor import NO_EFFECTS, Platform, Sensor
 from twin.orbit.ground.grid import GroundFrame, Terrain
 from twin.orbit.images.line_optics import optics_of
 from twin.orbit.images.patch import window_of

@@ -17,8 +17,8 @@ from analysis.statistics import rms
 from twin.framework.svg import AFTER, BEFORE, INK
 from twin.orbit.export.quality_run import compare_product
 from twin.orbit.export.rational_polynomial import sensor_polynomial
-from twin.orbit.flight.light_effects import NO_EFFECTS, LightEffects
 from twin.orbit.flight.platform_table import PlatformTable, TabulatedTrajectory
+from twin.orbit.flight.sensor import NO_EFFECTS, LightEffects
 from twin.orbit.measured.orbit_files import read_oem
 from twin.orbit.measured.platform_files import read_scene
 from twin.orbit.measured.xml_file import Element, read_xml
