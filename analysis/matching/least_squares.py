@@ -69,12 +69,13 @@ from analysis.matching import window_checks
 from analysis.matching.correlation import (
     MatchOptions,
     Reason,
+    SplineStack,
     checked_image,
     checked_positions,
     checked_templates,
     concatenated,
+    low_passed,
 )
-from analysis.matching.spline import SplineStack, low_passed
 from analysis.matching.window_checks import ResidualCorrelation, WindowHalves, WindowRelief, WindowScales
 
 _LEAST = 0.4

@@ -42,7 +42,7 @@ from analysis.monitor.parameters import CameraCalibration, MonitorCalibration
 from analysis.spots import CENTROIDS
 from analysis.spots.centroid import mean_frames
 from analysis.spots.likelihood import FALSE_ALARM, FitStates, fit_states, require_convergence, widened
-from analysis.spots.spot_positions import NoiseParts, SpotPositions, difference_covariance, noise_parts
+from analysis.spots.spot_image import NoiseParts, SpotPositions, difference_covariance, noise_parts
 from optics.numerics.extension_table import EntryPointError
 
 ALIKE = 2.0

@@ -21,7 +21,7 @@ from numpy.typing import ArrayLike, NDArray
 from analysis.arrays import Array
 from analysis.spots import spot_image
 from analysis.spots.noise import NoiseModel
-from analysis.spots.spot_positions import SpotPositions
+from analysis.spots.spot_image import SpotPositions
 
 # Greatest distance of the fitted centre from the first guess, px.
 _GAUSS_MOVE_PX = 4

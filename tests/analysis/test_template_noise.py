@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from scipy import ndimage, stats
 
+from analysis.matching.correlation import SplineStack, low_passed
 from analysis.matching.least_squares import noise_energy, template_noise
-from analysis.matching.spline import SplineStack, low_passed
 from tests.analysis.stereo_pairs import Pair
 
 pytestmark = pytest.mark.second

@@ -15,7 +15,7 @@ from scenes.specs.resolved import resolve
 from scenes.yaml.errors import InputError
 from tests.tiers import quick
 from twin.framework.provenance import program_digest
-from twin.live.camera_pictures import CameraPictures
+from twin.live.camera_design import CameraPictures
 from twin.live.computer import RequestHandler
 from twin.live.knobs import KINDS, knob_name, perturbation
 from twin.live.live_bench import LiveBench

@@ -30,19 +30,7 @@ from scenes.specs.camera import CameraSpec
 from scenes.specs.job import JobSpec, checked_nodes
 from scenes.specs.perturbation import perturbation_text
 from scenes.specs.resolved import CameraSetup
-from twin.camera import field_maps
-from twin.camera.aberrations import (
-    ENERGY,
-    GHOST,
-    THIRD_ORDER,
-    PointImages,
-    RayFans,
-    ThirdOrder,
-    camera_ghosts,
-    point_images,
-    ray_fans,
-    third_order,
-)
+from twin.camera import aberrations
 from twin.camera.camera_optics import RINGS, CameraOptics
 from twin.camera.camera_results import Field, Mtf, Spot, Wavefront
 from twin.camera.colour import COLOURS, Colours, colour_data, evaluate_colours
@@ -199,9 +187,9 @@ class CameraRun:
     without_mtf: str
     field: np.ndarray
     errors: np.ndarray
-    distortion: field_maps.Distortion
-    curves: field_maps.FieldCurves
-    focus: field_maps.ThroughFocus
+    distortion: aberrations.Distortion
+    curves: aberrations.FieldCurves
+    focus: aberrations.ThroughFocus
     refocus: Refocus | None = None
     perturbed: Perturbed | None = None
     quality: CameraQuality | None = None
@@ -236,24 +224,24 @@ class CameraRun:
         return tuple(ranked)
 
     @cached_property
-    def third_order(self) -> ThirdOrder | None:
+    def third_order(self) -> aberrations.ThirdOrder | None:
         """Third-order aberrations of the nominal camera by surface; None for one that is not centred on an axis."""
-        return third_order(self.optics.model)
+        return aberrations.third_order(self.optics.model)
 
     @cached_property
     def ghosts(self) -> tuple[Ghost, ...]:
         """Ghosts of the nominal camera in the middle of the field, the largest irradiance first."""
-        return camera_ghosts(self.optics.model, self.optics.path.backend)
+        return aberrations.camera_ghosts(self.optics.model, self.optics.path.backend)
 
     @cached_property
-    def fans(self) -> RayFans:
+    def fans(self) -> aberrations.RayFans:
         """Ray fans at FAN_FIELDS."""
-        return ray_fans(self.optics, FAN_FIELDS)
+        return aberrations.ray_fans(self.optics, FAN_FIELDS)
 
     @cached_property
-    def images(self) -> PointImages | None:
+    def images(self) -> aberrations.PointImages | None:
         """Point images and their energies at the design wavelength; None for a camera too blurred for an MTF."""
-        return point_images(self.optics) if self.mtfs else None
+        return aberrations.point_images(self.optics) if self.mtfs else None
 
 
 def aberration_name(index: int) -> str:
@@ -320,7 +308,7 @@ def run_camera(
         if setup.instrument is not None:
             quality = image_quality(instrument, backend, [state], QUALITY_FIELDS).cameras[mounted]
     advance("focus", 1, 1)
-    field = field_maps.field_grid(ERROR_GRID)
+    field = aberrations.field_grid(ERROR_GRID)
     where = tuple(map(tuple, field.reshape(-1, 2)))
     errors = optics.errors(where, RINGS if built else MAP_RINGS).reshape(field.shape[:2])
     if setup.perturb and instrument is not None:
@@ -343,8 +331,8 @@ def run_camera(
         mtfs = optics.mtfs(MTF_FIELDS) if sharp else ()
     except UnphysicalError as error:  # a pupil cut by edges, or a wavefront that is too irregular
         mtfs, sharp, without_mtf = (), False, f"it cannot be computed for this pupil: {error}"
-    focus = field_maps.through_focus(optics, MTF_FIELDS, sharp)
-    curves = field_maps.field_curves(optics, sharp)
+    focus = aberrations.through_focus(optics, MTF_FIELDS, sharp)
+    curves = aberrations.field_curves(optics, sharp)
     advance("MTF", 1, 1)
     colours, light = None, camera.light
     if light is not None and light.ends[0] < light.ends[1]:
@@ -362,7 +350,7 @@ def run_camera(
         without_mtf="" if mtfs else without_mtf,
         field=field,
         errors=errors,
-        distortion=field_maps.distortion(optics),
+        distortion=aberrations.distortion(optics),
         curves=curves,
         focus=focus,
         refocus=refocused,
@@ -556,7 +544,7 @@ _MTF: Record[Mtf] = Record(
         where_known=True,
     ),
 )
-_DISTORTION: Record[field_maps.Distortion] = Record(
+_DISTORTION: Record[aberrations.Distortion] = Record(
     "Distortion relative to the best-fitting distortion-free camera, over the field and along the line.",
     Quantity("principal_distance_m", lambda d: d.distance, "f of the best-fitting distortion-free camera"),
     Quantity("principal_point_mm", lambda d: d.point, "principal point of that camera, from the line's middle"),
@@ -645,15 +633,15 @@ CAMERA: Record[CameraRun] = Record(
     Quantity("first_order", lambda run: run.first_order, record=FIRST_ORDER),
     Quantity("fields", _field_numbers, "wavefront and spot, field by field"),
     Quantity("mtf_at_nyquist", lambda run: run.mtfs, "MTF of the optics, field by field", record=_MTF),
-    Quantity("energy", lambda run: run.images, "energy of point images", record=ENERGY, where_known=True),
+    Quantity("energy", lambda run: run.images, "energy of point images", record=aberrations.ENERGY, where_known=True),
     Quantity(
         "third_order",
         lambda run: run.third_order,
         "Seidel and chromatic sums by surface",
-        record=THIRD_ORDER,
+        record=aberrations.THIRD_ORDER,
         where_known=True,
     ),
-    Quantity("ghosts", lambda run: run.ghosts, "ghosts, the largest irradiance first", record=GHOST),
+    Quantity("ghosts", lambda run: run.ghosts, "ghosts, the largest irradiance first", record=aberrations.GHOST),
     Quantity("colours", lambda run: run.colours, "polychromatic results", record=COLOURS, where_known=True),
     Quantity("distortion", lambda run: run.distortion, record=_DISTORTION),
     Quantity("refocus", lambda run: run.refocus, record=_REFOCUS),

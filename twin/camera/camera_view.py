@@ -11,22 +11,27 @@ For the perturbed instrument of a job use
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import dataclass, fields
 from html import escape
 from typing import Any, TypeVar
 
 import numpy as np
+from matplotlib import patches
 from matplotlib.axes import Axes
 from matplotlib.collections import QuadMesh
 from matplotlib.figure import Figure
-from matplotlib.patches import Circle
 
 from analysis.arrays import summary
 from optics.camera.ghosts import Ghost
-from optics.camera.prescription import Camera
+from optics.camera.prescription import MIRROR, Camera, OpticalSurface
+from optics.geometry.aperture import Circle, Ray
+from optics.materials.glass import refractive_index
+from scenes.models.camera_model import CameraModel
+from scenes.specs.camera import CameraSpec
+from scenes.yaml.errors import KeyPath
 from twin.camera.camera_optics import CameraOptics
 from twin.camera.camera_results import Field, FieldText, Frequencies, Mtf, Spot, Wavefront
-from twin.camera.prescription import optics_camera
 from twin.framework.svg import BLUE, DIVERGING, GREY, INK, LIGHT, VERMILION, look, plain_axes, to_svg
 
 LINE, TRACK = BLUE, VERMILION
@@ -53,7 +58,7 @@ def draw_wavefront(axes: Axes, wavefront: Wavefront, most: float | None = None) 
     mesh = axes.pcolormesh(
         wavefront.x, wavefront.y, values, cmap=WAVES, vmin=-end, vmax=end, shading="nearest", rasterized=True
     )
-    axes.add_patch(Circle((0.0, 0.0), 1.0, fill=False, lw=0.7, color=GREY))
+    axes.add_patch(patches.Circle((0.0, 0.0), 1.0, fill=False, lw=0.7, color=GREY))
     axes.set_aspect("equal")
     axes.set_xlim(-1.06, 1.06)
     axes.set_ylim(-1.06, 1.06)
@@ -75,7 +80,7 @@ def draw_spot(axes: Axes, spot: Spot, half: float | None = None) -> None:
     rays = 1e6 * (spot.rays - spot.centroid)
     reach = 1e6 * (spot.half_width if half is None else half)
     axes.plot(rays[:, 0], rays[:, 1], ".", ms=2.2, color=BLUE, mew=0.0)
-    axes.add_patch(Circle((0.0, 0.0), 1e6 * spot.airy, fill=False, lw=0.8, color=INK))
+    axes.add_patch(patches.Circle((0.0, 0.0), 1e6 * spot.airy, fill=False, lw=0.8, color=INK))
     axes.axhline(0.0, lw=0.4, color=LIGHT, zorder=0)
     axes.axvline(0.0, lw=0.4, color=LIGHT, zorder=0)
     axes.set_aspect("equal")
@@ -302,3 +307,101 @@ Shown = TypeVar("Shown")
 def _shown(kind: type[Shown], value: Any) -> Shown:
     """Convert a wavefront, spot or MTF to the subclass that has a ``plot`` method."""
     return kind(**{field.name: getattr(value, field.name) for field in fields(value)})
+
+
+_EDGES = "one clear circle, one blocking circle and vanes about one centre, at the stop about its middle"
+
+
+def optics_camera(model: CameraModel, wavelength: float) -> Camera:
+    """Return the nominal camera as an `optics.Camera`, whose frame is that of the file moved to the first vertex.
+
+    Parameters
+    ----------
+    model : CameraModel
+        The camera.
+    wavelength : float
+        Wavelength of the light, metres.
+
+    Raises
+    ------
+    InputError
+        `optics.Camera` cannot describe the camera: a surface has terms of ``sag`` or other edges than circles and vanes
+        about one centre, or vertices in another order than that of the light.
+    """
+    spec = model.spec
+    heights = [*(mirror.z for mirror in spec.mirrors.values()), spec.image.z]
+    surfaces: list[OpticalSurface] = []
+    medium: str | float = 1.0
+    for (name, mirror), thickness in zip(spec.mirrors.items(), np.diff(heights), strict=True):
+        if mirror.sag:
+            problem = f"optics.Camera has conics and even aspheric terms only, and {name} has further terms of its sag"
+            raise spec.error(problem, ("mirrors", name, "sag"), allowed="radius, conic and aspheric")
+        shape, light = model.surfaces[name], mirror.light
+        if light == "refracts":
+            medium = _material(spec, name, wavelength)
+        x, y = mirror.decentre or (0.0, 0.0)
+        outer, inner, vanes, centre = _edges(model, name)
+        surface = OpticalSurface(
+            radius=mirror.radius,
+            thickness=float(thickness),
+            conic=shape.conic,
+            material=MIRROR if light is None else medium,
+            diameter=2.0 * outer,
+            inner_diameter=2.0 * inner,
+            vanes=vanes,
+            offset=centre,
+            asphere=shape.even,
+            decenter=(x, y),
+            tilt=mirror.rotate or (0.0, 0.0, 0.0),
+        )
+        surfaces.append(surface)
+    try:
+        tilt = (spec.image.tilt or 0.0, 0.0, 0.0)
+        return Camera(surfaces, wavelength, model.mirrors.index(spec.stop), tilt, spec.medium or "vacuum")
+    except ValueError as error:  # a thickness against the light
+        problem = f"optics.Camera cannot describe this camera: {error}"
+        raise spec.error(problem, ("mirrors",), allowed="vertices in the order of the light") from error
+
+
+def _material(spec: CameraSpec, name: str, wavelength: float) -> str | float:
+    """Return the glass behind a lens face by name where the catalogue has it, else its refractive index."""
+    index, glass = spec.index_behind(name, wavelength), spec.mirrors[name].glass
+    with suppress(ValueError):  # the catalogue does not have the glass, or not at this wavelength
+        if glass is not None and refractive_index(glass.name, wavelength, spec.medium or "vacuum") == index:
+            return glass.name
+    return index
+
+
+def _edges(model: CameraModel, name: str) -> tuple[float, float, tuple[tuple[float, float], ...], tuple[float, float]]:
+    """Return the edges of a surface: radii of its rim and of its hole, vanes, and their common centre, metres.
+
+    Raises
+    ------
+    InputError
+        `OpticalSurface` cannot describe these edges.
+    """
+    key: KeyPath = ("mirrors", name, "edges")
+    rims: list[float] = []
+    holes: list[float] = []
+    vanes: list[tuple[float, float]] = []
+    centres: list[tuple[float, float]] = []
+    if name == model.spec.stop:
+        x_min, x_max, y_min, y_max = model.apertures[name].bounds
+        rims.append(0.5 * (x_max - x_min))
+        centres.append((0.5 * (x_min + x_max), 0.5 * (y_min + y_max)))
+    other = False
+    for edge in model.edges.get(name, ()):
+        shape = edge.shape
+        if isinstance(shape, Circle):
+            (holes if edge.blocks else rims).append(shape.radius)
+            holes += [shape.inner] if shape.inner and not edge.blocks else []
+            other = other or bool(edge.blocks and shape.inner)
+        elif isinstance(shape, Ray) and edge.blocks:
+            vanes.append((shape.width, edge.rotation))
+        else:
+            other = True
+        centres.append(shape.centre)
+    if other or len(rims) > 1 or len(holes) > 1 or len(set(centres)) > 1:
+        raise model.spec.error(f"optics.Camera cannot describe the edges of {name}", key, allowed=_EDGES)
+    rim, hole, centre = (*rims, np.inf)[0], (*holes, 0.0)[0], (*centres, (0.0, 0.0))[0]
+    return float(rim), hole, tuple(vanes), centre

@@ -19,7 +19,7 @@ from twin.framework.svg import BLUE, GREEN, GREY, INK, LIGHT, VERMILION, new_fig
 _END_COLOURS = (BLUE, GREEN, VERMILION)
 """Colours of the negative end of the field, its middle and its positive end."""
 
-BEFORE = 0.16
+INCOMING = 0.16
 """Length of the incoming rays in the drawing, as a fraction of the layout's length."""
 
 _VIEWS = ((1, "y", "Side view, in the plane of symmetry"), (0, "x", "Top view, along the line"))
@@ -90,7 +90,7 @@ def _extent(model: CameraModel, backend: Backend, axis: int) -> tuple[float, flo
     z = points[..., 2]
     length = float(np.ptp(z))
     room = 0.05 * length
-    first = float(z.min()) - BEFORE * length
+    first = float(z.min()) - INCOMING * length
     across = np.concatenate([points[..., axis], begun(rays, first)[:1, ..., axis]])
     return (first, float(z.max()) + 2.0 * room, float(across.min()) - room, float(across.max()) + room)
 

@@ -25,7 +25,7 @@ from typing import Any, Literal
 from optics.numerics.backend import BackendUnavailable, cores, kernel_threads, one_blas_thread
 from optics.numerics.llvm import LibraryMissing
 from scenes.yaml.errors import InputError
-from twin.live.camera_pictures import CameraPictures
+from twin.live.camera_design import CameraPictures
 from twin.live.live_bench import IMPOSSIBLE, LiveBench
 from twin.live.messages import AskedState, AskedView, BlindState, Opened, packed
 from twin.live.saved_files import camera_file, course_text, job_text

@@ -10,7 +10,7 @@ from functools import partial
 import numpy as np
 
 from analysis.monitor.recovery import recover_monitor
-from analysis.spots.spot_positions import SpotError
+from analysis.spots.spot_image import SpotError
 from optics.geometry.tree import State, compose
 from optics.numerics.array_math import UnphysicalError
 from optics.numerics.backend import Backend
@@ -32,8 +32,7 @@ from twin.main_job.render_results import JobRun, RenderRun, StrayPair
 from twin.monitor.crosstalk import crosstalk
 from twin.monitor.image_quality import ImageQuality, image_quality
 from twin.monitor.monitor_beams import SpotFocus
-from twin.monitor.monitor_experiment import MonitorExperiment
-from twin.monitor.monitor_memory import require_memory
+from twin.monitor.monitor_experiment import MonitorExperiment, require_memory
 from twin.monitor.observation import LOST, ObservationOptions, light_of, read
 from twin.monitor.time_series import run_series, series_states, too_large
 from twin.path_tracing.stray_light import NominalPathLost, StrayLight, ghost_warnings, stray_light

@@ -21,9 +21,9 @@ from twin.main_job.monitor_reading import MonitorReading, contradicted
 from twin.main_job.render_results import RenderRun
 from twin.monitor.crosstalk import CameraCrosstalk
 from twin.monitor.monitor_derivative import LOST, traced_states
-from twin.monitor.motions import ElementaryMotion
 from twin.monitor.reading_table import Reading
 from twin.monitor.time_series import SmoothedCourse
+from twin.monitor.truth import ElementaryMotion
 from twin.uncertainty.monitor_limits import short_text, unit_text
 
 _FAMILY = 4

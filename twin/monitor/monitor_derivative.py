@@ -42,8 +42,15 @@ from scenes.specs.disturbances import TimeLawSpec
 from scenes.specs.instrument import BASE
 from twin.monitor.monitor_beams import AIM_TOLERANCE, MonitorBeams
 from twin.monitor.monitor_path import MonitorPath
-from twin.monitor.motions import FIGURE_TERMS, ElementaryMotion, line_family, pivot_states
-from twin.monitor.truth import LineSight, trace_truth, truth_jacobian
+from twin.monitor.truth import (
+    FIGURE_TERMS,
+    ElementaryMotion,
+    LineSight,
+    line_family,
+    pivot_states,
+    trace_truth,
+    truth_jacobian,
+)
 
 
 def _size_steps(placed: PlacedBodies, bodies: Sequence[str]) -> np.ndarray:

@@ -16,7 +16,7 @@ import numpy as np
 from analysis.arrays import shows
 from analysis.monitor.recovery import MeasuredSpots, Recovery, judged_spots, recover_monitor
 from analysis.spots.centroid import mean_frames
-from analysis.spots.spot_positions import SpotError
+from analysis.spots.spot_image import SpotError
 from optics.geometry.tree import PlacedBodies, State
 from optics.numerics.backend import cores, one_blas_thread, one_kernel_thread
 from optics.raytrace.aim import AimError

@@ -14,7 +14,7 @@ from analysis.monitor.monitor_formulas import GroundGeometry
 from analysis.monitor.parameters import CameraCalibration
 from analysis.monitor.recovery import Curvature, Recovery, SpotEvidence, estimates_of
 from analysis.monitor.series_smoother import smooth_series, window_of
-from analysis.spots.spot_positions import NoiseParts, SeriesNoise, SpotError
+from analysis.spots.spot_image import NoiseParts, SeriesNoise, SpotError
 from analysis.statistics import limit_of
 from optics.geometry.tree import Motion, State
 from optics.numerics.backend import one_blas_thread
@@ -27,8 +27,7 @@ from scenes.specs.resolved import ResolvedJob
 from scenes.yaml.errors import InputError, names_text
 from twin.framework.artefact import significant
 from twin.framework.record import Quantity, Record
-from twin.monitor.monitor_experiment import MonitorExperiment
-from twin.monitor.monitor_memory import largest_piece
+from twin.monitor.monitor_experiment import MonitorExperiment, largest_piece
 from twin.monitor.observation import LOST, ObservationOptions, observe, shared_detector, why_lost
 from twin.monitor.reading_table import ReadingTable, reading_table
 
