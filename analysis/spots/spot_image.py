@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, fields
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -392,14 +393,10 @@ def check_edge(position: Array, height: int, width: int, distance: float) -> Non
     high = np.array([height, width]) - 1 - distance
     bad = ~np.all((position >= distance) & (position <= high), axis=1)
     if np.any(bad):
+        where = f"px is less than {distance:g} px from the edge of the {height} x {width} image"
+        places = {n: position[n] for n in np.flatnonzero(bad).tolist()}
         raise SpotError(
-            {
-                int(
-                    n
-                ): f"too near the edge: ({position[n, 0]:.2f}, {position[n, 1]:.2f}) px is less than {distance:g} px"
-                f" from the edge of the {height} x {width} image"
-                for n in np.flatnonzero(bad)
-            }
+            {n: f"too near the edge: ({row:.2f}, {column:.2f}) {where}" for n, (row, column) in places.items()}
         )
 
 
@@ -431,16 +428,10 @@ def coarse(image: Array, frames: int, noise: NoiseModel) -> tuple[Array, Array, 
     brightest = image.reshape(count, -1).max(axis=1)
     # The mean of frames of which some are clipped lies below the clipping level, hence the allowance of a few sigmas.
     reach = brightest + _SATURATION_SIGMAS * np.sqrt(noise.temporal_variance_dn2(brightest, 1))
-    if np.any(reach >= noise.saturation_dn):
-        raise SpotError(
-            {
-                int(
-                    n
-                ): f"saturated: its brightest pixel, {brightest[n]:.0f} DN, is within {_SATURATION_SIGMAS:g} sigma of"
-                f" saturation at {noise.saturation_dn:.0f} DN; lower the light or the exposure"
-                for n in np.flatnonzero(reach >= noise.saturation_dn)
-            }
-        )
+    if saturated := np.flatnonzero(reach >= noise.saturation_dn).tolist():
+        limit = f"DN, is within {_SATURATION_SIGMAS:g} sigma of saturation at {noise.saturation_dn:.0f} DN"
+        why = f"{limit}; lower the light or the exposure"
+        raise SpotError({n: f"saturated: its brightest pixel, {brightest[n]:.0f} {why}" for n in saturated})
     bins = image[:, : rows * size, : columns * size].reshape(count, rows, size, columns * size).sum(axis=2)
     bins = bins.reshape(count, rows, columns, size).sum(axis=3) / size**2
     ring = np.ones((rows, columns), dtype=bool)
@@ -658,17 +649,7 @@ def propagate(maps: Array, level: Array, noise: NoiseModel, frames: int) -> tupl
 
 
 def positions(
-    position: Array,
-    maps: Array,
-    image: Array,
-    frames: int,
-    noise: NoiseModel,
-    keep_maps: bool,
-    flux: Array,
-    background: Array,
-    converged: NDArray[np.bool_],
-    iterations: int,
-    chi: Array,
+    position: Array, maps: Array, image: Array, frames: int, noise: NoiseModel, keep_maps: bool, **fit: Any
 ) -> SpotPositions:
     """Return the SpotPositions of a centroid method that has no model of the spot's light.
 
@@ -691,32 +672,14 @@ def positions(
         Noise of the detector.
     keep_maps : bool
         True to keep `maps` in the result.
-    flux : (B,) ndarray
-        Flux of each spot, DN.
-    background : (B,) ndarray
-        Background of each spot, DN.
-    converged : (B,) ndarray of bool
-        Mask of the spots that converged.
-    iterations : int
-        Number of iterations of the slowest spot.
-    chi : (B,) ndarray
-        Reduced chi-square of each fit.
+    **fit
+        Other attributes of `SpotPositions`: flux, background, convergence, iterations and reduced chi-square.
     """
     count = position.shape[0]
     temporal, fixed = propagate(maps.reshape(count, 2, -1), image.reshape(count, -1), noise, frames)
-    return SpotPositions(
-        row=position[:, 0].copy(),
-        column=position[:, 1].copy(),
-        temporal_covariance=temporal,
-        fixed_covariance=fixed,
-        flux=flux,
-        background=background,
-        converged=converged,
-        iterations=iterations,
-        reduced_chi_square=chi,
-        gain_maps=maps if keep_maps else None,
-        light_dn=noise.light_signal_dn(image) if keep_maps else None,
-    )
+    row, column = position.T.copy()
+    light = noise.light_signal_dn(image) if keep_maps else None
+    return SpotPositions(row, column, temporal, fixed, gain_maps=maps if keep_maps else None, light_dn=light, **fit)
 
 
 def filled(mean: Array, good: NDArray[np.bool_]) -> Array:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -313,16 +314,12 @@ def run_camera(
     errors = optics.errors(where, RINGS if built else MAP_RINGS).reshape(field.shape[:2])
     if setup.perturb and instrument is not None:
         change = trace_truth(instrument, backend, [state]).cameras[mounted]
-        perturbed = Perturbed(
-            job, change, errors, _nyquist(optics) if errors.max() < MAX_WAVES_FOR_MTF else np.empty((0, 2))
-        )
+        perturbed = Perturbed(job, change, errors, _nyquist(optics, errors))
     if state:
         optics = optics.in_state(state)
         errors = optics.errors(where).reshape(field.shape[:2])
-    sharp, without_mtf = (
-        float(errors.max()) < MAX_WAVES_FOR_MTF,
-        f"wavefront errors exceed {MAX_WAVES_FOR_MTF:g} waves, and it would be nearly zero",
-    )
+    sharp = float(errors.max()) < MAX_WAVES_FOR_MTF
+    without_mtf = f"wavefront errors exceed {MAX_WAVES_FOR_MTF:g} waves, and it would be nearly zero"
     advance("wavefronts", 0, 1)
     waves, spots = optics.wavefronts(GRID, points=MAP_POINTS), optics.spots(GRID)
     advance("wavefronts", 1, 1)
@@ -366,12 +363,12 @@ def run_camera(
     return run
 
 
-def _nyquist(optics: CameraOptics) -> np.ndarray:
+def _nyquist(optics: CameraOptics, errors: np.ndarray) -> np.ndarray:
     """Return the MTF at Nyquist at the F fields MTF_FIELDS, along line and track, (F, 2); empty if not computable."""
-    try:
-        return np.array([mtf.at(optics.nyquist) for mtf in optics.mtfs(MTF_FIELDS)])
-    except UnphysicalError:
-        return np.empty((0, 2))
+    with suppress(UnphysicalError):
+        if errors.max() < MAX_WAVES_FOR_MTF:
+            return np.array([mtf.at(optics.nyquist) for mtf in optics.mtfs(MTF_FIELDS)])
+    return np.empty((0, 2))
 
 
 def find_focus(optics: CameraOptics, tilt: bool, mounted: str | None = None, existing: Motion | None = None) -> Refocus:
@@ -439,17 +436,16 @@ def verdict(run: CameraRun) -> tuple[str, ...]:
     position_text = field_text(run.camera, field)
     (kind, size), *_ = run.limits
     lead = f"{worst:.3g} waves rms at field {position_text}, mainly {kind} ({size:.3g})"
+    marechal = f"Mar\N{LATIN SMALL LETTER E WITH ACUTE}chal's limit is {SHARP:.3f}"
     if worst <= SHARP:
-        text = f"Diffraction limited over the whole field: the worst wavefront error is {lead}"
-        text += f" (Mar\N{LATIN SMALL LETTER E WITH ACUTE}chal's limit is {SHARP:.3f})."
+        text = f"Diffraction limited over the whole field: the worst wavefront error is {lead} ({marechal})."
     elif worst <= BLURRED:
         share = float(np.mean(run.errors <= SHARP))
         part = "nowhere in"
         if share:
             percent = "less than 1" if share < 0.01 else "more than 99" if share > 0.99 else f"{100.0 * share:.0f}"
             part = f"in {percent} % of"
-        text = f"Diffraction limited {part} the field: the worst wavefront error is "
-        text += f"{lead} (Mar\N{LATIN SMALL LETTER E WITH ACUTE}chal's limit is {SHARP:.3f})."
+        text = f"Diffraction limited {part} the field: the worst wavefront error is {lead} ({marechal})."
     else:
         text = (
             f"Blurred: the worst wavefront error is {lead}; beyond {BLURRED:g} waves an image has almost no contrast."
@@ -457,11 +453,8 @@ def verdict(run: CameraRun) -> tuple[str, ...]:
     if run.mtfs:
         low = min(float(np.min(mtf.at(run.optics.nyquist))) for mtf in run.mtfs)
         limit = max(float(np.interp(mtf.nyquist, mtf.frequency, row)) for mtf in run.mtfs for row in mtf.limit)
-        text_mtf = (
-            f"The lowest MTF of the optics, without the pixel, at Nyquist is {low:.2g} over the field; the diffraction "
-            f"limit is {limit:.2f}."
-        )
-        return text, text_mtf
+        lowest = f"The lowest MTF of the optics, without the pixel, at Nyquist is {low:.2g} over the field"
+        return text, f"{lowest}; the diffraction limit is {limit:.2f}."
     return (text,)
 
 
@@ -577,11 +570,7 @@ _PERTURBED: Record[Perturbed] = Record(
     "Effect of a perturbation: changes of the camera's geometry by exact chief rays, and its values before.",
     Quantity("perturb", lambda p: p.job.plain()["perturb"], "perturbation as in a job's file"),
     *(
-        Quantity(
-            parameter.key,
-            lambda p, k=k: p.change.vector[0, k],  # type: ignore[misc]
-            parameter.meaning,
-        )
+        Quantity(parameter.key, lambda p, k=k: p.change.vector[0, k], parameter.meaning)  # type: ignore[misc]
         for k, parameter in enumerate(parameters.ESTIMATED)
     ),
     Quantity("worst_as_designed_waves", lambda p: p.errors.max(), "wavefront error of the worst field"),
@@ -595,21 +584,13 @@ _PERTURBED: Record[Perturbed] = Record(
 
 def _field_numbers(run: CameraRun) -> list[dict[str, Any]]:
     """Return wavefront, spot and Zernike terms without piston and tilts of every field of ``GRID``."""
-    return [
-        {**_WAVE(wave), **_SPOT(spot), "zernike_waves": dict(list(wave.terms.items())[3:]), **_cut_numbers(wave)}
-        for wave, spot in zip(run.waves, run.spots, strict=True)
-    ]
-
-
-def _cut_numbers(wave: Wavefront) -> dict[str, Any]:
-    """Return the numbers in optics.json that only the wavefront of a vignetted beam has; empty for any other."""
-    if not wave.is_vignetted:
-        return {}
-    return {
-        "wfe_accuracy": wave.accuracy,
-        "polynomials": wave.polynomials,
-        "orthonormal_waves": dict(list(wave.orthonormal_terms.items())[3:]),
-    }
+    out = []
+    for wave, spot in zip(run.waves, run.spots, strict=True):
+        out.append({**_WAVE(wave), **_SPOT(spot), "zernike_waves": dict(list(wave.terms.items())[3:])})
+        if wave.is_vignetted:
+            terms = dict(list(wave.orthonormal_terms.items())[3:])
+            out[-1] |= {"wfe_accuracy": wave.accuracy, "polynomials": wave.polynomials, "orthonormal_waves": terms}
+    return out
 
 
 CAMERA: Record[CameraRun] = Record(
@@ -667,23 +648,19 @@ def camera_data(run: CameraRun) -> xr.Dataset:
     share = "fraction of the half field"
     maps = np.stack([w.map for w in run.waves])
     terms, parts = (np.stack([getattr(w, name) for w in run.waves]) for name in ("coefficients", "parts"))
+    focus_attributes = named("MTF of the optics at the Nyquist frequency through focus")
     orthonormal = named("Zernike terms made orthonormal over the light of each pupil", rms)
     data: dict[str, Any] = {
         "wavefront": (("field", "y", "x"), maps, named("wavefront error over the stop", waves)),
         "zernike": (("field", "noll"), terms, named("Zernike terms of the wavefront error", rms)),
-        **(
-            {}
-            if not any(w.is_vignetted for w in run.waves)
-            else {"orthonormal": (("field", "noll"), parts, orthonormal)}
-        ),
+    }
+    if any(w.is_vignetted for w in run.waves):
+        data["orthonormal"] = (("field", "noll"), parts, orthonormal)
+    data |= {
         "field_share": (("field", "direction"), np.array(fields), named(share)),
         "wfe": (("field_along", "field_across"), run.errors, named("wavefront error over the field", rms)),
         "through_focus_wfe": (("mtf_field", "defocus"), run.focus.error, named("wavefront error through focus", rms)),
-        "through_focus_mtf": (
-            ("mtf_field", "direction", "defocus"),
-            run.focus.mtf,
-            named("MTF of the optics at the Nyquist frequency through focus"),
-        ),
+        "through_focus_mtf": (("mtf_field", "direction", "defocus"), run.focus.mtf, focus_attributes),
         "distortion_line": (
             ("line",),
             run.distortion.residual,
@@ -704,11 +681,8 @@ def camera_data(run: CameraRun) -> xr.Dataset:
     }
     if run.mtfs:
         data["mtf"] = (mtf, np.stack([m.values for m in run.mtfs]), named("MTF of the optics"))
-        data["mtf_limit"] = (
-            mtf,
-            np.stack([m.limit for m in run.mtfs]),
-            named("MTF of the optics without wavefront error, the diffraction limit"),
-        )
+        perfect = named("MTF of the optics without wavefront error, the diffraction limit")
+        data["mtf_limit"] = (mtf, np.stack([m.limit for m in run.mtfs]), perfect)
         axis_attributes = named("spatial frequency in the image, cycles per length", {"units": "1/m"})
         coords["frequency"] = ("frequency", run.mtfs[0].frequency, axis_attributes)
     if run.colours is not None:

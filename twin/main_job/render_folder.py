@@ -77,11 +77,8 @@ def write_run(run: JobRun, session: Session, picture: bool = False, beside: Seco
     if isinstance(run, RenderRun):
         beside.start(limits_drawing(run.limits))
     write_results(run, folder)
-    sections = [
-        section
-        for section in (part_sections.deformation_section(run), part_sections.heat_section(run))
-        if section is not None
-    ]
+    of_tables = part_sections.deformation_section(run), part_sections.heat_section(run)
+    sections = [section for section in of_tables if section is not None]
     drawn, missing = without_failed(beside.results())
     if isinstance(run, RenderRun):
         from twin.uncertainty.uncertainty_report import limits_section  # slow to import
@@ -172,12 +169,8 @@ def render_report(
         *((spot_section(monitored, drawn), residual_section(monitored, drawn)) if monitored else ()),
         part_sections.quality_section(run, drawn),
         part_sections.target_section(run, drawn),
-        *(
-            (part_sections.stray_section(monitored), motion_section(monitored, drawn), crosstalk_section(monitored))
-            if monitored
-            else ()
-        ),
-        formula_section(monitored) if monitored else None,
+        *((part_sections.stray_section(monitored), motion_section(monitored, drawn)) if monitored else ()),
+        *((crosstalk_section(monitored), formula_section(monitored)) if monitored else ()),
         _light(drawn, monitored is not None),
         *sections,
     )
@@ -227,12 +220,11 @@ def _light(drawn: Mapping[str, str], monitored: bool) -> Section:
         "Clear apertures and footprints on every mirror, in the mirror's own frame (origin at the parent's vertex). "
         "Imaging beams of the line CCD's ends and centre fill the apertures"
     )
-    caption += (
-        "; the monitor's beams, limited by the return face, use a small part off the middle, out and back. A wavefront "
-        "or focus error over that part moves the spot, so that defocus is read as a rotation."
-        if monitored
-        else "."
+    of_monitor = (
+        "the monitor's beams, limited by the return face, use a small part off the middle, out and back. A wavefront "
+        "or focus error over that part moves the spot, so that defocus is read as a rotation"
     )
+    caption += f"; {of_monitor}." if monitored else "."
     footprints = figure(drawn, "footprints", caption)
     return Section("Light path and footprints", (), (footprints,), name="light", closed=True)
 

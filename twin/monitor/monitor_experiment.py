@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from copy import copy
@@ -467,10 +466,8 @@ class MonitorExperiment:
         photons = self.nominal_photons + stray
         if not isinstance(seed, Sequence):
             return self.detector.expose(photons, self.pattern(seed), frames, self.exposure, stream(seed, 1))
-        repeated, streams = (
-            np.broadcast_to(photons, (len(seed), *photons.shape)),
-            [stream(single_seed, 1) for single_seed in seed],
-        )
+        repeated = np.broadcast_to(photons, (len(seed), *photons.shape))
+        streams = [stream(single_seed, 1) for single_seed in seed]
         return self.detector.expose(repeated, self.pattern(seed), frames, self.exposure, streams)
 
     def frames_after(
@@ -581,33 +578,6 @@ class MonitorSize:
     frames: int = 1
     times: int = 0
     pictures: int = 0
-
-    @classmethod
-    def of_job(cls, resolved: ResolvedJob, frames: int, times: int = 0, pictures: int = 0) -> MonitorSize:
-        """Return the size that an instrument's files specify, before the instrument is built.
-
-        Parameters
-        ----------
-        resolved : ResolvedJob
-            Job.
-        frames : int
-            Number of frames of each state.
-        times : int
-            Number of times of a time series of states, 0 if there is none.
-        pictures : int
-            Number of pixels of the frames of all other images.
-
-        Raises
-        ------
-        InputError
-            The instrument has no monitor.
-        """
-        monitor, ccd = resolved.instrument.autocollimator, resolved.instrument.autocollimator.area_ccd
-        focal_length = min(camera.focal_length for camera in resolved.cameras.values())
-        # of a beam that fills its aperture
-        phase = math.pi * monitor.return_face.aperture / focal_length * ccd.pitch / monitor.wavelength
-        spots = sum(len(resolved.instrument.channels_of(name)) for name in resolved.instrument.cameras)
-        return cls(spots, ccd.rows, ccd.columns, phase, frames, times, pictures)
 
     @property
     def rays(self) -> int:

@@ -61,8 +61,7 @@ def _verdict(run: RecoverRun) -> tuple[str, tuple[str, ...]]:
     if run.setup.model is None:
         largest = max(readings, key=lambda row: abs(row.size))
         first = f"The largest reading of the {title}{when} against the noise of the images alone is {largest.name}"
-        first += f", {largest.read}"
-        second = ""
+        first, second = f"{first}, {largest.read}", ""
     elif out:
         clearest = max(out, key=lambda row: abs(row.size))
         exceed = "exceeds" if len(out) == 1 else "exceed"
@@ -82,11 +81,9 @@ def _verdict(run: RecoverRun) -> tuple[str, tuple[str, ...]]:
     limit = ""
     if reading.disturbances is not None:
         body, share = limits(reading, about)
-        what = body if body == NOISE else f"motions of {body}"
+        what = f"{body} causes" if body == NOISE else f"motions of {body} cause"
         size = f"{significant(about.sigma, 2)} {about.parameter.unit}"
-        limit = f"{what} cause {share_text(share)} of the variance of {about.name} (σ {size})"
-        if body == NOISE:
-            limit = f"{what} causes {share_text(share)} of the variance of {about.name} (σ {size})"
+        limit = f"{what} {share_text(share)} of the variance of {about.name} (σ {size})"
     count, total, worst_spot, where = _corrected(run)
     cleaned = "the frames were used as they are" if run.setup.test.corrections == "none" else "the frames are clean"
     if worst_spot is not None:
@@ -141,12 +138,8 @@ def _frames_text(run: RecoverRun) -> str:
 def _summary(run: RecoverRun) -> Table:
     """Return the table of the cameras' changes by every estimator, with the sigma of the one that the verdict uses."""
     reading, alone = run.last, run.setup.model is None
-    heads = [
-        "camera",
-        "change",
-        *(estimator.title for estimator in reading.estimators.values()),
-        *(("σ of noise",) if alone else ("σ", "σ of noise", "in σ")),
-    ]
+    heads = ["camera", "change", *(estimator.title for estimator in reading.estimators.values())]
+    heads += ["σ of noise"] if alone else ["σ", "σ of noise", "in σ"]
     rows: list[list[Cell]] = []
     for rows_of_change in reading.table.by_change():
         judged_row = next(row for row in rows_of_change if row.estimator == reading.judged)
@@ -171,43 +164,22 @@ def _spots(run: RecoverRun) -> Section:
             position, sigma = (r.before, r.sigma_before) if k == 0 else (r.after, r.sigma_after)
             digits = decimals_for(float(sigma[0, i].min()))
             artefacts = "; ".join(f"{finding.kind}: {finding.text}" for finding in spot.findings) or "none"
-            rms_sigma = float(np.sqrt(np.mean(np.square(sigma[0, i]))))
-            rows.append(
-                [
-                    result.channel.name,
-                    state_name(run.times, k),
-                    len(spot.frames.frames),
-                    fixed(float(position[0, i, 0]), digits),
-                    fixed(float(position[0, i, 1]), digits),
-                    significant(rms_sigma, 2, floor=0.0),
-                    artefacts,
-                    fixed(100.0 * spot.cost, 1),
-                ]
-            )
+            rms_sigma = significant(float(np.sqrt(np.mean(np.square(sigma[0, i])))), 2, floor=0.0)
+            places = [fixed(float(coordinate), digits) for coordinate in position[0, i]]
+            frames: list[Cell] = [result.channel.name, state_name(run.times, k), len(spot.frames.frames)]
+            rows.append([*frames, *places, rms_sigma, artefacts, fixed(100.0 * spot.cost, 1)])
     caption = (
         "Rows and columns count on the whole CCD, from the centre of its first pixel. The increase of σ is that of the "
         "spot's position, relative to the same light without excluded pixels or fitted artefacts."
     )
     cameras = list(run.last.cameras)
-    figures = [
-        SvgFigure(
-            f"spots-{name}",
-            f"Spots of {name}",
-            "Mean frames, stretched to show faint light, with the centres before and after; excluded pixels are "
-            "marked.",
-            spots_svg(run, name),
-        )
-        for name in cameras
-    ]
+    excluded = "excluded pixels are marked."
+    about = f"Mean frames, stretched to show faint light, with the centres before and after; {excluded}"
+    figures = [SvgFigure(f"spots-{name}", f"Spots of {name}", about, spots_svg(run, name)) for name in cameras]
     fitted = [name for name in cameras if any(s.residual is not None for r in _of(run, name) for _, s in r.states())]
+    about = f"Mean frame minus fitted spot and background in standard deviations of each pixel; {excluded}"
     figures += [
-        SvgFigure(
-            f"residuals-{name}",
-            f"Residuals of the fitted shape, {name}",
-            "Mean frame minus fitted spot and background in standard deviations of each pixel; excluded pixels are "
-            "marked.",
-            residuals_svg(run, name),
-        )
+        SvgFigure(f"residuals-{name}", f"Residuals of the fitted shape, {name}", about, residuals_svg(run, name))
         for name in fitted
     ]
     text = () if run.setup.test.corrections == "automatic" else ("The frames were not searched for artefacts.",)
@@ -228,11 +200,8 @@ def _estimators(run: RecoverRun) -> Section:
         heads += [estimator.title, f"{estimator.title} σ", f"{estimator.title} σ of noise"]
     rows: list[list[Cell]] = []
     for rows_of_change in reading.table.by_change():
-        row: list[Cell] = [
-            rows_of_change[0].camera or "both",
-            rows_of_change[0].parameter.symbol,
-            rows_of_change[0].parameter.unit,
-        ]
+        first = rows_of_change[0]
+        row: list[Cell] = [first.camera or "both", first.parameter.symbol, first.parameter.unit]
         for reading_row in rows_of_change:
             row += [reading_row.value, reading_row.sigma, reading_row.noise]
         rows.append(row)
