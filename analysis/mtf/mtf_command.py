@@ -280,17 +280,10 @@ def _draw(edge: EdgeMtf, pitch: float, path: Path) -> None:
     line.plot(edge.distance[shown], edge.lsf[shown], color="C0")
     line.axhline(0.0, color="0.7", lw=0.8, zorder=0)
     line.set(title="line-spread function", xlabel="along the normal / px", ylabel="1/px")
-    curve.fill_between(
-        edge.frequency / pitch,
-        edge.mtf - edge.sigma,
-        edge.mtf + edge.sigma,
-        color="C0",
-        alpha=0.3,
-        lw=0,
-        label="±1 sigma",
-    )
-    curve.plot(edge.frequency / pitch, edge.mtf, color="C0", label="MTF")
-    curve.plot(edge.frequency / pitch, edge.noise_bias, color="C3", lw=1, label="noise bias in it")
+    frequency, (low, high) = edge.frequency / pitch, (edge.mtf - edge.sigma, edge.mtf + edge.sigma)
+    curve.fill_between(frequency, low, high, color="C0", alpha=0.3, lw=0, label="±1 sigma")
+    curve.plot(frequency, edge.mtf, color="C0", label="MTF")
+    curve.plot(frequency, edge.noise_bias, color="C3", lw=1, label="noise bias in it")
     curve.axvline(0.5 / pitch, color="0.5", ls="--", lw=1)
     curve.annotate("Nyquist", (0.5 / pitch, 1.0), xytext=(4, 0), textcoords="offset points", color="0.4")
     curve.set(title="MTF along the normal", xlabel="cycles/mm", xlim=(0, edge.frequency[-1] / pitch), ylim=(0, 1.05))

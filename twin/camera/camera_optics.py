@@ -388,20 +388,12 @@ class CameraOptics:
         rays = self.rays(fields, np.concatenate([np.zeros((1, 2)), np.stack([nodes.x, nodes.y], axis=-1)]))
         plane = self.model.focal_plane
         position, direction = plane.apply(rays.position), rays.direction @ plane.rotation.T
-        room = np.sum(
-            (position[:, 0] - self.model.mirror_pose(self.model.mirrors[-1]).translation) * direction[:, 0], -1
-        )
-        return FieldBeams(
-            self.model.spec,
-            np.array(places),
-            nodes,
-            position,
-            direction,
-            rays.path,
-            float(self.model.first_order.exit_pupil_distance[0]),
-            room,
-            rays.valid[:, 1:] if self.model.edges or self.cut is not None else None,
-        )
+        last = self.model.mirror_pose(self.model.mirrors[-1]).translation
+        room = np.sum((position[:, 0] - last) * direction[:, 0], -1)
+        passed = rays.valid[:, 1:] if self.model.edges or self.cut is not None else None
+        distance = float(self.model.first_order.exit_pupil_distance[0])
+        spec, fields = self.model.spec, np.array(places)
+        return FieldBeams(spec, fields, nodes, position, direction, rays.path, distance, room, passed)
 
     @one_blas_thread()
     def errors(self, fields: Sequence[Field | FieldText] | np.ndarray, rings: int = RINGS) -> np.ndarray:
@@ -490,20 +482,13 @@ class CameraOptics:
         out = []
         for where, field_pupils in zip(fields, pupils, strict=True):
             perfect = [replace(pupil, eikonal_terms=np.zeros_like(pupil.eikonal_terms)) for pupil in field_pupils]
-            values, limit = (
-                np.abs(
-                    polychromatic_transfer(
-                        pupil_set if len(pupil_set) > 1 else pupil_set[0], both, colours, shares, np.zeros(1)
-                    )[0]
-                ).reshape(2, -1)
-                for pupil_set in (field_pupils, perfect)
+            transfers = (
+                polychromatic_transfer(pupils if len(pupils) > 1 else pupils[0], both, colours, shares, np.zeros(1))[0]
+                for pupils in (field_pupils, perfect)
             )
-            place = (float(where[0]), float(where[1]))
-            out.append(
-                Mtf(
-                    place, self._angles(where), frequency, values, limit, colours, self.nyquist, shares / np.sum(shares)
-                )
-            )
+            values, limit = (np.abs(transfer).reshape(2, -1) for transfer in transfers)
+            place, weights = (float(where[0]), float(where[1])), shares / np.sum(shares)
+            out.append(Mtf(place, self._angles(where), frequency, values, limit, colours, self.nyquist, weights))
             check_mtf(out[-1])
         return tuple(out)
 

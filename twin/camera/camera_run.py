@@ -404,17 +404,10 @@ def find_focus(optics: CameraOptics, tilt: bool, mounted: str | None = None, exi
     body, total = focal_plane_body(optics.path.root), motion
     if existing is not None:
         total = compose({body: existing}, {body: motion}, {body: optics.assembly.tree[body]})[body]
-    return Refocus(
-        nominal,
-        best,
-        beams.errors(nominal),
-        beams.errors(best),
-        tilt,
-        motion,
-        _motion_words(focal_plane_body(mounted or "").lstrip("/"), total),
-        existing is not None,
-        bool(model.image_direction @ frame.rotation[:, 2] > 0.0),
-    )
+    errors = beams.errors(nominal), beams.errors(best)
+    words = _motion_words(focal_plane_body(mounted or "").lstrip("/"), total)
+    downstream = bool(model.image_direction @ frame.rotation[:, 2] > 0.0)
+    return Refocus(nominal, best, *errors, tilt, motion, words, existing is not None, downstream)
 
 
 def _motion_words(node: str, motion: Motion) -> tuple[str, ...]:

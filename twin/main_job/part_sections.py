@@ -334,13 +334,8 @@ def finish_section(run: RenderRun) -> Section | None:
                 total = scatter.table.total(float(angle))
                 unequal: Cell = "" if np.isnan(rms) else 100.0 * rms
                 rows.append((kind, float(np.degrees(angle)), 100.0 * total, 100.0 * specified, unequal))
-        heads = (
-            "surfaces",
-            "incidence [deg]",
-            "total scatter [%]",
-            "specified in the file [%]",
-            "not reciprocal [% rms]",
-        )
+        heads = ["surfaces", "incidence [deg]", "total scatter [%]", "specified in the file [%]"]
+        heads += ["not reciprocal [% rms]"]
         text = "Shares of the incident light. Total scatter is the integral of the table, which the paths use."
         tables.append(Table("finish_scatter", "Measured scattering", text, heads, rows, (), 4))
     if measured.coatings:

@@ -232,14 +232,8 @@ def spot_gradient(
             np.repeat(np.swapaxes(slope, -1, -2), 2, axis=0), slope_direction[..., None]
         )[..., 0]
         hit_weights = np.concatenate([weights_direction, np.zeros_like(weights_direction[..., :1])], axis=-1)
-        back_outgoing = vjp(
-            path.backend,
-            outgoing,
-            start_point,
-            start_direction,
-            hit_weights,
-            [tuple(tangent) for tangent in outgoing_steps],
-        )
+        tangents = [tuple(tangent) for tangent in outgoing_steps]
+        back_outgoing = vjp(path.backend, outgoing, start_point, start_direction, hit_weights, tangents)
         pinhole = (back_monitor.position + back_outgoing.position).sum(axis=1).reshape(len(path.channels), 2, 3)
         out += _dot(monitor_steps, back_monitor.values) + _dot(outgoing_steps, back_outgoing.values)
         out += np.einsum("ckx,cmx->ckm", pinhole, source)
@@ -529,17 +523,10 @@ def derivative_changes(
 
 def _law(law: TimeLawSpec) -> TimeLaw:
     """Convert a time law of a disturbances file to the class that the analysis uses."""
-    return TimeLaw(
-        law.kind == "white",
-        law.drift,
-        law.period,
-        law.trend,
-        law.relaxation,
-        law.since or 0.0,
-        () if law.event is None else ((law.event, 1.0),),
-        law.kind == "jump" or law.jump is not None,
-        law.jump,
-    )
+    events, since = () if law.event is None else ((law.event, 1.0),), law.since or 0.0
+    jumps = law.kind == "jump" or law.jump is not None
+    drifts = law.drift, law.period, law.trend, law.relaxation
+    return TimeLaw(law.kind == "white", *drifts, since, events, jumps, law.jump)
 
 
 NEAR = 3.0
