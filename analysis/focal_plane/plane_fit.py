@@ -317,7 +317,9 @@ def fit_focal_plane(
         extra = float(brentq(lambda s: solve(s)[2] - freedom, 0.0, most, xtol=1e-6 * most))
         parameters, covariance, _ = solve(extra)
     return FocalPlaneFit(
-        *map(float, parameters),
+        piston=float(parameters[0]),
+        slope_x=float(parameters[1]),
+        slope_y=float(parameters[2]),
         covariance=covariance,
         position=spots,
         residual=height - design @ parameters,

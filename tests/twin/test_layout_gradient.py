@@ -28,7 +28,7 @@ from twin.design.layout_bench import FULLEST, LayoutBench, LayoutFacts, _Outside
 from twin.design.layout_refinement import LayoutNumber, Slope, known_of, numbers_of, refined, slope_of
 from twin.design.layout_search import Candidate, End, SearchResult, merit, optima, spread
 from twin.framework.procedure import BenchError
-from twin.monitor.information import Information
+from twin.monitor.monitor_derivative import Information
 
 FILES = Path(__file__).with_name("layouts_differentiated")
 STATED_NAME = "mirrors.yaml"

@@ -2,29 +2,44 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
+from markupsafe import Markup
 from matplotlib.figure import Figure
 
 from optics.camera.ghosts import DETECTOR
 from optics.camera.seidel import ABERRATIONS
 from optics.geometry import zernike
+from optics.numerics.array_math import PhysicalError
 from scenes.models.camera_design import file_with_plane
 from scenes.models.camera_sharpness import FIELDS, field_text
 from twin.camera import camera_plots as plots
 from twin.camera.aberrations import COEFFICIENTS
 from twin.camera.camera_results import Mtf
 from twin.camera.camera_run import CameraRun, built_text, camera_data, perturbed_text, refocus_text, verdict
+from twin.camera.camera_view import dimensions, layout_figure
 from twin.camera.colour import Colours
 from twin.camera.first_order_data import FIRST_ORDER, detector_beyond_field, unmodelled_obscuration
-from twin.camera.layout_plot import dimensions, layout_figure
-from twin.camera.solid_view import solid_view
-from twin.framework.artefact import Artefact, CameraFile, Cell, SvgFigure, Table, fixed, significant
+from twin.framework.artefact import (
+    Artefact,
+    CameraFile,
+    Cell,
+    Piece,
+    PngFigure,
+    SvgFigure,
+    Table,
+    Undrawn,
+    fixed,
+    significant,
+)
 from twin.framework.data_files import netcdf
 from twin.framework.report import Report, Section, answer
 from twin.framework.svg import look, to_svg
+from twin.pictures.light_paths import trace_light_paths
+from twin.pictures.picture_scene import still_png
+from twin.pictures.scene_file import TUBE, scene_bytes, viewer_page
 
 _TABLE_TERMS = 15
 """Number of Zernike terms in the report's table of fields; all terms are in optics.json and optics.nc."""
@@ -460,3 +475,37 @@ def _bodies(run: CameraRun) -> Section:
     heads = ("body", "right end [%]", "middle [%]", "left end [%]")
     table = Table("bodies", "Fraction of the beam blocked", "", heads, rows, (None, 2, 2, 2))
     return Section("In the instrument", (text,), (table,))
+
+
+TITLE = "In three dimensions"
+
+_IMAGE = '<div class="card"><img src="{0}" alt="{1}"></div>'
+_FIGURE = (
+    '<h3>{0}</h3>\n<figure><a href="view.html">{1}</a>\n<figcaption>Mirrors and lenses with their clear apertures, and '
+    'beams of the middle and both ends of the line. <a href="view.html">view.html</a> turns with the mouse; '
+    '<a href="scene.glb">scene.glb</a> is the same scene for other programs.</figcaption></figure>'
+)
+
+
+def solid_view(run: CameraRun) -> tuple[Artefact, Mapping[str, bytes]]:
+    """Return the figure of a camera in its state, and the contents of view.html and scene.glb by name.
+
+    A camera through which no light finds its way from the ends of the line has a note in place of the figure, and no
+    files.
+    """
+    state, length = run.optics.state, run.first_order.length
+    tube = min(TUBE, 6e-4 * length)
+    try:
+        instrument = run.instrument
+        paths = trace_light_paths(instrument, run.optics.path.backend, state, length)
+    except PhysicalError as error:
+        return Undrawn("view", TITLE, "", f"{type(error).__name__}: {error}"), {}
+    scene = scene_bytes(instrument, state, paths, tube)
+    still = PngFigure("view", TITLE, "", still_png(instrument, paths))
+    image = Markup(_IMAGE).format(still.address, f"{run.setup.title} {TITLE.lower()}")
+    moved = run.perturbed.words if run.perturbed is not None else ""
+    page = viewer_page(f"Camera {run.setup.title}", scene, moved, image)
+    return (
+        Piece("view", "", "", Markup(_FIGURE).format(TITLE, image), within=""),
+        {"view.html": page.encode(), "scene.glb": scene},
+    )

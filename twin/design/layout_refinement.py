@@ -35,7 +35,7 @@ from scenes.models.instrument_builder import build_instrument
 from scenes.models.monitor_layout import Beam, Layout, layout_spec, number_of, ranges
 from scenes.yaml.errors import InputError
 from twin.design.layout_bench import FULLEST, LayoutBench, LayoutFacts
-from twin.monitor.information import Information
+from twin.monitor.monitor_derivative import Information
 
 FIRST_BOX = 0.1
 """Initial half-width of the trust region, relative to the range of each parameter."""

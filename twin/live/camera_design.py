@@ -32,8 +32,16 @@ from scenes.specs.resolved import ResolvedJob, resolve_job
 from scenes.yaml.errors import InputError, Issue
 from twin.camera.camera_optics import INSIDE, CameraOptics
 from twin.camera.camera_results import Field, Spot
-from twin.camera.camera_view import CameraView, draw_mtf, draw_spot, draw_wavefront
-from twin.camera.layout_plot import INCOMING, begun, section_lines, section_rays
+from twin.camera.camera_view import (
+    INCOMING,
+    CameraView,
+    begun,
+    draw_mtf,
+    draw_spot,
+    draw_wavefront,
+    section_lines,
+    section_rays,
+)
 from twin.framework.artefact import rounded_down
 from twin.framework.random_streams import stream
 from twin.framework.svg import AFTER, BEFORE, BLUE, GRAY, GREY, INK, VERMILION, look, to_svg

@@ -214,19 +214,11 @@ def _series(run: RecoverRun) -> Section:
     assert run.times is not None
     smoothed = run.smoothed
     heads = ["time [s]", "camera", "change", "unit", "value", "σ", "σ of noise"]
-    rows: list[list[Cell]] = [
-        [
-            time,
-            change.camera or "both",
-            change.parameter.symbol,
-            change.parameter.unit,
-            change.value,
-            change.sigma,
-            change.noise,
-        ]
-        for time, reading in zip(run.times, run.readings, strict=True)
-        for change in reading.table.of(reading.judged)
-    ]
+    rows: list[list[Cell]] = []
+    for time, reading in zip(run.times, run.readings, strict=True):
+        for change in reading.table.of(reading.judged):
+            labels: list[Cell] = [time, change.camera or "both", change.parameter.symbol, change.parameter.unit]
+            rows.append([*labels, change.value, change.sigma, change.noise])
     judged = run.last.estimators[run.last.judged].title
     caption = f"Value: reading of the {judged} at each time alone, relative to the same frames before."
     legend = f"Marks: readings of the {judged} at each time alone, with one total standard deviation."
