@@ -310,10 +310,8 @@ def _image_warnings(
 ) -> tuple[str, ...]:
     if targets is None and quality is None:
         return ()
-    models = {model.spec.name: model for model in experiment.instrument.cameras.values()}
-    shadows = {
-        name: unmodelled_obscuration(model, obscuration(model, experiment.backend)) for name, model in models.items()
-    }
+    backend, models = experiment.backend, {m.spec.name: m for m in experiment.instrument.cameras.values()}
+    shadows = {name: unmodelled_obscuration(model, obscuration(model, backend)) for name, model in models.items()}
     return (
         *(f"camera {name}: {text}" for name, text in shadows.items() if text),
         *(targets.warnings if targets is not None else ()),
@@ -394,12 +392,8 @@ def _too_large(resolved: ResolvedJob, reason: str) -> InputError:
     allowed = "smaller motions, which keep the beams on the mirrors and the spots on their CCDs"
     if any(what.deformation is not None for what in resolved.job.perturb.values()):
         allowed += "; with a table of rippled nodes, a job without image quality and targets"
-    return resolved.job.error(
-        f"the perturbed instrument cannot be rendered: {reason}",
-        ("perturb",),
-        found=f"motions of {moved}",
-        allowed=allowed,
-    )
+    text, found = f"the perturbed instrument cannot be rendered: {reason}", f"motions of {moved}"
+    return resolved.job.error(text, ("perturb",), found=found, allowed=allowed)
 
 
 def _no_spots(experiment: MonitorExperiment, reason: str) -> InputError:
@@ -424,9 +418,8 @@ def _mounted_facets(experiment: MonitorExperiment) -> str:
         return advice
     bodies = {body.path: body for body in instrument.assembly.tree.bodies}
     positions = as_built_of(compose(instrument.as_built, rotations, bodies))
-    return (
-        f"{advice}; or facets aligned when mounted: {perturbation_text({path: positions[path] for path in rotations})}"
-    )
+    aligned = perturbation_text({path: positions[path] for path in rotations})
+    return f"{advice}; or facets aligned when mounted: {aligned}"
 
 
 def _unmeasured(experiment: MonitorExperiment, before: np.ndarray, error: SpotError, focus: SpotFocus) -> InputError:
