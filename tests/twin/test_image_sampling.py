@@ -91,7 +91,7 @@ def test_light_is_that_of_the_rays(blurred, monkeypatch) -> None:
     path = blurred(0.0)
     path.expected_photons([{}])
     true = monitor_path.image
-    monkeypatch.setattr(monitor_path, "quadrature_difference", lambda images, *_: np.zeros(len(images)))
+    monkeypatch.setattr(monitor_beams, "quadrature_difference", lambda images, *_: np.zeros(len(images)))
     monkeypatch.setattr(monitor_path, "image", lambda *arguments: 1.2 * true(*arguments))
     with pytest.raises(UncertainImageError, match="of its light too much"):
         path.expected_photons([{}])
