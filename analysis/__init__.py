@@ -114,9 +114,9 @@ if TYPE_CHECKING:
     from analysis.orbit.rational_polynomial import RationalPolynomial, fit_rpc
     from analysis.orbit.three_line_model import LineModel, Rays
     from analysis.orientation.interior import InteriorOrientation, fit_interior_orientation
+    from analysis.spots.likelihood import SpotFit, fit_spot
     from analysis.spots.noise import NoiseModel
     from analysis.spots.photon_transfer import PhotonTransfer, photon_transfer
-    from analysis.spots.spot_fit import SpotFit, fit_spot
     from analysis.spots.spot_template import SpotTemplate
     from analysis.spots.window_series import SeriesPrior, WindowSeries, fit_window_series
     from analysis.statistics import proportion_interval, robust_sigma
@@ -147,7 +147,7 @@ _MODULES = {
     "orientation.interior": ("InteriorOrientation", "fit_interior_orientation"),
     "spots.noise": ("NoiseModel",),
     "spots.photon_transfer": ("PhotonTransfer", "photon_transfer"),
-    "spots.spot_fit": ("SpotFit", "fit_spot"),
+    "spots.likelihood": ("SpotFit", "fit_spot"),
     "spots.window_series": ("SeriesPrior", "WindowSeries", "fit_window_series"),
     "spots.spot_template": ("SpotTemplate",),
     "statistics": ("robust_sigma", "proportion_interval"),

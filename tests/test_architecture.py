@@ -26,7 +26,7 @@ NOT_IN_OPTICS = {"ruamel", "yaml", "pydantic", "pint", "typer", "rich", "mitsuba
 ONLY_IN_ANALYSIS = {"analysis", "numpy", "scipy", "cv2"} | sys.stdlib_module_names
 # Modules of analysis that may use more: commands that draw, and fits that need a library. Name each module here.
 ANALYSIS_MAY: dict[str, set[str]] = {
-    "turntable/angle_network.py": {"sklearn"},
+    "turntable/dividing_error.py": {"sklearn"},
     "mtf/__main__.py": {"typer"},
     "mtf/mtf_command.py": {"typer", "rich", "matplotlib"},
     "images/image_file.py": {"tifffile", "astropy"},

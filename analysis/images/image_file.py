@@ -580,9 +580,7 @@ class ImageFile:
         except Exception as error:
             raise ImageError(f"{path} cannot be read as an image ({_reason(error)})") from error
         if page is not None and page not in header.pages:
-            raise ImageError(
-                f"{choose or 'page'} {page} does not exist: {path} has {len(header.pages)} pages, the first is 0"
-            )
+            raise no_such_page(path, page, len(header.pages), choose)
         if frames is not None and frames > len(header.pages):
             raise ImageError(f"--frames {frames} is more than the {len(header.pages)} pages of {path}")
         if header.inverted and not math.isfinite(header.full_scale):

@@ -69,12 +69,13 @@ from analysis.matching import window_checks
 from analysis.matching.correlation import (
     MatchOptions,
     Reason,
+    SplineStack,
     checked_image,
     checked_positions,
     checked_templates,
     concatenated,
+    low_passed,
 )
-from analysis.matching.spline import SplineStack, low_passed
 from analysis.matching.window_checks import ResidualCorrelation, WindowHalves, WindowRelief, WindowScales
 
 _LEAST = 0.4
@@ -156,45 +157,63 @@ class TemplateNoise:
         return out
 
 
-def template_noise(
-    stack: SplineStack,
-    which: NDArray[np.intp],
-    window: tuple[Array, Array],
-    shift: Array,
-    affine: Array,
-    linear: Array,
-    smoothing: Array,
-    design: Array,
-    residual: Array,
-    lowered: tuple[Array, Array],
-) -> TemplateNoise:
-    """Compute the effect of template noise on converged fits.
+@dataclass(frozen=True, eq=False)
+class FitState:
+    """Images, templates and current unknowns of n fits; the arrays are updated in place.
 
-    Parameters
+    Attributes
     ----------
     stack : SplineStack
         Low-passed templates.
-    which : (n,) ndarray of int
-        Template of each fit.
     window : tuple of (p,) ndarray
         Rows and columns of the pixels about the window's middle, in pixels.
+    grey : (n, p) ndarray
+        Grey values of the image, in DN.
     shift : (n, 2) ndarray
-        Fitted position against the window's middle.
+        Position against the window's middle.
     affine : (n, 2, 2) ndarray
         Affine matrices.
     linear : (n, 2) or (n, 4) ndarray
         Offset, gain and, optionally, sharpness along rows and columns.
-    smoothing : (n,) ndarray
-        RMS radius of the low-pass of each of the n templates, in pixels.
     design : (n, q, p) ndarray
         Derivatives of the p grey values of the model with respect to the q unknowns: position, affine matrix
         (optional), and linear unknowns.
     residual : (n, p) ndarray
         Residuals, in DN; NaN where there is no fit.
+    """
+
+    stack: SplineStack
+    window: tuple[Array, Array]
+    grey: Array
+    shift: Array
+    affine: Array
+    linear: Array
+    design: Array
+    residual: Array
+
+    def offset(self, which: NDArray[np.intp]) -> Array:
+        """Return the positions of the window's p pixels against the fitted positions of m fits, (m, 2, p)."""
+        return np.stack([self.window[k] - self.shift[which, k, None] for k in range(2)], axis=1)
+
+
+def template_noise(
+    state: FitState, which: NDArray[np.intp], smoothing: Array, lowered: tuple[Array, Array]
+) -> TemplateNoise:
+    """Compute the effect of template noise on converged fits.
+
+    Parameters
+    ----------
+    state : FitState
+        The n fits.
+    which : (n,) ndarray of int
+        Template of each fit.
+    smoothing : (n,) ndarray
+        RMS radius of the low-pass of each of the n templates, in pixels.
     lowered : tuple of (n,) ndarray
         Decrease of the sum of squared residuals by the low-pass, and decrease of the energy of white noise of unit
         variance in a pixel, against no low-pass.
     """
+    affine, linear, design, residual = state.affine, state.linear, state.design, state.residual
     count, unknowns, pixels = design.shape
     inverse, lean = np.full((count, unknowns, unknowns), np.nan), np.full((count, 2), np.nan)
     curvature = np.full(count, np.nan)
@@ -202,15 +221,15 @@ def template_noise(
     used = np.flatnonzero(np.isfinite(residual).all(axis=1) & np.all((design**2).sum(axis=2) > 0, axis=1))
     if not used.size:
         return TemplateNoise(inverse, lean, curvature, share)
-    offset = np.stack([window[0] - shift[used, :1], window[1] - shift[used, 1:]], axis=1)
-    position = affine[used] @ offset + stack.size // 2
+    offset = state.offset(used)
+    position = affine[used] @ offset + state.stack.size // 2
     # derivatives with respect to the geometric unknowns: position and, optionally, matrix
     by_geometry = np.zeros((used.size, 2, unknowns - linear.shape[1], pixels))
     by_geometry[:, :, :2] = -affine[used][..., None]
     if by_geometry.shape[2] > 2:
         for axis in range(2):
             by_geometry[:, axis, 2 + 2 * axis : 4 + 2 * axis] = offset
-    second_derivatives = _bend(stack, which[used], position, linear[used], by_geometry, residual[used])
+    second_derivatives = _bend(state.stack, which[used], position, linear[used], by_geometry, residual[used])
     square = design[used] @ np.swapaxes(design[used], 1, 2)
     inverse[used] = _inverse(square, square - second_derivatives)
     variance = np.einsum("np,np->n", residual[used], residual[used]) / (pixels - unknowns)
@@ -535,83 +554,50 @@ def _fit(image: NDArray[np.generic], templates: Array, start: Array, options: Ma
         g.ravel().astype(np.float64) for g in np.mgrid[-half_width : half_width + 1, -half_width : half_width + 1]
     )
     grey, anchor, reason = _windows(image, templates, start, half_width, options)
-    shift = start - anchor
-    affine = np.tile(np.eye(2), (count, 1, 1))
-    linear = np.full((count, options.parameters - 6), np.nan)
-    linear[:, 0], linear[:, 1:] = grey.mean(axis=1), 0.0
+    linear = np.zeros((count, options.parameters - 6))
+    linear[:, 0] = grey.mean(axis=1)
     iterations = np.zeros(count, np.intp)
-    design = np.zeros((count, options.parameters, row.size))
-    residual = np.full((count, row.size), np.nan)
     finite_templates = np.where((reason == 0)[:, None, None], templates, 0.0)
     radii = [smoothing for smoothing in _SMOOTHINGS if smoothing <= math.sqrt(row.size) / 9.0]
     # template i smoothed by the k-th radius has the number k count + i
     stack = SplineStack(np.concatenate([low_passed(finite_templates, smoothing) for smoothing in radii]))
+    affine, design = np.tile(np.eye(2), (count, 1, 1)), np.zeros((count, options.parameters, row.size))
+    residual = np.full((count, row.size), np.nan)
+    state = FitState(stack, (row, column), grey, start - anchor, affine, linear, design, residual)
     level = np.zeros(count, np.intp)
     # repeat, because a template that is not yet in position seems to need more smoothing
     for pass_number in range(2):
         active = np.flatnonzero(reason == 0)
         candidates_count = int(level.max(initial=0)) + 1 if pass_number else len(radii)
-        chosen, lowered = _best_smoothing(
-            stack, radii[:candidates_count], active, grey, (row, column), shift, affine, options
-        )
+        chosen, lowered = _best_smoothing(state, radii[:candidates_count], active, options.sharpness)
         active = active[(chosen != level)[active] | (pass_number == 0)]
         level = chosen
         for iteration in range(options.iterations + 1):
             if not active.size:
                 break
-            step, design[active], residual[active] = _step(
-                stack,
-                level[active] * count + active,
-                grey[active],
-                (row, column),
-                shift[active],
-                affine[active],
-                linear[active, 1:],
-                iteration,
-                options,
-            )
+            number, known = level[active] * count + active, linear[active, 1:]
+            step, design[active], residual[active] = _step(state, active, number, known, iteration, options.sharpness)
             size = np.abs(step[:, :2]).max(axis=1)
             affine_step = step[:, 2:6].reshape(-1, 2, 2)
             converged = np.maximum(size, half_width * np.abs(affine_step).max(axis=(1, 2))) < _REST
             moved = iteration > 0
             damping = np.minimum(1.0, _LONGEST_STEP / np.maximum(size, 1e-300))[:, None]
             if moved:
-                shift[active] += damping * step[:, :2]
+                state.shift[active] += damping * step[:, :2]
                 affine[active] += damping[:, :, None] * affine_step
             linear[active] = step[:, 6:]
             iterations[active] += moved
-            moved_too_far = np.abs(shift[active] + anchor[active] - start[active]).max(axis=1) > options.largest_move
+            moved_too_far = (
+                np.abs(state.shift[active] + anchor[active] - start[active]).max(axis=1) > options.largest_move
+            )
             distorted = np.abs(affine[active] - np.eye(2)).max(axis=(1, 2)) > options.largest_distortion
             reason[active[distorted]] = Reason.DISTORTED
             reason[active[moved_too_far]] = Reason.MOVED
             active = active[~((converged & moved) | moved_too_far | distorted)]
         reason[active] = Reason.DIVERGED
     smoothing = np.array(radii)[level]
-    noise_of_template = template_noise(
-        stack,
-        level * count + np.arange(count),
-        (row, column),
-        shift,
-        affine,
-        linear,
-        smoothing,
-        design,
-        residual,
-        lowered,
-    )
-    return _summary(
-        grey,
-        anchor + shift,
-        affine,
-        linear,
-        design,
-        residual,
-        smoothing,
-        iterations,
-        reason,
-        half_width,
-        noise_of_template,
-    )
+    noise_of_template = template_noise(state, level * count + np.arange(count), smoothing, lowered)
+    return _summary(state, anchor, smoothing, iterations, reason, noise_of_template)
 
 
 def _windows(
@@ -642,14 +628,7 @@ def _windows(
 
 
 def _best_smoothing(
-    stack: SplineStack,
-    radii: list[float],
-    selected: Index,
-    grey: Array,
-    window: tuple[Array, Array],
-    shift: Array,
-    affine: Array,
-    options: MatchOptions,
+    state: FitState, radii: list[float], selected: Index, sharpness: bool
 ) -> tuple[Index, tuple[Array, Array]]:
     """Return the index of the strongest acceptable low-pass of each of n points, and the decreases that it causes.
 
@@ -657,23 +636,21 @@ def _best_smoothing(
     low-pass. The decreases, relative to the first low-pass, are those of the residuals and of the noise's energy for
     `template_noise`. Points not selected get 0.
     """
-    best, lowered = np.zeros(len(grey), np.intp), (np.zeros(len(grey)), np.zeros(len(grey)))
+    count, pixels = state.grey.shape
+    best, lowered = np.zeros(count, np.intp), (np.zeros(count), np.zeros(count))
     if not selected.size:
         return best, lowered
     # the gain of the first guess only scales columns, which does not change residuals
-    linear = np.zeros((selected.size, options.parameters - 7))
+    linear = np.zeros((selected.size, state.linear.shape[1] - 1))
     linear[:, :1] = 1.0
     radius_count = len(radii)
     square, energy = np.zeros((2, radius_count, selected.size))
     for k, smoothing in enumerate(radii):
-        number = k * len(grey) + selected
-        step, _, residual = _step(
-            stack, number, grey[selected], window, shift[selected], affine[selected], linear, 1, options
-        )
+        step, _, residual = _step(state, selected, k * count + selected, linear, 1, sharpness)
         square[k] = np.einsum("np,np->n", residual, residual)
         energy[k] = noise_energy(step[:, 7:], smoothing)
     # take the strongest: too little smoothing is overconfident, too much loses little accuracy
-    acceptable = square <= square.min(axis=0) * (1.0 + _ACCEPTED_INCREASE / grey.shape[1])
+    acceptable = square <= square.min(axis=0) * (1.0 + _ACCEPTED_INCREASE / pixels)
     best[selected] = radius_count - 1 - np.argmax(acceptable[::-1], axis=0)
     chosen = best[selected], np.arange(selected.size)
     for decrease, values in zip(lowered, (square, energy), strict=True):
@@ -682,25 +659,17 @@ def _best_smoothing(
 
 
 def _step(
-    stack: SplineStack,
-    which: Index,
-    grey: Array,
-    window: tuple[Array, Array],
-    shift: Array,
-    affine: Array,
-    linear: Array,
-    iteration: int,
-    options: MatchOptions,
+    state: FitState, active: Index, which: Index, linear: Array, iteration: int, sharpness: bool
 ) -> tuple[Array, Array, Array]:
     """Return a Gauss-Newton step, new linear unknowns, derivatives (m, q, p) and residuals (m, p) of m fits.
 
     q is the number of unknowns, p that of pixels; linear unknowns are offset, gain and sharpness.
     """
-    offset = np.stack([window[0] - shift[:, :1], window[1] - shift[:, 1:]], axis=1)
+    stack, grey, affine, offset = state.stack, state.grey[active], state.affine[active], state.offset(active)
     u = affine @ offset + stack.size // 2
     # third derivatives are needed only with sharpness terms
-    third_order = options.sharpness and bool(linear[:, 1:].any())
-    value = stack(u[:, 0], u[:, 1], which, order=2 + third_order if options.sharpness else 1)
+    third_order = sharpness and bool(linear[:, 1:].any())
+    value = stack(u[:, 0], u[:, 1], which, order=2 + third_order if sharpness else 1)
     # the first pass estimates the linear unknowns at the start position
     known = linear.T[:, :, None] if iteration else np.zeros((linear.shape[1], len(grey), 1))
     by_row, by_column = known[0] * value[1], known[0] * value[2]
@@ -713,7 +682,7 @@ def _step(
         (slope[:, :, None] * offset[:, None]).reshape(len(grey), 4, -1),
         np.stack([np.ones_like(value[0]), value[0] - value[0].mean(axis=1, keepdims=True)], axis=1),
     ]
-    columns.extend([np.stack([value[3], value[5]], axis=1)] if options.sharpness else [])
+    columns.extend([np.stack([value[3], value[5]], axis=1)] if sharpness else [])
     design = np.concatenate(columns, axis=1)
     step = _solve(design, grey)
     return step, design, grey - np.einsum("mqp,mq->mp", design, step)
@@ -728,27 +697,18 @@ def _solve(design: Array, grey: Array) -> Array:
 
 
 def _summary(
-    grey: Array,
-    position: Array,
-    affine: Array,
-    linear: Array,
-    design: Array,
-    residual: Array,
-    smoothing: Array,
-    iterations: Index,
-    reason: NDArray[np.int8],
-    half_width: int,
-    template_noise_effect: TemplateNoise,
+    state: FitState, anchor: Array, smoothing: Array, iterations: Index, reason: NDArray[np.int8], noise: TemplateNoise
 ) -> Fits:
     """Return the converged fits with their statistics and the checks of their windows."""
     unfitted = np.isin(reason, (Reason.TEMPLATE, Reason.OUTSIDE, Reason.IMAGE, Reason.FLAT, Reason.SATURATED))
+    grey, design, residual = state.grey, state.design, state.residual
     square = np.einsum("np,np->n", residual, residual)
     centred = grey - grey.mean(axis=1, keepdims=True)
     total = np.einsum("np,np->n", centred, centred)
     redundancy = grey.shape[1] - design.shape[1]
     with np.errstate(invalid="ignore", divide="ignore"):
-        correlation = np.sqrt(np.maximum(1.0 - square / total, 0.0)) * np.sign(linear[:, 1])
-        side = 2 * half_width + 1
+        correlation = np.sqrt(np.maximum(1.0 - square / total, 0.0)) * np.sign(state.linear[:, 1])
+        side = math.isqrt(grey.shape[1])
         plane = grey.reshape(-1, side, side)
         checker = plane[:, 1:, 1:] - plane[:, 1:, :-1] - plane[:, :-1, 1:] + plane[:, :-1, :-1]
         contrast = np.sqrt(total / grey.shape[1]) / (
@@ -756,11 +716,11 @@ def _summary(
         )
     fitted = np.where(unfitted[:, None, None], np.nan, design), np.where(unfitted[:, None], np.nan, residual)
     mask = np.where(unfitted, np.nan, 1.0)
-    spread = window_checks.residual_correlation(*fitted, side, template_noise_effect.inverse)
+    spread = window_checks.residual_correlation(*fitted, side, noise.inverse)
     return Fits(
-        position * mask[:, None],
-        affine * mask[:, None, None],
-        linear[:, 1] * mask,
+        (anchor + state.shift) * mask[:, None],
+        state.affine * mask[:, None, None],
+        state.linear[:, 1] * mask,
         correlation * mask,
         np.sqrt(square / redundancy) * mask,
         contrast,
@@ -768,7 +728,7 @@ def _summary(
         iterations,
         reason,
         spread,
-        template_noise_effect,
+        noise,
         window_checks.window_relief(*fitted, side),
         window_checks.window_halves(*fitted, side),
         window_checks.window_scales(*fitted, side, spread),

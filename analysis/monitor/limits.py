@@ -382,11 +382,7 @@ def calibrated_sigma(rows: Array, disturbances: Disturbances, noise: Array, fiel
         Time since the calibration, s.
     """
     before, across, after = np.array([law.two_time_moments(0.0, gap_s) for law in disturbances.laws]).reshape(-1, 3).T
-    now, then, old_now = (
-        disturbances.correlation * after,
-        disturbances.correlation * across,
-        disturbances.correlation * before,
-    )
+    now, then, old_now = (disturbances.correlation * moment for moment in (after, across, before))
     a, b = disturbances.spots, disturbances.parameters
     measured = np.concatenate([a, a, b])
     parts = len(a), 2 * len(a)
@@ -483,9 +479,8 @@ def prior_numbers(disturbances: Disturbances) -> dict[str, list[int]]:
         Prior of the disturbances (motions of bodies), with their effects on spots and parameters.
     """
     sizes: dict[tuple[str, str], set[float]] = {}
-    whats = [
-        label.removeprefix(f"{body} ") for label, body in zip(disturbances.labels, disturbances.bodies, strict=True)
-    ]
+    named = zip(disturbances.labels, disturbances.bodies, strict=True)
+    whats = [label.removeprefix(f"{body} ") for label, body in named]
     for cause, what, sigma in zip(disturbances.causes, whats, disturbances.sigmas.tolist(), strict=True):
         sizes.setdefault((cause, what.split()[0]), set()).add(sigma)
     out: dict[str, list[int]] = {}

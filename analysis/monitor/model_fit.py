@@ -259,20 +259,15 @@ def _statements(reports: list[MotionReport], family: list[str], rank: int, coord
             continue
         if largest_shift[name] <= _INVISIBLE_PX:
             true = _show(report.true)
-            lines.append(
-                f"{name}: moves no spot and is invisible; its true change is {true}."
-                if true
-                else f"{name}: moves no spot and changes no parameter."
-            )
+            what = f"is invisible; its true change is {true}" if true else "changes no parameter"
+            lines.append(f"{name}: moves no spot and {what}.")
             continue
+        text = f"is explained to {100 * report.explained:.3g}% by the family and leaves a residual"
         if report.explained > 1 - 1e-6:
             text = "is not separable from the family"
-        else:
-            text = f"is explained to {100 * report.explained:.3g}% by the family and leaves a residual"
         amounts = [(float(a), other) for a, other in zip(report.imitation, family, strict=True)]
-        shown = [
-            (a, other) for a, other in amounts if abs(a) * largest_shift[other] > _NEGLIGIBLE * largest_shift[name]
-        ]
+        least = _NEGLIGIBLE * largest_shift[name]
+        shown = [(a, other) for a, other in amounts if abs(a) * largest_shift[other] > least]
         mix = _sum(sorted(shown, key=lambda item: -abs(item[0]) * largest_shift[item[1]])) or "nothing"
         smallest = _NEGLIGIBLE * float(np.max(np.abs(np.concatenate([_table(report.reported), _table(report.true)]))))
         lines.append(

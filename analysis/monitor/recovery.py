@@ -42,7 +42,7 @@ from analysis.monitor.parameters import CameraCalibration, MonitorCalibration
 from analysis.spots import CENTROIDS
 from analysis.spots.centroid import mean_frames
 from analysis.spots.likelihood import FALSE_ALARM, FitStates, fit_states, require_convergence, widened
-from analysis.spots.spot_positions import NoiseParts, SpotPositions, difference_covariance, noise_parts
+from analysis.spots.spot_image import NoiseParts, SpotPositions, difference_covariance, noise_parts
 from optics.numerics.extension_table import EntryPointError
 
 ALIKE = 2.0
@@ -190,8 +190,8 @@ class SpotEvidence:
             cause = AFTER
             why = (
                 "the shape of the spots differs from the calibration: a motion blurs or aberrates them, or they "
-                "contain a "
-                "reflection or stray light, and a position on a changed spot is not that on the calibrated one"
+                "contain a reflection or stray light, and a position on a changed spot is not that on the calibrated "
+                "one"
             )
         named = ", ".join(names[k] if names else str(k) for k in spots)
         limit = float(fit_state.core_limit[0, worst[1]]), float(fit_state.whole_limit[0, worst[1]])
@@ -201,11 +201,9 @@ class SpotEvidence:
         )
         text = (
             f"σ does not hold: the fit of the spots {named} is not good, {size}; {why}. The noise of their positions "
-            f"was increased up to {_number(worst[0])}-fold, which does not cover the effect of a changed shape"
-            if cause != NOISE
-            else f"σ does not hold: the fit of the spots {named} is not good, {size}; {why}. The noise of "
-            f"their positions was increased up to {_number(worst[0])}-fold"
+            f"was increased up to {_number(worst[0])}-fold"
         )
+        text += ", which does not cover the effect of a changed shape" if cause != NOISE else ""
         return SpotWarning(cause, spots, worst[0], text)
 
 
@@ -846,7 +844,8 @@ def estimates_of(
             whole = None if total is None else total[..., part, part]
             parameters[name][title] = CameraParameters.from_vector(values[..., part], noise[..., part, part], whole)
         if len(cameras) == 2:
-            first_camera, second_camera = _pair(cameras)
+            # the camera that looks farther forward comes first
+            first_camera, second_camera = sorted(cameras, key=lambda name: -cameras[name].look_rad)
             first, second = (slices[list(cameras).index(name)] for name in (first_camera, second_camera))
             across = noise[..., first, second], None if total is None else total[..., first, second]
             looks = cameras[first_camera].look_rad, cameras[second_camera].look_rad
@@ -882,9 +881,3 @@ def _flat(mean: Array) -> Array:
 
 def _sigma(positions: SpotPositions) -> Array:
     return np.stack([positions.sigma_row, positions.sigma_column], axis=-1)
-
-
-def _pair(cameras: Mapping[str, CameraCalibration]) -> tuple[str, str]:
-    """Return the names of two cameras: the forward one, from which their angle is counted, then the other."""
-    forward, backward = sorted(cameras, key=lambda name: -cameras[name].look_rad)
-    return forward, backward

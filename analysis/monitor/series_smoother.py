@@ -34,18 +34,8 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.linalg import solve_triangular
 
 from analysis.arrays import Array, UndeterminedError
+from analysis.monitor import jump_detection
 from analysis.monitor.disturbances import FALSE_ALARM, Consistency, Disturbances, TimeLaw
-from analysis.monitor.jump_detection import (
-    MOST,
-    Jump,
-    Steps,
-    candidates,
-    most_likely_jump,
-    steps,
-    with_jumps,
-    with_sizes,
-    with_subthreshold_jumps,
-)
 from analysis.statistics import limit_of
 
 Numbers = NDArray[np.int_]
@@ -120,7 +110,7 @@ class SmoothedSeries:
     smoothed: SeriesChanges
     innovations: Array
     consistency: Consistency
-    jumps: tuple[Jump, ...] | None = None
+    jumps: tuple[jump_detection.Jump, ...] | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -275,7 +265,7 @@ def detect_jumps(
     shifts: ArrayLike,
     noise: ShiftNoise | Array,
     reference: float | None = None,
-) -> tuple[Jump, ...]:
+) -> tuple[jump_detection.Jump, ...]:
     """Detect steps at unknown times in a series of measurements by generalised likelihood ratios.
 
     Dimensions: M measurements, D spot coordinates (row and column of every spot).
@@ -365,9 +355,9 @@ class _Search:
         reference: float | None,
     ) -> None:
         self.prior, self.when, self.shifts, self.noise, self.order = prior, when, shifts, noise, order
-        self.reference, self.may = reference, candidates(prior)
+        self.reference, self.may = reference, jump_detection.candidates(prior)
 
-    def jumps(self) -> tuple[tuple[Jump, ...], Disturbances]:
+    def jumps(self) -> tuple[tuple[jump_detection.Jump, ...], Disturbances]:
         """Return all detected jumps with their sizes, in the order of time, and the prior with these jumps."""
         detected = self._further([])
         if len(detected) > 1:
@@ -378,30 +368,35 @@ class _Search:
                 detected = others if again is None else [*detected[:k], again, *detected[k + 1 :]]
             detected = self._further(detected)
         detected.sort(key=lambda jump: jump.until)
-        model = with_jumps(self.prior, detected)
+        model = jump_detection.with_jumps(self.prior, detected)
         if any(law.every_s is not None for law in self.prior.laws):
             all_steps = self._steps(model)
             looks = len(self.may) * sum(len(jump.until) for jump in all_steps)
-            model = with_subthreshold_jumps(model, all_steps, self.prior, looks, float(self.when[-1]))
+            model = jump_detection.with_subthreshold_jumps(model, all_steps, self.prior, looks, float(self.when[-1]))
         return tuple(self._sized(jump, model) for jump in detected), model
 
-    def _further(self, detected: list[Jump]) -> list[Jump]:
-        while len(detected) < MOST and (jump := self._look(detected)) is not None:
+    def _further(self, detected: list[jump_detection.Jump]) -> list[jump_detection.Jump]:
+        while len(detected) < jump_detection.MOST and (jump := self._look(detected)) is not None:
             detected = [*detected, jump]
         return detected
 
-    def _look(self, known: list[Jump]) -> Jump | None:
+    def _look(self, known: list[jump_detection.Jump]) -> jump_detection.Jump | None:
         """Return the most likely jump that is not known yet if it is significant; None otherwise."""
-        jump = most_likely_jump(self._steps(with_jumps(self.prior, known)), self.may, self.prior)
+        jump = jump_detection.most_likely_jump(
+            self._steps(jump_detection.with_jumps(self.prior, known)), self.may, self.prior
+        )
         return jump if jump is not None and jump.false_alarm <= self.prior.jump_false_alarm else None
 
-    def _steps(self, model: Disturbances) -> list[Steps]:
-        return [steps(part.root, part.white, part.when, piece, self.reference) for part, piece in self._factors(model)]
+    def _steps(self, model: Disturbances) -> list[jump_detection.Steps]:
+        return [
+            jump_detection.steps(part.root, part.white, part.when, piece, self.reference)
+            for part, piece in self._factors(model)
+        ]
 
-    def _sized(self, jump: Jump, model: Disturbances) -> Jump:
+    def _sized(self, jump: jump_detection.Jump, model: Disturbances) -> jump_detection.Jump:
         for part, piece in self._factors(model):
             if jump.until in part.when[piece]:
-                return with_sizes(jump, self.prior, part.root, part.white, part.when, self.reference)
+                return jump_detection.with_sizes(jump, self.prior, part.root, part.white, part.when, self.reference)
         raise AssertionError(f"a jump at {jump.until} s is at no measurement")
 
     def _factors(self, model: Disturbances) -> Iterator[tuple[_Factor, slice]]:

@@ -102,26 +102,11 @@ def main(
     Exit codes: 0 measured; 2 bad input, with a sentence that says what to change; 1 the result cannot be printed.
     With exit code 2 no file is written.
     """
+    options = locals()
     # imported here, so that help is printed without loading the numerical packages
     from analysis.mtf.mtf_command import run_mtf
 
-    run_mtf(
-        image,
-        roi,
-        pitch,
-        pixel_size,
-        bars,
-        dark,
-        bright,
-        saturation,
-        offset,
-        frames,
-        page,
-        gamma,
-        plot,
-        csv_file,
-        as_json,
-    )
+    run_mtf(**options)
 
 
 if __name__ == "__main__":

@@ -115,7 +115,7 @@ def measure_pages(
         saturation = noise.saturation_dn
     grey = checked_region(mean_page(array, saturation), saturation)
     frames = np.asarray(array, np.float64)
-    run = _Run(noise, step, same, even)
+    run = _Run(noise, step, same, even, len(frames))
     try:
         line = locate_edge(grey)
         rising_mean = slanted_edge.rising(grey, line)
@@ -125,7 +125,7 @@ def measure_pages(
         shift = stack.differences(step, rising_mean)
         if len(frames) == 1 or shift.p_value >= FALSE_ALARM:
             stack = stack.moved(shift.line)
-            return run.result(rising_mean[None], len(frames), line, fitted, stack, shift, aligned=False)
+            return run.result(rising_mean[None], line, fitted, stack, shift, aligned=False)
     except EdgeError:
         # the mean of pages whose edge moves far shows no edge
         if len(frames) == 1:
@@ -143,16 +143,10 @@ class _Run:
     step: float
     same: int
     even: bool
+    frames: int
 
     def result(
-        self,
-        pages: Array,
-        frames: int,
-        line: EdgeLine,
-        fitted: edge_fit.FittedEdge,
-        stack: _Stack,
-        shift: _Shift,
-        aligned: bool,
+        self, pages: Array, line: EdgeLine, fitted: edge_fit.FittedEdge, stack: _Stack, shift: _Shift, aligned: bool
     ) -> EdgeMtf:
         """Return the MTF of the mean page, given as (1, H, W), or of P aligned pages (P, H, W).
 
@@ -163,7 +157,7 @@ class _Run:
         count = len(stack.line)
         rounded = [rounding_residual(rms, self.step) for rms in shift.page_noise]
         result = slanted_edge.edge_result(
-            pages, line, fitted, self.noise, frames // len(pages), slanted_edge.FREQUENCY, (rounded[0], rounded[1])
+            pages, line, fitted, self.noise, self.frames // len(pages), slanted_edge.FREQUENCY, (rounded[0], rounded[1])
         )
         position, slope = stack.line.T
         spread = np.sqrt(np.stack([np.diag(matrix) for matrix in shift.covariance]))
@@ -447,7 +441,7 @@ def _aligned(pages: Array, line: EdgeLine, stack: _Stack | None, run: _Run) -> E
     # chi-square of the differences between the lines
     apart = final.line - final.line.mean(axis=0)
     square = float(np.sum(apart * np.linalg.solve(chi.covariance, apart[..., None])[..., 0]))
-    return run.result(final.levelled, len(upright), line, fitted, final, replace(chi, chi_square=square), aligned=True)
+    return run.result(final.levelled, line, fitted, final, replace(chi, chi_square=square), aligned=True)
 
 
 def _levelled(upright: Array, lines: Array, levels: Array, bend: Array) -> tuple[edge_fit.EdgeRows, Array, float]:

@@ -184,14 +184,18 @@ def _pitch_option(pitch: str | None, pixel_size: str | None, errors: Console) ->
     return str(pitch if pixel_size is None else pixel_size)
 
 
+def _quantity(text: str, units: str) -> tuple[float, str]:
+    """Return a number and its unit, which a pattern describes; NaN where the text is no such quantity."""
+    match = re.fullmatch(rf"\s*([-+0-9.eE]+)\s*({units})\s*", text)
+    try:
+        return (float(match[1]), match[2]) if match else (math.nan, "")
+    except ValueError:
+        return math.nan, ""
+
+
 def _pitch(text: str) -> float:
     """Return the pixel pitch in millimetres from the text of its option, such as ``7 um``."""
-    match = re.fullmatch(r"\s*([-+0-9.eE]+)\s*(\S*)\s*", text)
-    try:
-        value = float(match[1]) if match else math.nan
-    except ValueError:
-        value = math.nan
-    unit = match[2] if match else ""
+    value, unit = _quantity(text, r"\S*")
     if unit not in _LENGTHS or not math.isfinite(value):
         raise _Wrong(f'--pitch {text!r} is not a length with its unit: write it as "7 um" or "0.007 mm"')
     if not 1e-6 <= value * _LENGTHS[unit] <= 10:
@@ -201,14 +205,10 @@ def _pitch(text: str) -> float:
 
 def _frequency(text: str, pitch: float) -> float:
     """Return the frequency in cycles per pixel from the text of its option; the pitch is in millimetres."""
-    match = re.fullmatch(r"\s*([-+0-9.eE]+)\s*(cycles/mm|cycles/pixel|lp/mm)\s*", text)
-    try:
-        value = float(match[1]) if match else math.nan
-    except ValueError:
-        value = math.nan
-    if match is None or not 0 < value < math.inf:
+    value, unit = _quantity(text, "cycles/mm|cycles/pixel|lp/mm")
+    if not 0 < value < math.inf:
         raise _Wrong(f'--bars {text!r} is not a frequency with its unit: write "71.4 cycles/mm" or "0.5 cycles/pixel"')
-    each = value if match[2] == "cycles/pixel" else value * pitch
+    each = value if unit == "cycles/pixel" else value * pitch
     if each > _HIGHEST:
         raise _Wrong(f"--bars {text!r} is {each:.3g} cycles/pixel; above {_HIGHEST:g} nothing can be measured")
     return each
@@ -280,17 +280,10 @@ def _draw(edge: EdgeMtf, pitch: float, path: Path) -> None:
     line.plot(edge.distance[shown], edge.lsf[shown], color="C0")
     line.axhline(0.0, color="0.7", lw=0.8, zorder=0)
     line.set(title="line-spread function", xlabel="along the normal / px", ylabel="1/px")
-    curve.fill_between(
-        edge.frequency / pitch,
-        edge.mtf - edge.sigma,
-        edge.mtf + edge.sigma,
-        color="C0",
-        alpha=0.3,
-        lw=0,
-        label="±1 sigma",
-    )
-    curve.plot(edge.frequency / pitch, edge.mtf, color="C0", label="MTF")
-    curve.plot(edge.frequency / pitch, edge.noise_bias, color="C3", lw=1, label="noise bias in it")
+    frequency, (low, high) = edge.frequency / pitch, (edge.mtf - edge.sigma, edge.mtf + edge.sigma)
+    curve.fill_between(frequency, low, high, color="C0", alpha=0.3, lw=0, label="±1 sigma")
+    curve.plot(frequency, edge.mtf, color="C0", label="MTF")
+    curve.plot(frequency, edge.noise_bias, color="C3", lw=1, label="noise bias in it")
     curve.axvline(0.5 / pitch, color="0.5", ls="--", lw=1)
     curve.annotate("Nyquist", (0.5 / pitch, 1.0), xytext=(4, 0), textcoords="offset points", color="0.4")
     curve.set(title="MTF along the normal", xlabel="cycles/mm", xlim=(0, edge.frequency[-1] / pitch), ylim=(0, 1.05))

@@ -15,7 +15,7 @@ from optics.numerics.extension_table import ExtensionTable
 if TYPE_CHECKING:
     from analysis.arrays import Array
     from analysis.spots.noise import NoiseModel
-    from analysis.spots.spot_positions import SpotPositions
+    from analysis.spots.spot_image import SpotPositions
     from analysis.spots.spot_template import SpotTemplate
 
 

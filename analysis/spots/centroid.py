@@ -21,7 +21,7 @@ from numpy.typing import ArrayLike, NDArray
 from analysis.arrays import Array
 from analysis.spots import spot_image
 from analysis.spots.noise import NoiseModel
-from analysis.spots.spot_positions import SpotPositions
+from analysis.spots.spot_image import SpotPositions
 
 # Greatest distance of the fitted centre from the first guess, px.
 _GAUSS_MOVE_PX = 4
@@ -125,10 +125,9 @@ def _energy(
     direct -= border * (direct.sum(axis=(2, 3), keepdims=True) / border.sum())
     direct /= flux[:, :, :, None]
     maps = np.linalg.solve(np.eye(2) - follow, direct.reshape(count, 2, -1)).reshape(direct.shape)
-    flux, nothing = flux[:, 0, 0], np.full(count, np.nan)
-    return spot_image.positions(
-        position, maps, image, frames, noise, keep_maps, flux, background, converged, iteration, nothing
-    )
+    fit = {"flux": flux[:, 0, 0], "background": background, "converged": converged, "iterations": iteration}
+    chi = np.full(count, np.nan)
+    return spot_image.positions(position, maps, image, frames, noise, keep_maps, **fit, reduced_chi_square=chi)
 
 
 def gaussian_fit(
@@ -237,6 +236,5 @@ def _gauss(image: Array, frames: int, noise: NoiseModel, radius: float, elliptic
     full_maps[spot[..., None], np.arange(2), rows[..., None], columns[..., None]] = maps.transpose(0, 2, 3, 1)
     position = np.asarray(theta[:, :2] + corner, dtype=np.float64)
     spot_image.check_edge(position, full_height, full_width, radius)
-    return spot_image.positions(
-        position, full_maps, full_image, frames, noise, True, flux, theta[:, 3], converged, iteration, chi
-    )
+    fit = {"flux": flux, "background": theta[:, 3], "converged": converged, "iterations": iteration}
+    return spot_image.positions(position, full_maps, full_image, frames, noise, True, **fit, reduced_chi_square=chi)

@@ -41,7 +41,7 @@ from analysis.arrays import Array
 from analysis.spots import spot_image
 from analysis.spots.frame_screening import Finding, ScreenedFrames
 from analysis.spots.noise import NoiseModel
-from analysis.spots.spot_positions import NoiseParts, SpotError, SpotPositions, noise_parts
+from analysis.spots.spot_image import NoiseParts, SpotError, SpotPositions, noise_parts
 from analysis.spots.spot_template import SmearedShape, SpotTemplate
 
 MARGIN_PX = 40

@@ -25,7 +25,7 @@ from analysis.arrays import Array, Mask
 from analysis.spots import spot_image
 from analysis.spots.likelihood import EDGE_PX
 from analysis.spots.noise import NoiseModel
-from analysis.spots.spot_positions import SpotError, SpotPositions
+from analysis.spots.spot_image import SpotError, SpotPositions
 from analysis.spots.spot_template import SmearedShape, SpotTemplate, TemplateRangeError
 
 _REST_PX, _MOST_STEPS = 1e-6, 60

@@ -31,7 +31,7 @@ from analysis.spots import spot_image
 from analysis.spots.frame_screening import FALSE_ALARM, Finding, ScreenedFrames
 from analysis.spots.noise import NoiseModel
 from analysis.spots.screened_fit import FitTerms, ScreenedFit, fit_screened, model_parts
-from analysis.spots.spot_positions import SpotError, SpotPositions
+from analysis.spots.spot_image import SpotError, SpotPositions
 from analysis.spots.spot_template import SpotTemplate
 from analysis.statistics import robust_sigma
 

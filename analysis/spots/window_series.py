@@ -34,7 +34,7 @@ from scipy.special import erf
 
 from analysis.arrays import Array
 from analysis.spots.noise import NoiseModel
-from analysis.spots.spot_positions import SpotError
+from analysis.spots.spot_image import SpotError
 from optics.numerics.number_tree import FrozenMap
 
 LEAST_FRAMES, LEAST_SIDE = 3, 5

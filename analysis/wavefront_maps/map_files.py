@@ -367,9 +367,8 @@ def read_codev(path: Path, lines: list[Line]) -> WavefrontMap:
     counts = counts.reshape(rows, columns)
     no_data = values.get("NDA", _CODEV_NO_DATA)
     metres = values["WVL"] * 1e-6 / values["SSZ"]
-    notes = (
-        () if "NDA" in values else (f"NDA is not stated; {_CODEV_NO_DATA} was used for missing data, as in CODE V.",)
-    )
+    note = f"NDA is not stated; {_CODEV_NO_DATA} was used for missing data, as in CODE V."
+    notes = () if "NDA" in values else (note,)
     return WavefrontMap(
         values=np.where(counts == no_data, np.nan, counts * metres)[::-1],
         spacing=math.nan,
@@ -454,12 +453,8 @@ def read_table(path: Path, text: str, wavelength: float | None) -> WavefrontMap:
     table = numbers.reshape(len(widths), widths[0])
     if np.isinf(table).any():
         raise MapError(f"{path} holds an infinite number; write nan where nothing was measured")
-    wavelength = agreed(
-        path,
-        "wavelength",
-        wavelength,
-        length_from(path, header["wavelength"], "wavelength") if "wavelength" in header else None,
-    )
+    in_file = length_from(path, header["wavelength"], "wavelength") if "wavelength" in header else None
+    wavelength = agreed(path, "wavelength", wavelength, in_file)
     unit = unit_written(path, header.get("unit"), "a line '# unit: nm' before the numbers")
     what = header.get("what")
     if what is not None and what not in _WHAT:

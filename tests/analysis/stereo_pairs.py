@@ -5,9 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import ndimage
 
-from analysis.matching.correlation import MatchOptions
+from analysis.matching.correlation import MatchOptions, resampled
 from analysis.matching.matches import Matches, match_windows
-from analysis.matching.spline import resampled
 from tests.analysis.texture_image import Texture, lattice
 
 HALF = 15

@@ -17,12 +17,12 @@ from scipy.interpolate import make_smoothing_spline
 from scipy.optimize import minimize
 
 from analysis.arrays import UndeterminedError
-from analysis.turntable import angle_network
-from analysis.turntable.angle_network import NotConvergedError
+from analysis.turntable import dividing_error
 from analysis.turntable.dividing_error import (
     FITS,
     CalibrationSeries,
     DividingCompensation,
+    NotConvergedError,
     angles_left,
     chauvenet,
     choose,
@@ -253,7 +253,7 @@ def test_network_derivative_is_that_of_the_trained_network(monkeypatch: pytest.M
     """Central differences of weights found by BFGS from a loss that is written down here; more decay than in use, so
     that the minimum is sharp enough for differences.
     """
-    monkeypatch.setattr(angle_network, "DECAY", 0.1)
+    monkeypatch.setattr(dividing_error, "DECAY", 0.1)
     rng = np.random.default_rng(11)
     n, h = 15, 4
     x, y, weight = np.linspace(-5.0, 5.0, n), rng.standard_normal(n), rng.uniform(0.5, 2.0, n)
@@ -264,7 +264,7 @@ def test_network_derivative_is_that_of_the_trained_network(monkeypatch: pytest.M
     def trained(value: np.ndarray, start: np.ndarray) -> np.ndarray:
         def loss(z: np.ndarray) -> np.ndarray:
             decay = np.sum(z[:h] ** 2) + np.sum(z[2 * h : 3 * h] ** 2)
-            return np.asarray(0.5 * np.sum(weight * (output(z, x) - value) ** 2) + 0.5 * angle_network.DECAY * decay)
+            return np.asarray(0.5 * np.sum(weight * (output(z, x) - value) ** 2) + 0.5 * dividing_error.DECAY * decay)
 
         def slope(theta: np.ndarray) -> np.ndarray:
             """By complex step, exact to rounding."""
@@ -277,7 +277,7 @@ def test_network_derivative_is_that_of_the_trained_network(monkeypatch: pytest.M
         coefs_=[theta[None, :h], theta[2 * h : 3 * h, None]], intercepts_=[theta[h : 2 * h], theta[-1:]]
     )
     at = np.linspace(-5.0, 5.0, 23)
-    told = angle_network.gradient(net, at) @ angle_network.response(net, x, y, weight)
+    told = dividing_error.gradient(net, at) @ dividing_error.response(net, x, y, weight)
     step = 1e-4
     for i in (2, 7, 12):
         change = np.where(np.arange(n) == i, step, 0.0)
@@ -338,7 +338,7 @@ def test_unknown_fit_and_outside_of_the_points() -> None:
 
 
 def test_network_that_does_not_converge(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(angle_network, "MOST_ITERATIONS", 2)
+    monkeypatch.setattr(dividing_error, "MOST_ITERATIONS", 2)
     refuses(NotConvergedError, "none of 4 trainings", fit_dividing_error, ANGLE, wave(ANGLE), 0.1, "network")
     series = CalibrationSeries(ANGLE, wave(ANGLE)[:, None] + np.random.default_rng(1).normal(0.0, 0.1, (41, 5)))
     choice = choose(series, names=("network", "cubic_spline"))

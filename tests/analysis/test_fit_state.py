@@ -9,7 +9,7 @@ from analysis.monitor.recovery import AFTER, BEFORE, NOISE, SpotEvidence
 from analysis.spots import likelihood
 from analysis.spots.centroid import energy_centroid, gaussian_fit
 from analysis.spots.likelihood import fit_states, maximum_likelihood_fit, require_convergence, widened
-from analysis.spots.spot_positions import SpotError
+from analysis.spots.spot_image import SpotError
 from analysis.spots.spot_template import SpotTemplate
 from analysis.statistics import limit_of
 from tests.analysis import test_spot_centroids as spots

@@ -16,7 +16,7 @@ from analysis.spots.learnt_template import FittedSpot, learn_template, learnt_sh
 from analysis.spots.likelihood import EDGE_PX
 from analysis.spots.noise import NoiseModel
 from analysis.spots.screened_fit import FitTerms, ScreenedFit, fit_screened
-from analysis.spots.spot_positions import SeriesNoise, SpotError, SpotPositions
+from analysis.spots.spot_image import SeriesNoise, SpotError, SpotPositions
 from analysis.spots.spot_template import SpotTemplate
 from analysis.spots.static_defects import _off, repaired_centroid
 from tests.analysis.refusals import refuses

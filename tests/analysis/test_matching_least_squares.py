@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from analysis.matching.correlation import MatchOptions, Reason
+from analysis.matching.correlation import MatchOptions, Reason, SplineStack, resampled
 from analysis.matching.least_squares import least_squares
-from analysis.matching.spline import SplineStack, resampled
 from tests.analysis.refusals import refuses
 from tests.analysis.texture_image import Texture, detected, lattice
 from tests.tiers import quick

@@ -21,8 +21,7 @@ from analysis.calibration import normal_equations, strip_adjustment
 from analysis.calibration.adjustment import adjust
 from analysis.calibration.strip_adjustment import adjust_strip
 from analysis.images.image_file import ImageError, ImageFile, Region, fits_cards
-from analysis.matching.correlation import MatchOptions, distinct_points
-from analysis.matching.spline import resampled
+from analysis.matching.correlation import MatchOptions, distinct_points, resampled
 from analysis.monitor import limits
 from analysis.monitor.estimators import ESTIMATORS, Posterior, Shifts
 from analysis.monitor.filter_state import Observed
@@ -51,7 +50,7 @@ from analysis.spots.frame_screening import FramesError
 from analysis.spots.likelihood import maximum_likelihood_fit
 from analysis.spots.noise import NoiseModel
 from analysis.spots.photon_transfer import photon_transfer, pixel_correction
-from analysis.spots.spot_positions import difference_covariance, noise_parts
+from analysis.spots.spot_image import difference_covariance, noise_parts
 from analysis.spots.spot_template import SpotTemplate
 from analysis.turntable.dividing_error import CalibrationSeries, cross_validate, fit_dividing_error
 from tests.analysis import test_adjustment

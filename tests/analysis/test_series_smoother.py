@@ -10,7 +10,7 @@ import pytest
 from analysis.monitor import series_smoother
 from analysis.monitor.disturbances import Disturbances, TimeLaw
 from analysis.monitor.series_smoother import smooth_series
-from analysis.spots.spot_positions import NoiseParts, SeriesNoise
+from analysis.spots.spot_image import NoiseParts, SeriesNoise
 from tests.analysis.refusals import refuses
 from tests.analysis.stated_motions import correlation_of, disturbances
 

@@ -14,8 +14,7 @@ from scipy.special import j1
 from analysis.spots.centroid import _GAUSS_MOVE_PX, _wandered, energy_centroid, gaussian_fit, mean_frames
 from analysis.spots.likelihood import _bound, image_bound, maximum_likelihood_fit
 from analysis.spots.noise import NoiseModel
-from analysis.spots.spot_image import sane, template_model
-from analysis.spots.spot_positions import SpotError, difference_covariance
+from analysis.spots.spot_image import SpotError, difference_covariance, sane, template_model
 from analysis.spots.spot_template import SpotTemplate
 from tests.analysis.refusals import refuses
 from tests.tiers import quick

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from scipy import ndimage, stats
 
-from analysis.matching.least_squares import noise_energy, template_noise
-from analysis.matching.spline import SplineStack, low_passed
+from analysis.matching.correlation import SplineStack, low_passed
+from analysis.matching.least_squares import FitState, noise_energy, template_noise
 from tests.analysis.stereo_pairs import Pair
 
 pytestmark = pytest.mark.second
@@ -45,18 +45,9 @@ def test_the_curvature_is_that_of_the_square_sum():
 
     # the spline's fourth derivative is piecewise linear, so that a step of the place of 1e-4 sees it to 1e-3
     curvature = differences(slopes, at, np.array([1e-4] * 2 + [1e-5] * 4 + [1e-4] * 4))
-    found = template_noise(
-        stack,
-        np.array([0]),
-        (ROW, COLUMN),
-        at[None, :2],
-        at[None, 2:6].reshape(1, 2, 2),
-        at[None, 6:],
-        np.array([0.7]),
-        design[None],
-        residual[None],
-        (np.zeros(1), np.zeros(1)),
-    )
+    affine, linear = at[None, 2:6].reshape(1, 2, 2), at[None, 6:]
+    state = FitState(stack, (ROW, COLUMN), grey[None], at[None, :2], affine, linear, design[None], residual[None])
+    found = template_noise(state, np.array([0]), np.array([0.7]), (np.zeros(1), np.zeros(1)))
     scale = np.sqrt(np.diag(design @ design.T))
     wanted = np.linalg.inv(0.5 * (curvature + curvature.T)) * np.outer(scale, scale)
     plain = np.linalg.inv(design @ design.T) * np.outer(scale, scale)

@@ -8,7 +8,7 @@ from scipy.special import erf
 
 import analysis
 from analysis.spots.noise import NoiseModel
-from analysis.spots.spot_positions import SpotError
+from analysis.spots.spot_image import SpotError
 from analysis.spots.window_series import CAUSES, SeriesPrior, fit_window_series
 
 NOISE = NoiseModel(gain_dn_per_e=0.15, dark_noise_e=20.0)

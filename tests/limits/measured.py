@@ -27,7 +27,7 @@ def resident(what: str) -> int:
 
 def taken(command: str, arguments: list[str]) -> dict[str, Any]:
     """What the command takes."""
-    from twin.monitor.monitor_memory import MonitorSize
+    from twin.monitor.monitor_experiment import MonitorSize
 
     app = importlib.import_module(command if command != "twin.study" else "twin.study.__main__").app
     if command in BEFORE:

@@ -34,9 +34,8 @@ from scenes.yaml.spec import validate
 from scenes.yaml.yaml_file import parse_yaml
 from tests.own_trace import OwnCamera
 from tests.twin.study_bench import ROOT
-from twin.camera.camera_optics import CameraOptics
-from twin.camera.cut_wavefront import RAYS_ACCURACY
-from twin.camera.field_maps import field_curves, through_focus
+from twin.camera.aberrations import field_curves, through_focus
+from twin.camera.camera_optics import RAYS_ACCURACY, CameraOptics
 from twin.camera.first_order_data import FIRST_ORDER, first_order_data
 from twin.framework import cli
 

@@ -37,7 +37,7 @@ from twin.camera.camera_optics import CameraOptics
 from twin.camera.varied_beams import VariedBeams
 from twin.monitor.image_quality import image_quality
 from twin.monitor.monitor_derivative import spot_jacobian
-from twin.monitor.motions import ElementaryMotion
+from twin.monitor.truth import ElementaryMotion
 from twin.tolerance.monitor_merit import Merit
 
 FIVE = [[-1, 0], [-0.5, 0], [0, 0], [0.5, 0], [1, 0]]

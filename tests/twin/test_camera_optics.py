@@ -14,10 +14,9 @@ from scenes.specs.spectrum import SpectrumSpec
 from tests.oracles.test_reference_cameras import bundle, rms_spot, wavefront_error
 from tests.scenes.lens.colour_cameras import colour_camera
 from twin.camera import varied_beams
-from twin.camera.camera_optics import CameraOptics
+from twin.camera.aberrations import through_focus
+from twin.camera.camera_optics import RAYS_ACCURACY, CameraOptics
 from twin.camera.colour import axial_colour, lateral_colour, spectral_mtfs
-from twin.camera.cut_wavefront import RAYS_ACCURACY
-from twin.camera.field_maps import through_focus
 from twin.camera.varied_beams import VariedBeams
 from twin.monitor.image_quality import image_quality
 from twin.targets import target_images

@@ -19,7 +19,7 @@ from scenes.specs.instrument import InstrumentSpec
 from scenes.specs.load import load_camera
 from tests.scenes.lens.colour_cameras import colour_camera
 from tests.twin.policed_page import breaches
-from twin.camera.layout_plot import dimensions
+from twin.camera.camera_view import dimensions
 from twin.pictures.light_paths import trace_light_paths
 from twin.pictures.picture_scene import still_png
 from twin.pictures.scene_file import scene_bytes, viewer_page

@@ -14,8 +14,7 @@ from optics.waves.imaging import path_to_sphere
 from scenes.models.camera_model import collimated, field_direction
 from twin.monitor.monitor_derivative import spot_jacobian
 from twin.monitor.monitor_path import MonitorPath
-from twin.monitor.motions import ElementaryMotion, line_family
-from twin.monitor.truth import trace_truth, truth_jacobian
+from twin.monitor.truth import ElementaryMotion, line_family, trace_truth, truth_jacobian
 
 CAMERA = "forward"
 PLANE = f"base/{CAMERA}/focal_plane"

@@ -97,7 +97,7 @@ def test_the_series_does_not_depend_on_its_pieces(folder, prepared, monkeypatch)
     resolved, experiment = resolve(folder / "config.yaml"), prepared
     states = series_states(experiment, resolved.job)
     done: list[int] = []
-    monkeypatch.setattr("twin.monitor.monitor_memory.CHUNK", 2)
+    monkeypatch.setattr("twin.monitor.monitor_experiment.CHUNK", 2)
     pieces = run_series(experiment, resolved, states, done.append)
     assert done == [0, 2, 3]
     whole = json.loads((folder / "course.json").read_text())

@@ -182,8 +182,8 @@ def test_exposures_of_one_seed_share_what_is_drawn_and_not_their_light(dark_nois
     alone = [ccd.expose(light, pattern, 7, 0.01, seed) for light, seed in zip(photons, seeds, strict=True)]
     monkeypatch.setattr(exposure_kernel, "_TOGETHER", 2 * 7 * 41 * 31)
     monkeypatch.setattr(exposure_kernel, "_MOST_KEPT", kept)
-    times, words_of = [], exposure_kernel.words_of
-    monkeypatch.setattr(exposure_kernel, "words_of", lambda *how: times.append(how) or words_of(*how))
+    times, words_of = [], module.words_of
+    monkeypatch.setattr(module, "words_of", lambda *how: times.append(how) or words_of(*how))
     for threads in (1, 4):
         times.clear()
         np.testing.assert_array_equal(ccd.expose(photons, pattern, 7, 0.01, seeds, threads), alone)
@@ -437,14 +437,14 @@ def test_threads_do_not_change_the_frames_of_one_image(monkeypatch: pytest.Monke
     monkeypatch.setattr(area_detector, "_FRAMES_PIXELS", 32 * 24 * 32)
     frames = 8 * FEWEST // (24 * 32)
     first = exposed(frames, threads=1, images=1)
-    drawn, calls = exposure_kernel.words_of, itertools.count()
+    drawn, calls = module.words_of, itertools.count()
 
     def slow(*arguments: Any) -> np.ndarray:
         if next(calls) == 0:
             time.sleep(0.2)
         return drawn(*arguments)
 
-    monkeypatch.setattr(exposure_kernel, "words_of", slow)
+    monkeypatch.setattr(module, "words_of", slow)
     np.testing.assert_array_equal(exposed(frames, threads=4, images=1), first)
 
 

@@ -9,7 +9,7 @@ from scipy.stats import chi2
 from analysis.spots.frame_screening import noise_ratio, screen_frames
 from analysis.spots.photon_transfer import pixel_correction
 from analysis.spots.screened_fit import one_shape
-from analysis.spots.spot_positions import SpotError
+from analysis.spots.spot_image import SpotError
 from analysis.spots.static_defects import examine, outlier_pixels
 from optics.numerics.backend import one_blas_thread
 from scenes.models.disturbances import state_of

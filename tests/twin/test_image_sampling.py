@@ -11,8 +11,8 @@ from optics.numerics.quadrature import PupilNodes
 from scenes.models.instrument_builder import build_instrument
 from scenes.specs.load import load_camera, load_instrument
 from tests.hunt.dense_images import DenseImages
-from twin.monitor import image_sampling, monitor_beams, monitor_path
-from twin.monitor.image_sampling import NodeClasses, UncertainImageError, energy_excess
+from twin.monitor import monitor_beams, monitor_path
+from twin.monitor.monitor_beams import NodeClasses, UncertainImageError, energy_excess
 from twin.monitor.monitor_path import MonitorPath
 
 ACCURACY = 3e-6  # of the peak: what classes of blurred spots are chosen for, in double precision
@@ -64,19 +64,19 @@ def test_the_check_finds_what_the_choice_overlooks(blurred, monkeypatch) -> None
     path = blurred(DEFOCUS[1])
     want = path.expected_photons([{}], single=False)
     blind = with_nodes(path, None)
-    monkeypatch.setattr(image_sampling, "BLUR_PHASE", 0.0)
+    monkeypatch.setattr(monitor_beams, "BLUR_PHASE", 0.0)
     assert path.class_of(path.coarse_trace([{}]))[0] < 2
     path.class_beams(0)  # its own nodes are chosen before
     got = blind.expected_photons([{}], single=False)
-    assert largest(got, want) < image_sampling.GOOD
+    assert largest(got, want) < monitor_beams.GOOD
 
 
 @pytest.mark.second
 def test_what_no_nodes_can_do_is_refused(blurred, monkeypatch) -> None:
     path = blurred(0.3)
     path.expected_photons([{}])
-    monkeypatch.setattr(image_sampling, "BLUR_PHASE", 0.0)
-    monkeypatch.setattr(image_sampling, "MOST_PHASE", 50.0)
+    monkeypatch.setattr(monitor_beams, "BLUR_PHASE", 0.0)
+    monkeypatch.setattr(monitor_beams, "MOST_PHASE", 50.0)
     with pytest.raises(UncertainImageError, match=r"forward/\w+ is uncertain by .* % of its peak: .* too rough"):
         path.expected_photons([{}])
 
@@ -91,7 +91,7 @@ def test_light_is_that_of_the_rays(blurred, monkeypatch) -> None:
     path = blurred(0.0)
     path.expected_photons([{}])
     true = monitor_path.image
-    monkeypatch.setattr(monitor_path, "quadrature_difference", lambda images, *_: np.zeros(len(images)))
+    monkeypatch.setattr(monitor_beams, "quadrature_difference", lambda images, *_: np.zeros(len(images)))
     monkeypatch.setattr(monitor_path, "image", lambda *arguments: 1.2 * true(*arguments))
     with pytest.raises(UncertainImageError, match="of its light too much"):
         path.expected_photons([{}])
@@ -112,7 +112,7 @@ def test_energy_leaves_room_for_diffraction_alone() -> None:
 def test_classes_grow_to_the_most_phase() -> None:
     classes = NodeClasses(0.5, (48.0, 48.0))
     assert np.all(np.diff(classes.reached) > 0.0)
-    assert classes.phase(len(classes.reached) - 1) <= image_sampling.MOST_PHASE
+    assert classes.phase(len(classes.reached) - 1) <= monitor_beams.MOST_PHASE
     still = np.zeros((2, 3, 2))
     blur = np.array([[0.0, 50.0, 0.0], [1.0, 0.0, 1e4]])
     number = classes.class_of(still, blur=blur)

@@ -9,7 +9,7 @@ from optics.numerics.array_math import UnphysicalError, check_at_most, check_clo
 from optics.waves import pupil_stack
 from scenes.models import shadow
 from scenes.specs.load import load_camera
-from twin.camera import camera_optics, cut_wavefront
+from twin.camera import camera_optics
 from twin.camera.camera_optics import CameraOptics
 from twin.monitor import image_quality as quality
 from twin.monitor.image_quality import image_quality
@@ -72,8 +72,8 @@ def test_light_of_a_pupil_beyond_all_of_it_is_none(telescope, monkeypatch) -> No
     ],
 )
 def test_statistics_of_a_wavefront_that_cannot_be_are_none(telescope, monkeypatch, wrong, said) -> None:
-    true = cut_wavefront.fit_part
-    monkeypatch.setattr(cut_wavefront, "fit_part", lambda *given: replace(true(*given), **wrong))
+    true = camera_optics.fit_part
+    monkeypatch.setattr(camera_optics, "fit_part", lambda *given: replace(true(*given), **wrong))
     with pytest.raises(UnphysicalError, match=said):
         telescope.wavefront((1.0, 0.0), points=3)
 

@@ -40,7 +40,7 @@ from twin.design.layout_search import (
     spread,
 )
 from twin.framework.procedure import BenchError
-from twin.monitor.information import Information
+from twin.monitor.monitor_derivative import Information
 
 FILES = Path(__file__).with_name("layouts_differentiated")
 STATED_NAME = "mirrors.yaml"

@@ -15,12 +15,11 @@ from scenes.specs.resolved import resolve
 from scenes.yaml.errors import InputError
 from tests.tiers import quick
 from twin.framework.provenance import program_digest
-from twin.live.camera_pictures import CameraPictures
-from twin.live.computer import RequestHandler
+from twin.live.camera_design import CameraPictures
+from twin.live.computer import RequestHandler, course_text, job_text
 from twin.live.knobs import KINDS, knob_name, perturbation
 from twin.live.live_bench import LiveBench
 from twin.live.messages import AskedState, AskedView, BlindState
-from twin.live.saved_files import course_text, job_text
 from twin.main_job.monitor_reading import stated
 from twin.main_job.render_job import render_job
 from twin.monitor.time_series import series_states

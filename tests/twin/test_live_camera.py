@@ -14,10 +14,9 @@ from scenes.yaml.errors import InputError
 from twin.camera.camera_optics import CameraOptics
 from twin.camera.colour import spectral_psfs
 from twin.live.camera_design import MOST_BLUR, RANGE_WAVES, changed_camera, image_width, point_image
-from twin.live.computer import RequestHandler
+from twin.live.computer import RequestHandler, camera_file, course_text
 from twin.live.live_bench import LiveBench
 from twin.live.messages import AskedState, AskedView
-from twin.live.saved_files import camera_file, course_text
 from twin.live.source import read_source
 from twin.scripting.instrument_twin import InstrumentTwin
 

@@ -20,10 +20,10 @@ from scenes.specs.resolved import TurntableSetup, resolve, resolve_camera
 from scenes.yaml.errors import InputError
 from tests.twin.study_bench import REFUSED
 from twin.framework.run_folder import RunFolder, write_manifest
-from twin.live.camera_pictures import _with_targets
+from twin.live.camera_design import _with_targets
+from twin.live.computer import job_text
 from twin.live.live_bench import LiveBench
 from twin.live.messages import MOST_FRAMES, AskedState
-from twin.live.saved_files import job_text
 from twin.live.source import Source, read_source
 from twin.main_job.monitor_reading import stated
 from twin.main_job.render_files import config_text

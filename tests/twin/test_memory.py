@@ -25,9 +25,8 @@ from twin.framework import memory
 from twin.framework.console import PROGRAMS
 from twin.framework.memory import LIMIT, amount_text, free_memory, largest
 from twin.main_job.render_job import render_job
-from twin.monitor import monitor_memory
-from twin.monitor.monitor_experiment import MonitorExperiment
-from twin.monitor.monitor_memory import MonitorSize, require_memory
+from twin.monitor import monitor_experiment
+from twin.monitor.monitor_experiment import MonitorExperiment, MonitorSize, require_memory
 from twin.sensors.area_detector import ReadNoise
 from twin.study.runs.plan import require_study_memory, study_bytes
 from twin.study.runs.setup import resolve_study
@@ -128,7 +127,7 @@ def test_frames_in_a_file_take_no_more_than_a_gibibyte(experiment, monkeypatch) 
     """However many they are, and on the way there: what is kept in memory is small against what a job takes anyway."""
     monkeypatch.setenv(LIMIT, "1 GB")
     noisy = replace(experiment.detector, noise=(ReadNoise(1.0),))
-    monkeypatch.setattr(monitor_memory, "cores", lambda: 64)
+    monkeypatch.setattr(monitor_experiment, "cores", lambda: 64)
     for frames in (100, 900, 1000, 3600, 10_000):
         size = replace(experiment.size(), frames=frames)
         for detector in (experiment.detector, noisy):

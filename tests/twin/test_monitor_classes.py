@@ -17,7 +17,7 @@ from optics.raytrace.aim import aim
 from optics.waves.diffraction import image
 from scenes.specs.instrument import BASE
 from twin.monitor import monitor_beams
-from twin.monitor.image_sampling import SPOT_RANGES, UncertainImageError
+from twin.monitor.monitor_beams import SPOT_RANGES, UncertainImageError
 from twin.monitor.monitor_path import MonitorPath
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -12,7 +12,7 @@ from optics.geometry.tree import ORIGIN, Motion, State
 from scenes.specs.instrument import BASE
 from twin.monitor.monitor_derivative import spot_gradient, spot_jacobian
 from twin.monitor.monitor_path import MonitorPath
-from twin.monitor.motions import FIGURE_TERMS, ElementaryMotion, line_family, other_motions
+from twin.monitor.truth import FIGURE_TERMS, ElementaryMotion, line_family, other_motions
 
 pytestmark = pytest.mark.second
 

@@ -36,7 +36,7 @@ from twin.design.layout_bench import BeamFacts, LayoutBench, combined, is_indivi
 from twin.design.layout_search import journal_of
 from twin.design.monitor_design import LAYOUTS, MonitorDesignRun, run_monitor_design
 from twin.framework.run_folder import RunFolderError
-from twin.monitor.information import Information, spot_noise
+from twin.monitor.monitor_derivative import Information, spot_noise
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.monitor.monitor_path import MonitorPath
 from twin.uncertainty.monitor_limits import expected_covariance, find_limits

@@ -21,7 +21,7 @@ import twin.orbit.__main__ as command
 from analysis.orbit.forward_intersection import CalibratedLine, IntersectionError
 from analysis.orbit.rational_polynomial import fit_rpc
 from analysis.orbit.three_line_model import LineModel
-from analysis.spots.spot_positions import SpotError
+from analysis.spots.spot_image import SpotError
 from optics.numerics.array_math import UnphysicalError
 from scenes.specs.load import ORBIT, SCENES
 from scenes.specs.orbit.angle import EffectsSpec

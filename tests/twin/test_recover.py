@@ -22,7 +22,7 @@ from PIL import Image
 
 from analysis.images.image_file import recording_origin
 from analysis.spots.noise import NoiseModel
-from analysis.spots.spot_positions import SpotError
+from analysis.spots.spot_image import SpotError
 from optics.geometry.tree import State
 from scenes.specs.job import JobSpec
 from scenes.specs.monitor_frames import MeasurementSetup

@@ -13,12 +13,12 @@ from analysis.monitor.limits import posterior_sigma, quantities
 from analysis.monitor.recovery import SpotEvidence, joint, judged_spots, recover_monitor, recovery_of
 from analysis.spots.centroid import mean_frames
 from analysis.spots.likelihood import maximum_likelihood_fit
-from analysis.spots.spot_positions import difference_covariance
+from analysis.spots.spot_image import difference_covariance
 from scenes.models.disturbances import state_of
 from twin.main_job import systematics
 from twin.main_job.systematics import UNNOTICED_SIGMAS
 from twin.main_job.verdict import recovered_numbers
-from twin.monitor.image_sampling import WRONG
+from twin.monitor.monitor_beams import WRONG
 from twin.monitor.observation import StateReader
 from twin.scripting import instrument_twin
 from twin.study.runs.base_job import BlockResult

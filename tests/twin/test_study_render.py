@@ -9,7 +9,7 @@ from scenes.specs.study import ResponseSpec
 from scenes.yaml.errors import InputError
 from tests.twin.study_bench import write_study
 from twin.main_job.render_job import render_job
-from twin.monitor import monitor_memory
+from twin.monitor import monitor_experiment
 from twin.monitor.monitor_path import MonitorPath
 from twin.study.runs.base_job import BlockResult, Failure, Run, leaf, with_values
 from twin.study.runs.blocks import check_responses
@@ -72,7 +72,7 @@ def test_the_same_block_gives_the_same_bits(study, backend, monkeypatch) -> None
     one = study.setup.job.evaluate(study.setup.tree, runs, backend)
     two = study.setup.job.evaluate(study.setup.tree, runs, backend)
     assert one == two
-    monkeypatch.setattr(monitor_memory, "LARGEST_FRAMES", 3 * 9 * 4 * 44 * 48)  # a frame and a fixed pattern each
+    monkeypatch.setattr(monitor_experiment, "LARGEST_FRAMES", 3 * 9 * 4 * 44 * 48)  # a frame and a fixed pattern each
     assert study.setup.job.evaluate(study.setup.tree, runs, backend) == one
 
 

@@ -32,8 +32,7 @@ from tests.twin.study_bench import TEXTS, budget
 from twin.camera.camera_optics import CameraOptics
 from twin.camera.varied_beams import RoughWavefrontError, VignettedBeamError
 from twin.monitor.image_quality import image_quality
-from twin.monitor.information import noise_as_built, quantity_rows
-from twin.monitor.monitor_derivative import SMALL, STEPS
+from twin.monitor.monitor_derivative import SMALL, STEPS, noise_as_built, quantity_rows
 from twin.monitor.monitor_experiment import TEMPLATE_MARGIN
 from twin.monitor.observation import ObservationOptions, observe, shared_detector
 from twin.tolerance import monitor_merit, tolerance_bench

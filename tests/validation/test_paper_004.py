@@ -19,8 +19,7 @@ import pytest
 
 from analysis.focal_plane.plane_fit import FocalPlaneFit
 from analysis.turntable import dividing_error
-from analysis.turntable.angle_network import NotConvergedError
-from analysis.turntable.dividing_error import FITS, fit_dividing_error
+from analysis.turntable.dividing_error import FITS, NotConvergedError, fit_dividing_error
 from optics.numerics.backend import load_backend
 from scenes.specs.resolved import DistortionSetup, FocusSetup
 from tests.tiers import quick

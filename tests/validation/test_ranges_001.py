@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from analysis.monitor import monitor_formulas
-from analysis.spots.spot_positions import SpotError
+from analysis.spots.spot_image import SpotError
 from scenes.specs.job import JobSpec
 from scenes.specs.resolved import resolve_job
 from twin.validation import group

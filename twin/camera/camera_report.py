@@ -2,28 +2,44 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
+from markupsafe import Markup
 from matplotlib.figure import Figure
 
 from optics.camera.ghosts import DETECTOR
 from optics.camera.prescription import ABERRATIONS
 from optics.geometry import zernike
+from optics.numerics.array_math import PhysicalError
 from scenes.models.camera_design import file_with_plane
 from scenes.models.camera_sharpness import FIELDS, field_text
 from twin.camera import camera_plots as plots
 from twin.camera.aberrations import COEFFICIENTS
+from twin.camera.camera_results import Mtf
 from twin.camera.camera_run import CameraRun, built_text, camera_data, perturbed_text, refocus_text, verdict
+from twin.camera.camera_view import dimensions, layout_figure
 from twin.camera.colour import Colours
 from twin.camera.first_order_data import FIRST_ORDER, detector_beyond_field, unmodelled_obscuration
-from twin.camera.layout_plot import dimensions, layout_figure
-from twin.camera.solid_view import solid_view
-from twin.framework.artefact import Artefact, CameraFile, Cell, SvgFigure, Table, fixed, significant
+from twin.framework.artefact import (
+    Artefact,
+    CameraFile,
+    Cell,
+    Piece,
+    PngFigure,
+    SvgFigure,
+    Table,
+    Undrawn,
+    fixed,
+    significant,
+)
 from twin.framework.data_files import netcdf
 from twin.framework.report import Report, Section, answer
 from twin.framework.svg import look, to_svg
+from twin.pictures.light_paths import trace_light_paths
+from twin.pictures.picture_scene import still_png
+from twin.pictures.scene_file import TUBE, scene_bytes, viewer_page
 
 _TABLE_TERMS = 15
 """Number of Zernike terms in the report's table of fields; all terms are in optics.json and optics.nc."""
@@ -34,22 +50,11 @@ def camera_report(run: CameraRun) -> Report:
     texts = refocus_text(run), built_text(run), perturbed_text(run)
     solid, files = solid_view(run)
     verdict_text, more = answer(*verdict(run), "see the wavefronts and the layout")
-    sections = [
-        _layout(run, solid),
-        *([_refocus(run)] if run.refocus is not None else []),
-        _wavefronts(run),
-        _spots(run),
-        *([_energy(run)] if run.images is not None else []),
-        _mtf(run),
-    ]
-    sections += [*_colours(run)]
-    sections += [
-        _through_focus(run),
-        _field(run),
-        _third_order(run),
-        _ghosts(run),
-        *([_bodies(run)] if run.quality is not None else []),
-    ]
+    refocused = [_refocus(run)] if run.refocus is not None else []
+    images = [_energy(run)] if run.images is not None else []
+    sections = [_layout(run, solid), *refocused, _wavefronts(run), _spots(run), *images, _mtf(run), *_colours(run)]
+    sections += [_through_focus(run), _field(run), _third_order(run), _ghosts(run)]
+    sections += [_bodies(run)] if run.quality is not None else []
     return Report(
         f"Camera {run.setup.title}",
         verdict_text,
@@ -59,11 +64,6 @@ def camera_report(run: CameraRun) -> Report:
         tuple(sections),
         files={"optics.nc": netcdf(camera_data(run)), **files},
     )
-
-
-def _new_name(run: CameraRun) -> str:
-    """Return the name of the refocused camera, which is also the name of its file."""
-    return f"{run.setup.camera.name}_refocused"
 
 
 def _figure(name: str, title: str, caption: str, draw: Callable[..., Figure], *drawn: Any) -> SvgFigure:
@@ -94,13 +94,15 @@ def _facts(run: CameraRun) -> tuple[tuple[str, str], ...]:
         facts.append(("Description", spec.description))
     if run.setup.instrument is not None:
         facts.append(("Mounted", f"as {run.setup.mounted} of {run.setup.where}"))
-    facts.append(("Mirrors", ", ".join(f"{m} (stop)" if m == spec.stop else m for m in spec.mirrors)))
-    facts.append(("Design wavelength", f"{1e9 * spec.wavelength:.0f} nm, the unit of waves"))
-    facts.append(
-        ("Fields", "angles along the line and along the track from the middle of the field; the first is positive at "
-         "the line's left end (+Y)")
-    )  # fmt: skip
-    return tuple(facts)
+    fields = (
+        "angles along the line and along the track from the middle of the field; the first is positive at the line's"
+    )
+    return (
+        *facts,
+        ("Mirrors", ", ".join(f"{m} (stop)" if m == spec.stop else m for m in spec.mirrors)),
+        ("Design wavelength", f"{1e9 * spec.wavelength:.0f} nm, the unit of waves"),
+        ("Fields", f"{fields} left end (+Y)"),
+    )
 
 
 def first_order_table(run: CameraRun) -> Table:
@@ -144,14 +146,12 @@ def first_order_table(run: CameraRun) -> Table:
     if n["hole_radius_mm"]:
         holes = ", ".join(f"{b} needs a hole of at least {r:.1f} mm radius" for b, r in n["hole_radius_mm"].items())
         rows.append(("central holes", f"{holes} (not in the file; specify edges: [{{blocks: circle, radius: ...}}])"))
-    axis_text = (
-        "the axis" if run.optics.model.axis.on_axis else "the middle of the field, as no light arrives along the axis"
-    )
+    on_axis = run.optics.model.axis.on_axis
+    axis_text = "the axis" if on_axis else "the middle of the field, as no light arrives along the axis"
     caption = (
-        f"The camera {state}, at {1e9 * run.camera.wavelength:.0f} nm. "
-        f"Focal lengths, F-number and pupils are paraxial, about {axis_text}; all else refers to the middle of the "
-        "field "
-        "unless specified, on the actual image plane."
+        f"The camera {state}, at {1e9 * run.camera.wavelength:.0f} nm. Focal lengths, F-number and pupils are "
+        f"paraxial, about {axis_text}; all else refers to the middle of the field unless specified, on the actual "
+        "image plane."
     )
     return Table("first-order", "First-order data", caption, ("quantity", "value"), rows)
 
@@ -192,7 +192,7 @@ def _refocus(run: CameraRun) -> Section:
     )
     file: tuple[Artefact, ...] = ()
     if run.camera is not run.setup.camera:
-        name = _new_name(run)
+        name = f"{run.setup.camera.name}_refocused"
         new = file_with_plane(run.setup.camera, refocused.after, name)
         about = "Its file, which differs in name and image plane only."
         file = (CameraFile(name.lower(), "The refocused camera", about, new),)
@@ -247,8 +247,7 @@ def _spots(run: CameraRun) -> Section:
     heads = ("field", "rms [µm]", "along line [µm]", "along track [µm]", "largest [µm]", "rms / Airy radius")
     caption = "Hexapolar rays about the spot's centroid, in boxes of equal size; circle: Airy disk."
     figure = _figure("spots", "Spot diagrams", caption, plots.spot_figure, run)
-    decimals = (None, 3, 3, 3, 3, 3)
-    table = Table("spot-sizes", "Spot sizes by field", "Radii about the centroid.", heads, rows, decimals)
+    table = Table("spot-sizes", "Spot sizes by field", "Radii about the centroid.", heads, rows, (None, *[3] * 5))
     about = (
         "Ray minus chief ray on the focal plane, in the direction of the fan; wavefront error against the chief ray."
     )
@@ -330,30 +329,30 @@ def _mtf(run: CameraRun) -> Section:
     """Return the report's section on the MTF over the field."""
     if not run.mtfs:
         return Section("MTF", (f"No MTF: {run.without_mtf}.",))
-    rows: list[list[Cell]] = []
-    for mtf in run.mtfs:
-        values = mtf.at(mtf.nyquist)
-        limits = [float(np.interp(mtf.nyquist, mtf.frequency, row)) for row in mtf.limit]
-        rows.append([plots.degrees_text(run, mtf.field), *map(float, values), *limits])
-    heads = ("field", "along line", "along track", "limit along line", "limit along track")
     text = (
         f"Optics alone, at {1e9 * run.camera.wavelength:.0f} nm, without the effects of pixels, charge and motion; "
         "with the pixel: `render: {quality: true}` in a job. "
         f"Nyquist is {1e-3 * run.optics.nyquist:.4g} cycles/mm."
     )
-    change = max(mtf.accuracy for mtf in run.mtfs)
-    if change:
-        text += (
-            " Edges vignette the pupil; with a third of the lines through it the curves change by at most "
-            f"{change:.1g}."
-        )
+    if change := max(mtf.accuracy for mtf in run.mtfs):
+        text += " Edges vignette the pupil; with a third of the lines through it the curves change by at most "
+        text += f"{change:.1g}."
     caption = "Along the line and along the track; dashed: diffraction limit."
     figure = _figure("mtf", "MTF of the optics by field", caption, plots.mtf_figure, run)
+    rows = [_at_nyquist(run, mtf) for mtf in run.mtfs]
     return Section(
-        "MTF",
-        (text,),
-        (figure, Table("mtf-nyquist", "MTF of the optics at Nyquist", "", heads, rows, (None, 3, 3, 3, 3))),
+        "MTF", (text,), (figure, Table("mtf-nyquist", "MTF of the optics at Nyquist", "", _HEADS, rows, _DIGITS))
     )
+
+
+_HEADS = ("field", "along line", "along track", "limit along line", "limit along track")
+_DIGITS = (None, 3, 3, 3, 3)
+
+
+def _at_nyquist(run: CameraRun, mtf: Mtf) -> list[Cell]:
+    """Return the row of a table with a field, the MTF at Nyquist along line and track, and its diffraction limits."""
+    limits = (float(np.interp(mtf.nyquist, mtf.frequency, row)) for row in mtf.limit)
+    return [plots.degrees_text(run, mtf.field), *map(float, mtf.at(mtf.nyquist)), *limits]
 
 
 def _colours(run: CameraRun) -> list[Section]:
@@ -402,23 +401,18 @@ def _light(run: CameraRun, colours: Colours, ends: str) -> Section:
     title = "Polychromatic image quality"
     if not colours.mtfs:
         return Section(title, (f"No MTF: {colours.without_mtf or run.without_mtf}.",))
-    rows: list[list[Cell]] = []
-    for mtf, psf in zip(colours.mtfs, colours.psfs, strict=True):
-        limits = [float(np.interp(mtf.nyquist, mtf.frequency, row)) for row in mtf.limit]
-        rows.append([plots.degrees_text(run, mtf.field), *map(float, mtf.at(mtf.nyquist)), *limits, float(psf.strehl)])
-    heads = ("field", "along line", "along track", "limit along line", "limit along track", "Strehl ratio")
+    both = zip(colours.mtfs, colours.psfs, strict=True)
+    rows: list[list[Cell]] = [[*_at_nyquist(run, mtf), float(psf.strehl)] for mtf, psf in both]
+    title_of_table, heads = "Polychromatic MTF of the optics at Nyquist", (*_HEADS, "Strehl ratio")
     count = len(colours.mtfs[0].wavelengths)
     exact = "spectral lines, summed exactly" if colours.spectrum.lines else f"accurate to {colours.error:.1g}"
     text = (
         f"Light of {ends} nm, weighted by the spectrum, at {count} wavelengths: {exact}. All wavelengths are referred "
-        "to "
-        "one point of the image, so that lateral and axial colour blur it."
+        "to one point of the image, so that lateral and axial colour blur it."
     )
     caption = "MTF by field; below: point images (square root of irradiance) about the design wavelength's chief ray."
     figure = _figure("light-mtf", "MTF of the optics and point images", caption, plots.light_mtf_figure, run)
-    table = Table(
-        "light-mtf-nyquist", "Polychromatic MTF of the optics at Nyquist", "", heads, rows, (None, 3, 3, 3, 3, 3)
-    )
+    table = Table("light-mtf-nyquist", title_of_table, "", heads, rows, (*_DIGITS, 3))
     return Section(title, (text,), (figure, table))
 
 
@@ -442,9 +436,8 @@ def _field(run: CameraRun) -> Section:
         f"{100 * d.line_largest / half:.2g}% of half the line. Fitted together: {both:.6f} m and a principal point "
         f"{fixed(1e3 * point, 3)} mm off.",
         f"Over the whole field: the best-fitting distortion-free camera has f {d.distance:.6f} m and its principal "
-        "point at "
-        f"({fixed(1e3 * d.point[0], 3)}, {fixed(1e3 * d.point[1], 3)}) mm from the line's middle, near the parent "
-        f"axis; distortion relative to it is {significant(1e6 * d.rms)} µm rms, at most "
+        f"point at ({fixed(1e3 * d.point[0], 3)}, {fixed(1e3 * d.point[1], 3)}) mm from the line's middle, near the "
+        f"parent axis; distortion relative to it is {significant(1e6 * d.rms)} µm rms, at most "
         f"{significant(1e6 * d.largest)} µm.",
     )
     x = np.degrees(curves.share * run.camera.field.x)
@@ -458,10 +451,8 @@ def _field(run: CameraRun) -> Section:
         [1e3 * float(p), float(np.degrees(w)), 1e6 * float(r)]
         for p, w, r in zip(d.position, d.angle, d.residual, strict=True)
     ]
-    against = (
-        "Left: relative to the distortion-free camera with the best principal distance and point. Right: along the "
-        "line."
-    )
+    against = "Left: relative to the distortion-free camera with the best principal distance and point. Right: "
+    against += "along the line."
     bent = "Along the line. Illumination: solid angle of the beam seen from the focal plane."
     line_heads = ("L [mm]", "W [deg]", "distortion [µm]")
     artefacts = (
@@ -484,3 +475,37 @@ def _bodies(run: CameraRun) -> Section:
     heads = ("body", "right end [%]", "middle [%]", "left end [%]")
     table = Table("bodies", "Fraction of the beam blocked", "", heads, rows, (None, 2, 2, 2))
     return Section("In the instrument", (text,), (table,))
+
+
+TITLE = "In three dimensions"
+
+_IMAGE = '<div class="card"><img src="{0}" alt="{1}"></div>'
+_FIGURE = (
+    '<h3>{0}</h3>\n<figure><a href="view.html">{1}</a>\n<figcaption>Mirrors and lenses with their clear apertures, and '
+    'beams of the middle and both ends of the line. <a href="view.html">view.html</a> turns with the mouse; '
+    '<a href="scene.glb">scene.glb</a> is the same scene for other programs.</figcaption></figure>'
+)
+
+
+def solid_view(run: CameraRun) -> tuple[Artefact, Mapping[str, bytes]]:
+    """Return the figure of a camera in its state, and the contents of view.html and scene.glb by name.
+
+    A camera through which no light finds its way from the ends of the line has a note in place of the figure, and no
+    files.
+    """
+    state, length = run.optics.state, run.first_order.length
+    tube = min(TUBE, 6e-4 * length)
+    try:
+        instrument = run.instrument
+        paths = trace_light_paths(instrument, run.optics.path.backend, state, length)
+    except PhysicalError as error:
+        return Undrawn("view", TITLE, "", f"{type(error).__name__}: {error}"), {}
+    scene = scene_bytes(instrument, state, paths, tube)
+    still = PngFigure("view", TITLE, "", still_png(instrument, paths))
+    image = Markup(_IMAGE).format(still.address, f"{run.setup.title} {TITLE.lower()}")
+    moved = run.perturbed.words if run.perturbed is not None else ""
+    page = viewer_page(f"Camera {run.setup.title}", scene, moved, image)
+    return (
+        Piece("view", "", "", Markup(_FIGURE).format(TITLE, image), within=""),
+        {"view.html": page.encode(), "scene.glb": scene},
+    )

@@ -440,13 +440,8 @@ def check_wavefront(wave: Wavefront) -> None:
     check_range("a Strehl ratio", wave.strehl, 0.0, 1.0, ROUNDING)
     check_range("an rms wavefront error in waves", wave.rms, 0.0, MAX_RMS_WAVES, 0.0)
     square = float(np.sum(wave.parts**2)) + wave.residual**2
-    check_close(
-        "the sum of squares of a wavefront error's parts and of their residual",
-        square,
-        wave.rms**2,
-        "the square of its rms",
-        1e-6 * wave.rms**2 + ROUNDING**2,
-    )
+    what, margin = "the sum of squares of a wavefront error's parts and of their residual", 1e-6 * wave.rms**2
+    check_close(what, square, wave.rms**2, "the square of its rms", margin + ROUNDING**2)
 
 
 def check_mtf(mtf: Mtf) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -30,19 +31,7 @@ from scenes.specs.camera import CameraSpec
 from scenes.specs.job import JobSpec, checked_nodes
 from scenes.specs.perturbation import perturbation_text
 from scenes.specs.resolved import CameraSetup
-from twin.camera import field_maps
-from twin.camera.aberrations import (
-    ENERGY,
-    GHOST,
-    THIRD_ORDER,
-    PointImages,
-    RayFans,
-    ThirdOrder,
-    camera_ghosts,
-    point_images,
-    ray_fans,
-    third_order,
-)
+from twin.camera import aberrations
 from twin.camera.camera_optics import RINGS, CameraOptics
 from twin.camera.camera_results import Field, Mtf, Spot, Wavefront
 from twin.camera.colour import COLOURS, Colours, colour_data, evaluate_colours
@@ -199,9 +188,9 @@ class CameraRun:
     without_mtf: str
     field: np.ndarray
     errors: np.ndarray
-    distortion: field_maps.Distortion
-    curves: field_maps.FieldCurves
-    focus: field_maps.ThroughFocus
+    distortion: aberrations.Distortion
+    curves: aberrations.FieldCurves
+    focus: aberrations.ThroughFocus
     refocus: Refocus | None = None
     perturbed: Perturbed | None = None
     quality: CameraQuality | None = None
@@ -236,24 +225,24 @@ class CameraRun:
         return tuple(ranked)
 
     @cached_property
-    def third_order(self) -> ThirdOrder | None:
+    def third_order(self) -> aberrations.ThirdOrder | None:
         """Third-order aberrations of the nominal camera by surface; None for one that is not centred on an axis."""
-        return third_order(self.optics.model)
+        return aberrations.third_order(self.optics.model)
 
     @cached_property
     def ghosts(self) -> tuple[Ghost, ...]:
         """Ghosts of the nominal camera in the middle of the field, the largest irradiance first."""
-        return camera_ghosts(self.optics.model, self.optics.path.backend)
+        return aberrations.camera_ghosts(self.optics.model, self.optics.path.backend)
 
     @cached_property
-    def fans(self) -> RayFans:
+    def fans(self) -> aberrations.RayFans:
         """Ray fans at FAN_FIELDS."""
-        return ray_fans(self.optics, FAN_FIELDS)
+        return aberrations.ray_fans(self.optics, FAN_FIELDS)
 
     @cached_property
-    def images(self) -> PointImages | None:
+    def images(self) -> aberrations.PointImages | None:
         """Point images and their energies at the design wavelength; None for a camera too blurred for an MTF."""
-        return point_images(self.optics) if self.mtfs else None
+        return aberrations.point_images(self.optics) if self.mtfs else None
 
 
 def aberration_name(index: int) -> str:
@@ -320,21 +309,17 @@ def run_camera(
         if setup.instrument is not None:
             quality = image_quality(instrument, backend, [state], QUALITY_FIELDS).cameras[mounted]
     advance("focus", 1, 1)
-    field = field_maps.field_grid(ERROR_GRID)
+    field = aberrations.field_grid(ERROR_GRID)
     where = tuple(map(tuple, field.reshape(-1, 2)))
     errors = optics.errors(where, RINGS if built else MAP_RINGS).reshape(field.shape[:2])
     if setup.perturb and instrument is not None:
         change = trace_truth(instrument, backend, [state]).cameras[mounted]
-        perturbed = Perturbed(
-            job, change, errors, _nyquist(optics) if errors.max() < MAX_WAVES_FOR_MTF else np.empty((0, 2))
-        )
+        perturbed = Perturbed(job, change, errors, _nyquist(optics, errors))
     if state:
         optics = optics.in_state(state)
         errors = optics.errors(where).reshape(field.shape[:2])
-    sharp, without_mtf = (
-        float(errors.max()) < MAX_WAVES_FOR_MTF,
-        f"wavefront errors exceed {MAX_WAVES_FOR_MTF:g} waves, and it would be nearly zero",
-    )
+    sharp = float(errors.max()) < MAX_WAVES_FOR_MTF
+    without_mtf = f"wavefront errors exceed {MAX_WAVES_FOR_MTF:g} waves, and it would be nearly zero"
     advance("wavefronts", 0, 1)
     waves, spots = optics.wavefronts(GRID, points=MAP_POINTS), optics.spots(GRID)
     advance("wavefronts", 1, 1)
@@ -343,8 +328,8 @@ def run_camera(
         mtfs = optics.mtfs(MTF_FIELDS) if sharp else ()
     except UnphysicalError as error:  # a pupil cut by edges, or a wavefront that is too irregular
         mtfs, sharp, without_mtf = (), False, f"it cannot be computed for this pupil: {error}"
-    focus = field_maps.through_focus(optics, MTF_FIELDS, sharp)
-    curves = field_maps.field_curves(optics, sharp)
+    focus = aberrations.through_focus(optics, MTF_FIELDS, sharp)
+    curves = aberrations.field_curves(optics, sharp)
     advance("MTF", 1, 1)
     colours, light = None, camera.light
     if light is not None and light.ends[0] < light.ends[1]:
@@ -362,7 +347,7 @@ def run_camera(
         without_mtf="" if mtfs else without_mtf,
         field=field,
         errors=errors,
-        distortion=field_maps.distortion(optics),
+        distortion=aberrations.distortion(optics),
         curves=curves,
         focus=focus,
         refocus=refocused,
@@ -378,12 +363,12 @@ def run_camera(
     return run
 
 
-def _nyquist(optics: CameraOptics) -> np.ndarray:
+def _nyquist(optics: CameraOptics, errors: np.ndarray) -> np.ndarray:
     """Return the MTF at Nyquist at the F fields MTF_FIELDS, along line and track, (F, 2); empty if not computable."""
-    try:
-        return np.array([mtf.at(optics.nyquist) for mtf in optics.mtfs(MTF_FIELDS)])
-    except UnphysicalError:
-        return np.empty((0, 2))
+    with suppress(UnphysicalError):
+        if errors.max() < MAX_WAVES_FOR_MTF:
+            return np.array([mtf.at(optics.nyquist) for mtf in optics.mtfs(MTF_FIELDS)])
+    return np.empty((0, 2))
 
 
 def find_focus(optics: CameraOptics, tilt: bool, mounted: str | None = None, existing: Motion | None = None) -> Refocus:
@@ -419,17 +404,10 @@ def find_focus(optics: CameraOptics, tilt: bool, mounted: str | None = None, exi
     body, total = focal_plane_body(optics.path.root), motion
     if existing is not None:
         total = compose({body: existing}, {body: motion}, {body: optics.assembly.tree[body]})[body]
-    return Refocus(
-        nominal,
-        best,
-        beams.errors(nominal),
-        beams.errors(best),
-        tilt,
-        motion,
-        _motion_words(focal_plane_body(mounted or "").lstrip("/"), total),
-        existing is not None,
-        bool(model.image_direction @ frame.rotation[:, 2] > 0.0),
-    )
+    errors = beams.errors(nominal), beams.errors(best)
+    words = _motion_words(focal_plane_body(mounted or "").lstrip("/"), total)
+    downstream = bool(model.image_direction @ frame.rotation[:, 2] > 0.0)
+    return Refocus(nominal, best, *errors, tilt, motion, words, existing is not None, downstream)
 
 
 def _motion_words(node: str, motion: Motion) -> tuple[str, ...]:
@@ -451,17 +429,16 @@ def verdict(run: CameraRun) -> tuple[str, ...]:
     position_text = field_text(run.camera, field)
     (kind, size), *_ = run.limits
     lead = f"{worst:.3g} waves rms at field {position_text}, mainly {kind} ({size:.3g})"
+    marechal = f"Mar\N{LATIN SMALL LETTER E WITH ACUTE}chal's limit is {SHARP:.3f}"
     if worst <= SHARP:
-        text = f"Diffraction limited over the whole field: the worst wavefront error is {lead}"
-        text += f" (Mar\N{LATIN SMALL LETTER E WITH ACUTE}chal's limit is {SHARP:.3f})."
+        text = f"Diffraction limited over the whole field: the worst wavefront error is {lead} ({marechal})."
     elif worst <= BLURRED:
         share = float(np.mean(run.errors <= SHARP))
         part = "nowhere in"
         if share:
             percent = "less than 1" if share < 0.01 else "more than 99" if share > 0.99 else f"{100.0 * share:.0f}"
             part = f"in {percent} % of"
-        text = f"Diffraction limited {part} the field: the worst wavefront error is "
-        text += f"{lead} (Mar\N{LATIN SMALL LETTER E WITH ACUTE}chal's limit is {SHARP:.3f})."
+        text = f"Diffraction limited {part} the field: the worst wavefront error is {lead} ({marechal})."
     else:
         text = (
             f"Blurred: the worst wavefront error is {lead}; beyond {BLURRED:g} waves an image has almost no contrast."
@@ -469,11 +446,8 @@ def verdict(run: CameraRun) -> tuple[str, ...]:
     if run.mtfs:
         low = min(float(np.min(mtf.at(run.optics.nyquist))) for mtf in run.mtfs)
         limit = max(float(np.interp(mtf.nyquist, mtf.frequency, row)) for mtf in run.mtfs for row in mtf.limit)
-        text_mtf = (
-            f"The lowest MTF of the optics, without the pixel, at Nyquist is {low:.2g} over the field; the diffraction "
-            f"limit is {limit:.2f}."
-        )
-        return text, text_mtf
+        lowest = f"The lowest MTF of the optics, without the pixel, at Nyquist is {low:.2g} over the field"
+        return text, f"{lowest}; the diffraction limit is {limit:.2f}."
     return (text,)
 
 
@@ -556,7 +530,7 @@ _MTF: Record[Mtf] = Record(
         where_known=True,
     ),
 )
-_DISTORTION: Record[field_maps.Distortion] = Record(
+_DISTORTION: Record[aberrations.Distortion] = Record(
     "Distortion relative to the best-fitting distortion-free camera, over the field and along the line.",
     Quantity("principal_distance_m", lambda d: d.distance, "f of the best-fitting distortion-free camera"),
     Quantity("principal_point_mm", lambda d: d.point, "principal point of that camera, from the line's middle"),
@@ -589,11 +563,7 @@ _PERTURBED: Record[Perturbed] = Record(
     "Effect of a perturbation: changes of the camera's geometry by exact chief rays, and its values before.",
     Quantity("perturb", lambda p: p.job.plain()["perturb"], "perturbation as in a job's file"),
     *(
-        Quantity(
-            parameter.key,
-            lambda p, k=k: p.change.vector[0, k],  # type: ignore[misc]
-            parameter.meaning,
-        )
+        Quantity(parameter.key, lambda p, k=k: p.change.vector[0, k], parameter.meaning)  # type: ignore[misc]
         for k, parameter in enumerate(parameters.ESTIMATED)
     ),
     Quantity("worst_as_designed_waves", lambda p: p.errors.max(), "wavefront error of the worst field"),
@@ -607,21 +577,13 @@ _PERTURBED: Record[Perturbed] = Record(
 
 def _field_numbers(run: CameraRun) -> list[dict[str, Any]]:
     """Return wavefront, spot and Zernike terms without piston and tilts of every field of ``GRID``."""
-    return [
-        {**_WAVE(wave), **_SPOT(spot), "zernike_waves": dict(list(wave.terms.items())[3:]), **_cut_numbers(wave)}
-        for wave, spot in zip(run.waves, run.spots, strict=True)
-    ]
-
-
-def _cut_numbers(wave: Wavefront) -> dict[str, Any]:
-    """Return the numbers in optics.json that only the wavefront of a vignetted beam has; empty for any other."""
-    if not wave.is_vignetted:
-        return {}
-    return {
-        "wfe_accuracy": wave.accuracy,
-        "polynomials": wave.polynomials,
-        "orthonormal_waves": dict(list(wave.orthonormal_terms.items())[3:]),
-    }
+    out = []
+    for wave, spot in zip(run.waves, run.spots, strict=True):
+        out.append({**_WAVE(wave), **_SPOT(spot), "zernike_waves": dict(list(wave.terms.items())[3:])})
+        if wave.is_vignetted:
+            terms = dict(list(wave.orthonormal_terms.items())[3:])
+            out[-1] |= {"wfe_accuracy": wave.accuracy, "polynomials": wave.polynomials, "orthonormal_waves": terms}
+    return out
 
 
 CAMERA: Record[CameraRun] = Record(
@@ -645,15 +607,15 @@ CAMERA: Record[CameraRun] = Record(
     Quantity("first_order", lambda run: run.first_order, record=FIRST_ORDER),
     Quantity("fields", _field_numbers, "wavefront and spot, field by field"),
     Quantity("mtf_at_nyquist", lambda run: run.mtfs, "MTF of the optics, field by field", record=_MTF),
-    Quantity("energy", lambda run: run.images, "energy of point images", record=ENERGY, where_known=True),
+    Quantity("energy", lambda run: run.images, "energy of point images", record=aberrations.ENERGY, where_known=True),
     Quantity(
         "third_order",
         lambda run: run.third_order,
         "Seidel and chromatic sums by surface",
-        record=THIRD_ORDER,
+        record=aberrations.THIRD_ORDER,
         where_known=True,
     ),
-    Quantity("ghosts", lambda run: run.ghosts, "ghosts, the largest irradiance first", record=GHOST),
+    Quantity("ghosts", lambda run: run.ghosts, "ghosts, the largest irradiance first", record=aberrations.GHOST),
     Quantity("colours", lambda run: run.colours, "polychromatic results", record=COLOURS, where_known=True),
     Quantity("distortion", lambda run: run.distortion, record=_DISTORTION),
     Quantity("refocus", lambda run: run.refocus, record=_REFOCUS),
@@ -679,23 +641,19 @@ def camera_data(run: CameraRun) -> xr.Dataset:
     share = "fraction of the half field"
     maps = np.stack([w.map for w in run.waves])
     terms, parts = (np.stack([getattr(w, name) for w in run.waves]) for name in ("coefficients", "parts"))
+    focus_attributes = named("MTF of the optics at the Nyquist frequency through focus")
     orthonormal = named("Zernike terms made orthonormal over the light of each pupil", rms)
     data: dict[str, Any] = {
         "wavefront": (("field", "y", "x"), maps, named("wavefront error over the stop", waves)),
         "zernike": (("field", "noll"), terms, named("Zernike terms of the wavefront error", rms)),
-        **(
-            {}
-            if not any(w.is_vignetted for w in run.waves)
-            else {"orthonormal": (("field", "noll"), parts, orthonormal)}
-        ),
+    }
+    if any(w.is_vignetted for w in run.waves):
+        data["orthonormal"] = (("field", "noll"), parts, orthonormal)
+    data |= {
         "field_share": (("field", "direction"), np.array(fields), named(share)),
         "wfe": (("field_along", "field_across"), run.errors, named("wavefront error over the field", rms)),
         "through_focus_wfe": (("mtf_field", "defocus"), run.focus.error, named("wavefront error through focus", rms)),
-        "through_focus_mtf": (
-            ("mtf_field", "direction", "defocus"),
-            run.focus.mtf,
-            named("MTF of the optics at the Nyquist frequency through focus"),
-        ),
+        "through_focus_mtf": (("mtf_field", "direction", "defocus"), run.focus.mtf, focus_attributes),
         "distortion_line": (
             ("line",),
             run.distortion.residual,
@@ -716,11 +674,8 @@ def camera_data(run: CameraRun) -> xr.Dataset:
     }
     if run.mtfs:
         data["mtf"] = (mtf, np.stack([m.values for m in run.mtfs]), named("MTF of the optics"))
-        data["mtf_limit"] = (
-            mtf,
-            np.stack([m.limit for m in run.mtfs]),
-            named("MTF of the optics without wavefront error, the diffraction limit"),
-        )
+        perfect = named("MTF of the optics without wavefront error, the diffraction limit")
+        data["mtf_limit"] = (mtf, np.stack([m.limit for m in run.mtfs]), perfect)
         axis_attributes = named("spatial frequency in the image, cycles per length", {"units": "1/m"})
         coords["frequency"] = ("frequency", run.mtfs[0].frequency, axis_attributes)
     if run.colours is not None:

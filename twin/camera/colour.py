@@ -273,18 +273,14 @@ def spectral_psfs(
         pupils = field_pupils if len(field_pupils) > 1 else field_pupils * len(colours)
         aperture = 0.5 * float(np.max(pupils[ends[1]].cutoff(np.eye(2), 1.0)))
         # about the design wavelength's chief ray, as the pupils are
-        extent = max(
-            float(np.max(np.abs(np.array(spot[f].position) - design[f].position + spot[f].rays))) for spot in spots
-        )
+        away = [np.array(spot[f].position) - design[f].position + spot[f].rays for spot in spots]
+        extent = max(float(np.max(np.abs(rays))) for rays in away)
         half = max(0.25 * WINDOW * colours[ends[1]] / aperture, 1.5 * extent)
         sampled = [_sampled(pupil, float(colour), half) for pupil, colour in zip(pupils, colours, strict=True)]
 
         def over_light(x: Grid, y: Grid, sampled: Sequence[PupilField] = sampled) -> np.ndarray:
-            return np.asarray(
-                sum(
-                    w * image(pupil_field, x, y, single=True)[0] for w, pupil_field in zip(shares, sampled, strict=True)
-                )
-            )
+            pairs = zip(shares, sampled, strict=True)
+            return np.asarray(sum(share * image(light, x, y, single=True)[0] for share, light in pairs))
 
         step = 2.0 * half / (PSF_POINTS - 1)
         grid = Grid(-half, step, PSF_POINTS)
@@ -373,32 +369,19 @@ class _AtField:
         return self.colours.psfs[self.number].strehl if self.colours.psfs else None
 
 
+_COLOUR = {
+    "lateral_primary": "chief-ray position of the shortest wavelength minus that of the longest",
+    "lateral_secondary": "chief-ray position of the reference wavelength minus the mean of both",
+    "axial_primary": "best focus of the shortest wavelength minus that of the longest, downstream positive",
+    "axial_secondary": "best focus of the reference wavelength minus the mean of both",
+}
+"""Attribute of `Colours` with a value for each field -> its meaning."""
 _FIELD: Record[_AtField] = Record(
     "Colour at one field; pairs of numbers are along the line and along the track.",
     Quantity("field", lambda a: a.colours.fields[a.number], "shares of the half field, along the line and the track"),
-    Quantity(
-        "lateral_primary_um",
-        lambda a: a.of(a.colours.lateral_primary),
-        "chief-ray position of the shortest wavelength minus that of the longest",
-        where_known=True,
-    ),
-    Quantity(
-        "lateral_secondary_um",
-        lambda a: a.of(a.colours.lateral_secondary),
-        "chief-ray position of the reference wavelength minus the mean of both",
-        where_known=True,
-    ),
-    Quantity(
-        "axial_primary_um",
-        lambda a: a.of(a.colours.axial_primary),
-        "best focus of the shortest wavelength minus that of the longest, downstream positive",
-        where_known=True,
-    ),
-    Quantity(
-        "axial_secondary_um",
-        lambda a: a.of(a.colours.axial_secondary),
-        "best focus of the reference wavelength minus the mean of both",
-        where_known=True,
+    *(
+        Quantity(f"{name}_um", lambda a, name=name: a.of(getattr(a.colours, name)), text, where_known=True)  # type: ignore[misc]
+        for name, text in _COLOUR.items()
     ),
     Quantity("mtf_at_nyquist", lambda a: a.mtf, "polychromatic MTF of the optics", where_known=True),
     Quantity("strehl", lambda a: a.strehl, "polychromatic Strehl ratio", where_known=True),
@@ -439,11 +422,8 @@ def colour_data(colours: Colours) -> tuple[dict[str, Any], dict[str, Any]]:
         coords["wavelength"] = ("wavelength", colours.wavelengths, {**metres, "long_name": "wavelength of the light"})
     if colours.mtfs:
         dims = ("mtf_field", "direction", "light_frequency")
-        data["light_mtf"] = (
-            dims,
-            np.stack([m.values for m in colours.mtfs]),
-            {"long_name": "polychromatic modulation"},
-        )
+        about = {"long_name": "polychromatic modulation"}
+        data["light_mtf"] = (dims, np.stack([m.values for m in colours.mtfs]), about)
         about = {"long_name": "polychromatic modulation without wavefront error and lateral colour"}
         data["light_mtf_limit"] = (dims, np.stack([m.limit for m in colours.mtfs]), about)
         about = {"units": "1/m", "long_name": "spatial frequency in the image, cycles per length"}

@@ -28,7 +28,7 @@ from scenes.specs.instrument import CENTRAL_PRISM, SIDES, prism_of
 from scenes.yaml.errors import InputError
 from scenes.yaml.spec import validate
 from scenes.yaml.yaml_file import parse_yaml
-from twin.monitor.information import Information, ground_of, information_of, quantity_rows
+from twin.monitor.monitor_derivative import Information, ground_of, information_of, quantity_rows
 from twin.sensors.area_detector import EmvaDetector
 
 _AROUND = 24

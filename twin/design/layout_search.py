@@ -63,7 +63,7 @@ from twin.framework import cluster
 from twin.framework.cli import Incomplete
 from twin.framework.journal import Journal
 from twin.framework.procedure import Advance
-from twin.monitor.information import Information
+from twin.monitor.monitor_derivative import Information
 
 FIRST_BOX = 0.1
 """Initial half-width of the trust region, relative to the range of each parameter."""

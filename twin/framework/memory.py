@@ -1,7 +1,7 @@
 """Memory available to a command, and refusal of a job that needs more before anything is computed.
 
 A job that can need more than 2 GiB is estimated at its start, from its numbers of pixels, frames, rays, points and runs
-(`require_memory`, `twin.monitor.monitor_memory`). Estimates are of the largest resident memory above that of the
+(`require_memory`, `twin.monitor.monitor_experiment`). Estimates are of the largest resident memory above that of the
 started program, and are within a factor of 1.5 of the memory used (tests/limits).
 """
 

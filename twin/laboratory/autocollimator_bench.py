@@ -35,7 +35,7 @@ import numpy as np
 from analysis.arrays import ARCSEC
 from analysis.monitor import autocollimator
 from analysis.spots.centroid import energy_centroid, mean_frames
-from analysis.spots.spot_positions import SpotPositions
+from analysis.spots.spot_image import SpotPositions
 from optics.geometry import zernike
 from optics.geometry.aperture import Circle
 from optics.geometry.pose import Pose, about_axis, rotation_matrix, triple

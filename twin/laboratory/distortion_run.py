@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from analysis.arrays import ARCSEC, MM_PER_M, Array
 from analysis.orientation import interior
-from analysis.spots.spot_positions import SpotError
+from analysis.spots.spot_image import SpotError
 from analysis.statistics import rms
 from analysis.turntable.dividing_error import (
     FITS,

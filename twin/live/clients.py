@@ -380,9 +380,8 @@ class LiveApi:
         """Put back a request during which the process ended, unless it did so twice for this request."""
         self._announce("ended", RESTARTED_TEXT.format(problem))
         if request.asked is self._suspect_message:
-            client.queue_json(
-                {"type": "refused", "problem": f"{problem} twice during the same {request.kind}, which is skipped"}
-            )
+            text = f"{problem} twice during the same {request.kind}, which is skipped"
+            client.queue_json({"type": "refused", "problem": text})
         else:
             self._suspect_message = request.asked
             client.requeue(request)

@@ -17,7 +17,7 @@ import numpy as np
 
 from analysis.monitor import parameters
 from analysis.monitor.parameters import Parameter
-from analysis.spots.spot_positions import SpotError
+from analysis.spots.spot_image import SpotError
 from optics.geometry.tree import PlacedBodies, State
 from scenes.models.disturbances import Component, state_of
 from scenes.models.instrument_model import Instrument

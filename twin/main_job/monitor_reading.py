@@ -188,9 +188,8 @@ class MonitorReading:
             return ()
         parts = split(np.stack([quantity.row for quantity in self._quantities]), prior, noise, prior.best_gain(noise))
         unmeasured = (parts.sigma_before > 0.0) & (parts.sigma > UNMEASURED * parts.sigma_before)
-        return tuple(
-            short_text(quantity) for quantity, repeated in zip(self._quantities, unmeasured, strict=True) if repeated
-        )
+        repeated = zip(self._quantities, unmeasured, strict=True)
+        return tuple(short_text(quantity) for quantity, repeats in repeated if repeats)
 
     @cached_property
     def consistency(self) -> Consistency | None:
@@ -262,9 +261,8 @@ class MonitorReading:
             size = curvature.worst()[1]
             if math.isfinite(size):
                 state = "relinearised" if curvature.beyond[0] and curvature.holds[0] else "linear"
-                meaning = (
-                    f"readings are {state}; above {NONLINEAR_SIGMAS:g} sigma relinearised, else sigma does not hold"
-                )
+                limit = f"above {NONLINEAR_SIGMAS:g} sigma relinearised, else sigma does not hold"
+                meaning = f"readings are {state}; {limit}"
                 yield SelfCheck(f"linear readings of {name} against the retraced state", size, None, "sigma", meaning)
 
     def recovered_dict(self) -> dict[str, Any]:
@@ -279,18 +277,11 @@ class MonitorReading:
                 "after": {**_spot(r.after[0, i], r.sigma_after[0, i]), **_fit(fits[1], i)},
             }
         share, retraced = self.from_statement, {name: self._retraced(name) for name in r.curvature}
-        return {
-            **{
-                "cameras": groups.pop("cameras"),
-                "spots": spots,
-                **groups,
-                "disturbances": self._consistency_plain(self.consistency),
-            },
-            **({"from_statement": share} if share else {}),
-            **({"retraced": retraced} if retraced else {}),
-            **{"sigma_holds": self.sigma_holds, "doubts": list(self.doubts)},
-            **{"centroid": self.centroid, "frames": self.frames},
-        }
+        out = {"cameras": groups.pop("cameras"), "spots": spots, **groups}
+        out["disturbances"] = self._consistency_plain(self.consistency)
+        out |= ({"from_statement": share} if share else {}) | ({"retraced": retraced} if retraced else {})
+        out |= {"sigma_holds": self.sigma_holds, "doubts": list(self.doubts)}
+        return out | {"centroid": self.centroid, "frames": self.frames}
 
     def _retraced(self, name: str) -> dict[str, Any]:
         """Return the comparison of an estimator's linear estimates with a ray trace of the estimated state."""
@@ -309,12 +300,8 @@ class MonitorReading:
         name = None if self.disturbances is None else self.disturbances.name
         numbers = {key: None if test is None else number(test) for key, number in _TEST_KEYS.items()}
         suspects = [
-            {
-                "body": suspect.body,
-                "times_stated": _to_digits(suspect.times),
-                "log_likelihood_gain": _to_digits(suspect.gain),
-            }
-            for suspect in (test.suspects if test is not None else ())
+            {"body": s.body, "times_stated": _to_digits(s.times), "log_likelihood_gain": _to_digits(s.gain)}
+            for s in (test.suspects if test is not None else ())
         ]
         return {"name": name, **numbers, "suspects": suspects}
 
@@ -477,9 +464,4 @@ _FIT = {
 
 
 def _spot(position: np.ndarray, sigma: np.ndarray) -> dict[str, float]:
-    return {
-        "row": float(position[0]),
-        "column": float(position[1]),
-        "row_sigma": float(sigma[0]),
-        "column_sigma": float(sigma[1]),
-    }
+    return dict(zip(("row", "column", "row_sigma", "column_sigma"), map(float, (*position, *sigma)), strict=True))

@@ -49,16 +49,16 @@ def quality_section(run: JobRun, drawn: Mapping[str, str]) -> Section | None:
         bands[len(rows)] = f"Camera {name}, MTF with the pixel in light of {light}, Nyquist {nyquist} cycles/mm"
         rows += _quality_rows(name, camera, quality)
     bodies = "; ".join(f"in {name} {', '.join(camera.bodies) or 'nothing'}" for name, camera in quality.cameras.items())
-    obstruction_text = (
-        f"The pupils include the obstruction by bodies in the beams: {bodies}." if quality.obstruction else ""
-    )
+    obstruction_text = f"{FREE[0].upper()}{FREE[1:]}."
+    if quality.obstruction:
+        obstruction_text = f"The pupils include the obstruction by bodies in the beams: {bodies}."
     caption = (
         "At fixed pixels of each line CCD, at its middle and at its left (+Y′) and right end. "
         f"Wavefront errors are rms over the pupil at {plain(1e9 * WAVELENGTH)} nm, without piston and tilt. "
         "Best focus is counted along the light: + is behind the CCD. The MTF with the pixel is that of the traced "
         "pupil over the named light, times the pixel's and, where the camera describes them, those of charge "
         "diffusion and TDI; `python -m twin.camera` has that of the optics alone. "
-        f"{obstruction_text or f'{FREE[0].upper()}{FREE[1:]}.'} Means and worst values: "
+        f"{obstruction_text} Means and worst values: "
         f"`quality.json`. The CSV has all {len(quality.fields)} fields."
     )
     parts: list[Artefact] = [
@@ -109,15 +109,8 @@ def _table_of_all_fields(quality: ImageQuality) -> Table:
         values = [quantity.shown_value(quantity.value(camera)) for quantity in AT_FIELDS]
         for s, when in enumerate(_WHEN):
             for k, field in enumerate(quality.fields):
-                rows.append(
-                    [
-                        name,
-                        when,
-                        float(field),
-                        positions.get(k, ""),
-                        *(float(quantity_values[s, k]) for quantity_values in values),
-                    ]
-                )
+                numbers = (float(quantity_values[s, k]) for quantity_values in values)
+                rows.append([name, when, float(field), positions.get(k, ""), *numbers])
     heads = ["camera", "state", "field", "place", *(quantity.shown_head for quantity in AT_FIELDS)]
     return Table("quality", "Image quality", "", heads, rows)
 
@@ -200,18 +193,8 @@ def _mtf_table(targets: TargetRun, kinds: list[str]) -> Table:
             " Bars are tilted at the Nyquist frequency; their fundamental is normalised by frames with the shutter "
             "closed and of uniform light, since in an area beside the bars diffraction tails lower the contrast by 1 %."
         )
-    heads = [
-        "camera",
-        "band",
-        "place",
-        "direction",
-        "state",
-        "target",
-        "MTF with the pixel at Nyquist",
-        "sigma",
-        "true",
-    ]
-    heads += ["along the line [cycles/px]", "along the track [cycles/px]", "true on the axis"]
+    heads = ["camera", "band", "place", "direction", "state", "target", "MTF with the pixel at Nyquist", "sigma"]
+    heads += ["true", "along the line [cycles/px]", "along the track [cycles/px]", "true on the axis"]
     return Table(
         "mtf",
         "MTF with the pixel at Nyquist, measured (±1 σ from noise) and true; move of the image on the line CCD, traced",
@@ -269,27 +252,21 @@ def stray_section(run: RenderRun) -> Section | None:
     surfaces: list[list[Cell]] = []
     full: list[dict[str, Any]] = []
     for i, channel in enumerate(run.experiment.path.channels):
-        detected = [
-            family
-            for family in after.traced.relative(channel.key)
-            if family.family.detector == f"{channel.key}/area_ccd"
-        ]
-        by_kind = [
-            sum(family.share for family in detected if family.family.kind == kind) for kind in ("ghost", "stray")
-        ]
+        here = f"{channel.key}/area_ccd"
+        detected = [f for f in after.traced.relative(channel.key) if f.family.detector == here]
+        by_kind = [sum(f.share for f in detected if f.family.kind == kind) for kind in ("ghost", "stray")]
         amounts.append([channel.key, float(shares[i]), *by_kind, float(after.photons[i].max())])
         records = [FAMILY(family) for family in detected]
         full += [{**family, "surfaces": " ".join(family["surfaces"])} for family in records]
         for family in records[:_STRONGEST]:
-            size = (
-                f"{significant(family['relative_to_nominal'])} ± {significant(family['relative_to_nominal_sigma'], 1)}"
-            )
-            numbers = (
-                Marked(text, "", "number") for text in (size, fixed(family["x_um"], 1), fixed(family["y_um"], 1))
-            )
-            families.append([channel.key, family["kind"], family["name"], *numbers])
+            share, sigma = family["relative_to_nominal"], family["relative_to_nominal_sigma"]
+            size = f"{significant(share)} ± {significant(sigma, 1)}"
+            numbers = (size, fixed(family["x_um"], 1), fixed(family["y_um"], 1))
+            cells = (Marked(text, "", "number") for text in numbers)
+            families.append([channel.key, family["kind"], family["name"], *cells])
             surfaces.append([channel.key, family["name"], _surface_list(family["surfaces"]) or "not identified"])
     keys = [*(family.key for family in FAMILY if family.key != "surfaces"), "surfaces"]
+    amount_heads = ("area CCD", "all / spot", "ghosts / spot", "scattered / spot", "brightest pixel [photons]")
     parts: list[Artefact] = [
         Table(
             "stray-families",
@@ -301,16 +278,7 @@ def stray_section(run: RenderRun) -> Section | None:
             within=IN_PAGE,
             full=FAMILY.table("stray_families", "Families", "", full, keys),
         ),
-        Table(
-            "stray",
-            "Amounts",
-            "",
-            ("area CCD", "all / spot", "ghosts / spot", "scattered / spot", "brightest pixel [photons]"),
-            amounts,
-            (),
-            3,
-            within=IN_PAGE,
-        ),
+        Table("stray", "Amounts", "", amount_heads, amounts, digits=3, within=IN_PAGE),
         Table(
             "stray_surfaces",
             "Surface by surface",
@@ -366,13 +334,8 @@ def finish_section(run: RenderRun) -> Section | None:
                 total = scatter.table.total(float(angle))
                 unequal: Cell = "" if np.isnan(rms) else 100.0 * rms
                 rows.append((kind, float(np.degrees(angle)), 100.0 * total, 100.0 * specified, unequal))
-        heads = (
-            "surfaces",
-            "incidence [deg]",
-            "total scatter [%]",
-            "specified in the file [%]",
-            "not reciprocal [% rms]",
-        )
+        heads = ["surfaces", "incidence [deg]", "total scatter [%]", "specified in the file [%]"]
+        heads += ["not reciprocal [% rms]"]
         text = "Shares of the incident light. Total scatter is the integral of the table, which the paths use."
         tables.append(Table("finish_scatter", "Measured scattering", text, heads, rows, (), 4))
     if measured.coatings:

@@ -139,14 +139,9 @@ def _images(run: RenderRun, first: str, coordinate: Gridded, photons: np.ndarray
     The coordinate of the first axis is attached.
     """
     path = run.experiment.path
+    about = {"units": "photons", "long_name": "expected photons per pixel and frame"}
     return GridData(
-        {
-            "photons": (
-                (first, "channel", "row", "column"),
-                photons,
-                {"units": "photons", "long_name": "expected photons per pixel and frame"},
-            )
-        },
+        {"photons": ((first, "channel", "row", "column"), photons, about)},
         {
             first: coordinate,
             "channel": ("channel", [c.key for c in path.channels], {"long_name": "camera and side of the area CCD"}),
@@ -165,32 +160,24 @@ def _images(run: RenderRun, first: str, coordinate: Gridded, photons: np.ndarray
 
 def table_names(job: JobSpec) -> Mapping[tuple[str, str], str]:
     """Return (body, key of its perturbation) -> name of the table of nodes in the run folder."""
-    named = {
-        (path, kind): spec.table
+    return {
+        (path, kind): f"{kind}/{path.replace('/', '_')}{PurePath(spec.table).suffix.lower()}"
         for path, what in job.perturb.items()
         for kind, spec in (("deformation", what.deformation), ("temperature", what.temperature))
         if spec is not None and spec.table is not None
     }
-    return FrozenMap(
-        {
-            (path, kind): f"{kind}/{path.replace('/', '_')}{PurePath(table).suffix.lower()}"
-            for (path, kind), table in named.items()
-        }
-    )
 
 
 def finish_tables(job: JobSpec) -> Mapping[tuple[str, str], FinishTableSpec]:
     """Return (kind of surface, measured quantity) -> table of a surface finish (scatter, coating) for stray light."""
     stray = job.render.stray
-    return FrozenMap({} if stray is None or stray.finishes is None else stray.finishes.tables)
+    return {} if stray is None or stray.finishes is None else stray.finishes.tables
 
 
 def finish_names(job: JobSpec) -> Mapping[tuple[str, str], str]:
     """Return (kind of surface, measured quantity) -> file name of its table of a surface finish in the run folder."""
     tables = finish_tables(job).items()
-    return FrozenMap(
-        {(kind, what): f"finish/{kind}_{what}{PurePath(t.table).suffix.lower()}" for (kind, what), t in tables}
-    )
+    return {(kind, what): f"finish/{kind}_{what}{PurePath(t.table).suffix.lower()}" for (kind, what), t in tables}
 
 
 def config_text(resolved: ResolvedJob) -> str:
@@ -294,9 +281,7 @@ def deformation_warnings(faces: Mapping[str, NodalDeformation], planes: Collecti
         for path, size in ignored.items()
     ]
     for path, face in faces.items():
-        residual, between, lost = (
-            1e9 * value for value in (face.rms(face.residual), face.between, face.rms(face.lost))
-        )
+        residual, between, lost = (1e9 * size for size in (face.rms(face.residual), face.between, face.rms(face.lost)))
         if face.printed_through:
             warnings.append(
                 f"{path}: the mesh is too coarse for the residual of {residual:.3g} nm after Z{max(face.figure)}: it "

@@ -25,15 +25,8 @@ from twin.framework.procedure import WRITE, Session
 from twin.framework.report import Report, Section, further_sections
 from twin.framework.run_folder import write_manifest
 from twin.framework.second_process import SecondProcess
+from twin.main_job import part_sections
 from twin.main_job.crosstalk_sections import crosstalk_section, formula_section, motion_section
-from twin.main_job.part_sections import (
-    deformation_section,
-    finish_section,
-    heat_section,
-    quality_section,
-    stray_section,
-    target_section,
-)
 from twin.main_job.render_files import config_text, write_results
 from twin.main_job.render_results import PROGRAM, JobRun, RenderRun
 from twin.main_job.result_sections import (
@@ -84,12 +77,13 @@ def write_run(run: JobRun, session: Session, picture: bool = False, beside: Seco
     if isinstance(run, RenderRun):
         beside.start(limits_drawing(run.limits))
     write_results(run, folder)
-    sections = [section for section in (deformation_section(run), heat_section(run)) if section is not None]
+    of_tables = part_sections.deformation_section(run), part_sections.heat_section(run)
+    sections = [section for section in of_tables if section is not None]
     drawn, missing = without_failed(beside.results())
     if isinstance(run, RenderRun):
         from twin.uncertainty.uncertainty_report import limits_section  # slow to import
 
-        finishes = finish_section(run)
+        finishes = part_sections.finish_section(run)
         sections += [*(() if finishes is None else (finishes,)), limits_section(run.limits, figure=drawn.get(LIMITS))]
     sections += further_sections("render", run)
     for name, file in FILES.items():
@@ -173,14 +167,10 @@ def render_report(
         setup_section(run),
         _instrument(drawn["side"], pictures, viewer_markup(bodies) if scene else Markup(), monitored is not None),
         *((spot_section(monitored, drawn), residual_section(monitored, drawn)) if monitored else ()),
-        quality_section(run, drawn),
-        target_section(run, drawn),
-        *(
-            (stray_section(monitored), motion_section(monitored, drawn), crosstalk_section(monitored))
-            if monitored
-            else ()
-        ),
-        formula_section(monitored) if monitored else None,
+        part_sections.quality_section(run, drawn),
+        part_sections.target_section(run, drawn),
+        *((part_sections.stray_section(monitored), motion_section(monitored, drawn)) if monitored else ()),
+        *((crosstalk_section(monitored), formula_section(monitored)) if monitored else ()),
         _light(drawn, monitored is not None),
         *sections,
     )
@@ -230,12 +220,11 @@ def _light(drawn: Mapping[str, str], monitored: bool) -> Section:
         "Clear apertures and footprints on every mirror, in the mirror's own frame (origin at the parent's vertex). "
         "Imaging beams of the line CCD's ends and centre fill the apertures"
     )
-    caption += (
-        "; the monitor's beams, limited by the return face, use a small part off the middle, out and back. A wavefront "
-        "or focus error over that part moves the spot, so that defocus is read as a rotation."
-        if monitored
-        else "."
+    of_monitor = (
+        "the monitor's beams, limited by the return face, use a small part off the middle, out and back. A wavefront "
+        "or focus error over that part moves the spot, so that defocus is read as a rotation"
     )
+    caption += f"; {of_monitor}." if monitored else "."
     footprints = figure(drawn, "footprints", caption)
     return Section("Light path and footprints", (), (footprints,), name="light", closed=True)
 
@@ -342,10 +331,10 @@ def _of_monitor(run: RenderRun) -> dict[str, Callable[[], Any]]:
     out[IRRADIANCE] = _drawing("render_files:irradiance_file", run)
     if (series := run.series) is not None:
         titles = {name: estimator.title for name, estimator in run.estimators.items()}
-        out["course"] = _drawing("series_plots:parameters_svg", series, titles)
-        out["temperatures"] = _drawing("series_plots:temperatures_svg", series)
+        out["course"] = _drawing("spot_plots:parameters_svg", series, titles)
+        out["temperatures"] = _drawing("spot_plots:temperatures_svg", series)
         if series.smoothed is not None:
-            out["smoothed"] = _drawing("series_plots:smoothed_svg", series)
+            out["smoothed"] = _drawing("spot_plots:smoothed_svg", series)
     out["glance"] = _drawing("spot_plots:glance_svg", run)
     out[SUMMARY] = _drawing("spot_plots:summary_png", run)
     out["residuals"] = _drawing("spot_plots:residuals_svg", run)

@@ -10,7 +10,7 @@ from functools import partial
 import numpy as np
 
 from analysis.monitor.recovery import recover_monitor
-from analysis.spots.spot_positions import SpotError
+from analysis.spots.spot_image import SpotError
 from optics.geometry.tree import State, compose
 from optics.numerics.array_math import UnphysicalError
 from optics.numerics.backend import Backend
@@ -32,8 +32,7 @@ from twin.main_job.render_results import JobRun, RenderRun, StrayPair
 from twin.monitor.crosstalk import crosstalk
 from twin.monitor.image_quality import ImageQuality, image_quality
 from twin.monitor.monitor_beams import SpotFocus
-from twin.monitor.monitor_experiment import MonitorExperiment
-from twin.monitor.monitor_memory import require_memory
+from twin.monitor.monitor_experiment import MonitorExperiment, require_memory
 from twin.monitor.observation import LOST, ObservationOptions, light_of, read
 from twin.monitor.time_series import run_series, series_states, too_large
 from twin.path_tracing.stray_light import NominalPathLost, StrayLight, ghost_warnings, stray_light
@@ -311,10 +310,8 @@ def _image_warnings(
 ) -> tuple[str, ...]:
     if targets is None and quality is None:
         return ()
-    models = {model.spec.name: model for model in experiment.instrument.cameras.values()}
-    shadows = {
-        name: unmodelled_obscuration(model, obscuration(model, experiment.backend)) for name, model in models.items()
-    }
+    backend, models = experiment.backend, {m.spec.name: m for m in experiment.instrument.cameras.values()}
+    shadows = {name: unmodelled_obscuration(model, obscuration(model, backend)) for name, model in models.items()}
     return (
         *(f"camera {name}: {text}" for name, text in shadows.items() if text),
         *(targets.warnings if targets is not None else ()),
@@ -395,12 +392,8 @@ def _too_large(resolved: ResolvedJob, reason: str) -> InputError:
     allowed = "smaller motions, which keep the beams on the mirrors and the spots on their CCDs"
     if any(what.deformation is not None for what in resolved.job.perturb.values()):
         allowed += "; with a table of rippled nodes, a job without image quality and targets"
-    return resolved.job.error(
-        f"the perturbed instrument cannot be rendered: {reason}",
-        ("perturb",),
-        found=f"motions of {moved}",
-        allowed=allowed,
-    )
+    text, found = f"the perturbed instrument cannot be rendered: {reason}", f"motions of {moved}"
+    return resolved.job.error(text, ("perturb",), found=found, allowed=allowed)
 
 
 def _no_spots(experiment: MonitorExperiment, reason: str) -> InputError:
@@ -425,9 +418,8 @@ def _mounted_facets(experiment: MonitorExperiment) -> str:
         return advice
     bodies = {body.path: body for body in instrument.assembly.tree.bodies}
     positions = as_built_of(compose(instrument.as_built, rotations, bodies))
-    return (
-        f"{advice}; or facets aligned when mounted: {perturbation_text({path: positions[path] for path in rotations})}"
-    )
+    aligned = perturbation_text({path: positions[path] for path in rotations})
+    return f"{advice}; or facets aligned when mounted: {aligned}"
 
 
 def _unmeasured(experiment: MonitorExperiment, before: np.ndarray, error: SpotError, focus: SpotFocus) -> InputError:

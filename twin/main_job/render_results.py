@@ -233,9 +233,8 @@ class RenderRun(JobRun):
         """Checks of images and estimated changes, and of the energy balance of stray light."""
         out = [*self.experiment.path.checked.self_checks(), *self.reading.checks]
         if self.worst_of_course is not None:
-            out.append(
-                prior_check("worst time of the course against the prior on disturbances", self.worst_of_course[1])
-            )
+            what = "worst time of the course against the prior on disturbances"
+            out.append(prior_check(what, self.worst_of_course[1]))
         if self.stray is not None:
             for when, light in (("before", self.stray.before), ("after", self.stray.after)):
                 error = max((abs(path.balance.error) for path in light.traced.runs.values()), default=0.0)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -92,27 +92,28 @@ def result_tables(run: JobRun) -> tuple[Table, ...]:
 def _change_table(run: JobRun) -> Table:
     """Return the table of true changes of the cameras, of the angle between two, and on the ground."""
     rows: list[list[Cell]] = []
-    bands: dict[int, str] = {}
+    full: list[list[Cell]] = []
+    titles = []
     for group, parameter, value in run.true_changes():
-        title = {ANGLE_GROUP: _ANGLE_TITLE, GROUND_GROUP: _GROUND_TITLE}.get(group, f"Camera {group}")
-        if title not in bands.values():
-            bands[len(rows)] = title
-        key = f"{group}.{parameter.key}"
-        label = Marked(parameter.label, parameter.meaning, "text")
-        rows.append([label, Marked(fixed(value, parameter.decimals, sign=True), "", "truth", key)])
-    full: list[list[Cell]] = [
-        [group, parameter.symbol, parameter.unit, value] for group, parameter, value in run.true_changes()
-    ]
+        titles.append({ANGLE_GROUP: _ANGLE_TITLE, GROUND_GROUP: _GROUND_TITLE}.get(group, f"Camera {group}"))
+        change = Marked(fixed(value, parameter.decimals, sign=True), "", "truth", f"{group}.{parameter.key}")
+        rows.append([Marked(parameter.label, parameter.meaning, "text"), change])
+        full.append([group, parameter.symbol, parameter.unit, value])
     return Table(
         "results",
         "Changes, by exact chief rays",
         "Perturbed minus nominal. Angles are right-handed about the camera's axes; Δf refers to pixels of its line.",
         ("Parameter", "change"),
         rows,
-        bands=bands,
+        bands=_bands(titles),
         within=IN_PAGE,
         full=Table("results", "Results", "", ["of", "parameter", "unit", "change"], full),
     )
+
+
+def _bands(titles: Sequence[str]) -> dict[int, str]:
+    """Return number of the first row -> title, from the titles of all rows of a table, one after the other."""
+    return {k: title for k, title in enumerate(titles) if title not in titles[:k]}
 
 
 def part_title(run: RenderRun, reading: Reading, nominal: bool = True) -> str:
@@ -157,14 +158,10 @@ def _value_and_sigma(run: RenderRun, label: str) -> list[str]:
 def _state_table(run: RenderRun, name: str, title: str) -> Table:
     table = run.reading.table
     rows: list[list[Cell]] = []
-    bands: dict[int, str] = {}
     good = dict.fromkeys(run.estimators, 0)
     has_prior = run.experiment.stated is not None
     for rows_of_change in table.by_change():
         first, p = rows_of_change[0], rows_of_change[0].parameter
-        heading = part_title(run, first)
-        if heading not in bands.values():
-            bands[len(rows)] = heading
         key = first.group if first.where == "both" else f"{first.group}.{p.key}"
         finest = min((reading.sigma for reading in rows_of_change if reading.sigma > 0), default=0.0)
         row: list[Cell] = [_label(first), Marked(fixed(first.true, decimals_for(finest)), "", "truth", f"{key}.true")]
@@ -185,37 +182,27 @@ def _state_table(run: RenderRun, name: str, title: str) -> Table:
         + ("The noise part of other estimators is shown when pointing at a value. " if has_prior else "")
         + f"Below each value (recovered − true) in σ, ● within {FAR:g} σ, ▲ beyond. Within {FAR:g} σ: {within}."
     )
-    return Table(
-        "recovered",
-        title,
-        caption,
-        [*heads, *([f"σ of noise, {run.estimators[run.judged].title}"] if has_prior else ())],
-        rows,
-        bands=bands,
-        within=IN_PAGE,
-        full=_all_digits(run, name, table, False),
+    heads += [f"σ of noise, {run.estimators[run.judged].title}"] if has_prior else []
+    bands, full = (
+        _bands([part_title(run, first) for first, *_ in table.by_change()]),
+        _all_digits(run, name, table, False),
     )
+    return Table("recovered", title, caption, heads, rows, bands=bands, within=IN_PAGE, full=full)
 
 
 def _course_table(run: RenderRun, series: TimeSeries) -> Table:
     rows: list[list[Cell]] = []
-    bands: dict[int, str] = {}
     table = series.readings.rms
     for rows_of_change in table.by_change():
         first = rows_of_change[0]
         values = series.readings.row(first.group, first.parameter.key, first.estimator).true
-        heading = part_title(run, first, nominal=False)
-        if heading not in bands.values():
-            bands[len(rows)] = heading
         key = f"course.{first.camera}.{first.parameter.key}" if first.camera else "course.angle"
         finest = decimals_for(min(reading.sigma for reading in rows_of_change))
         row: list[Cell] = [_label(first), Marked(_range(values, finest), "", "truth", f"{key}.true")]
         for reading in rows_of_change:
-            far = reading.sigma > 0.0 and reading.far
-            below = f"{'▲' if far else '●'} σ {reading.shown(reading.sigma)}"
-            row.append(
-                Marked(reading.shown(reading.error), below, "far" if far else "near", f"{key}.{reading.estimator}")
-            )
+            mark, kind = ("▲", "far") if reading.sigma > 0.0 and reading.far else ("●", "near")
+            below = f"{mark} σ {reading.shown(reading.sigma)}"
+            row.append(Marked(reading.shown(reading.error), below, kind, f"{key}.{reading.estimator}"))
         rows.append(row)
     return Table(
         "errors",
@@ -223,7 +210,7 @@ def _course_table(run: RenderRun, series: TimeSeries) -> Table:
         f"● error within {FAR:g} σ, ▲ beyond. {_worst(run, series)}",
         ["Parameter", "true, range", *(estimator.title for estimator in run.estimators.values())],
         rows,
-        bands=bands,
+        bands=_bands([part_title(run, first, nominal=False) for first, *_ in table.by_change()]),
         within=IN_PAGE,
         full=_all_digits(run, "results", table, True),
     )
@@ -246,11 +233,7 @@ def glance_table(run: RenderRun) -> Table:
     over, estimator = run.series is not None, run.estimators[run.judged]
     readings = run.series.readings.rms if run.series is not None else run.reading.table
     rows: list[list[Cell]] = []
-    bands: dict[int, str] = {}
     for reading in readings.of(run.judged):
-        heading = part_title(run, reading, nominal=False)
-        if heading not in bands.values():
-            bands[len(rows)] = heading
         label = Marked(reading.parameter.label, "", "text", hint=reading.parameter.meaning)
         shown = reading.shown(reading.error if over else reading.value)
         ratio = residual(reading.error, reading.sigma)
@@ -261,6 +244,7 @@ def glance_table(run: RenderRun) -> Table:
     heads = ("Parameter", "true, RMS" if over else "true", f"error by {estimator.title}" if over else estimator.title)
     title = f"Recovered by the {estimator.title}"
     full = _all_digits(run, "glance", readings, over)
+    bands = _bands([part_title(run, reading, nominal=False) for reading in readings.of(run.judged)])
     return Table("glance-table", title, caption, heads, rows, bands=bands, within=IN_PAGE, full=full)
 
 
@@ -442,14 +426,12 @@ def residual_section(run: RenderRun, drawn: Mapping[str, str]) -> Section:
     )
     caption = f"Recovered minus true in σ; shaded ±{FAR:g} σ. {assumed(run.reading)}. {far}"
     drawing = figure(drawn, "residuals", caption)
+    explained_heads = ("expected from the crosstalk table", "unexplained", "in σ of noise")
     table = Table(
         "explained",
         f"Residuals of {title}, and the part explained by the crosstalk table",
         "",
-        (
-            *("Camera", "Parameter", f"{title} − true", "in σ", "expected from the crosstalk table", "unexplained"),
-            "in σ of noise",
-        ),
+        ("Camera", "Parameter", f"{title} − true", "in σ", *explained_heads),
         rows,
         within=IN_PAGE,
         full=Table("residuals", "Residuals", "", [*heads, "unexplained"], full),
@@ -471,8 +453,8 @@ def facts(run: JobRun) -> tuple[tuple[str, str], ...]:
     as_built_fact = () if not spec.as_built else (("As built", f"{perturbation_text(spec.as_built)}. {_BUILT}"),)
     expansion_text = (
         "Structures expand freely and carry the bodies on them, mirrors and prisms bend (finite elements), and the "
+        "index of glass changes."
     )
-    expansion_text += "index of glass changes."
     if not isinstance(run, RenderRun):
         without = "The instrument has no monitor: changes are from the exact trace, and nothing is measured."
         return ("Assumptions", f"{without} {expansion_text}"), instrument_fact, *as_built_fact
@@ -480,16 +462,11 @@ def facts(run: JobRun) -> tuple[tuple[str, str], ...]:
     fields = [float(np.degrees(channel.field)) for name in spec.cameras for channel in spec.channels_of(name).values()]
     family = "; ".join(e.title for e in run.estimators.values() if not e.needs_prior)
     judged = run.estimators[run.judged].title
+    covered = f"σ covers this error for motions of the prior. The {judged} weighs them against the noise. "
     about = (
         "These estimators assume shifts of the line CCD along X and Y, its rotation about Z and a scale of the whole "
         f"optics: {family}. They read any other motion as a mixture of these, an error that more frames do not reduce "
-        "(Residuals, Crosstalk). "
-        + (
-            f"σ covers this error for motions of the prior. The {judged} weighs them against the noise. "
-            if has_prior
-            else ""
-        )
-        + expansion_text
+        f"(Residuals, Crosstalk). {covered if has_prior else ''}{expansion_text}"
     )
     return (
         ("Assumptions", about),
@@ -640,9 +617,7 @@ def _shown(run: JobRun) -> int | None:
 
 def _heated(run: JobRun) -> int:
     """Return the number of bodies whose temperature is not nominal, faces of prisms not counted."""
-    job = run.resolved.job
-    time = _shown(run)
-    fields = run.experiment.thermal.fields(run.experiment.fields(job, time))
+    fields = run.experiment.thermal.fields(run.experiment.fields(run.resolved.job, _shown(run)))
     return sum(path in run.experiment.thermal.materials and field != Temperature() for path, field in fields.items())
 
 

@@ -21,9 +21,9 @@ from twin.main_job.monitor_reading import MonitorReading, contradicted
 from twin.main_job.render_results import RenderRun
 from twin.monitor.crosstalk import CameraCrosstalk
 from twin.monitor.monitor_derivative import LOST, traced_states
-from twin.monitor.motions import ElementaryMotion
 from twin.monitor.reading_table import Reading
 from twin.monitor.time_series import SmoothedCourse
+from twin.monitor.truth import ElementaryMotion
 from twin.uncertainty.monitor_limits import short_text, unit_text
 
 _FAMILY = 4
@@ -62,9 +62,8 @@ class Systematics:
 
 def systematics(run: RenderRun, camera: str) -> Systematics:
     """Return the systematic errors of a camera's estimates: the crosstalk per unit times the motions of a run."""
-    amounts = {
-        name: np.array([_amount(run, motion) for motion in table.motions]) for name, table in run.crosstalk.items()
-    }
+    tables = run.crosstalk.items()
+    amounts = {name: np.array([_amount(run, motion) for motion in table.motions]) for name, table in tables}
     k = list(run.crosstalk).index(camera)
     rows = slice(4 * k, 4 * k + 4)
     moved = np.concatenate([table.spot_shift @ amounts[name] for name, table in run.crosstalk.items()])
@@ -142,9 +141,8 @@ def _uncovered(run: RenderRun, camera: str, table: CameraCrosstalk) -> tuple[str
     uncovered = []
     perturbations = run.resolved.job.perturb
     for path, motion in run.state.items():
-        if path not in (camera_body, CENTRAL_PRISM) and not path.startswith(
-            (f"{camera_body}/", f"{CENTRAL_PRISM}/{camera}_")
-        ):
+        parts = f"{camera_body}/", f"{CENTRAL_PRISM}/{camera}_"
+        if path not in (camera_body, CENTRAL_PRISM) and not path.startswith(parts):
             continue
         deformed = path in perturbations and perturbations[path].deformation is not None
         if (motion.expansion and not deformed) or motion.index or any(motion.index_gradient):

@@ -14,25 +14,12 @@ from scipy.spatial import cKDTree
 
 from optics.targets.target_shapes import TARGETS
 from optics.thermal.nodal_deformation import NodalDeformation
-from twin.framework.svg import (
-    BLUE,
-    GREY,
-    INK,
-    LIGHT,
-    ORANGE,
-    SKY,
-    VERMILION,
-    look,
-    new_figure,
-    plain_axes,
-    signed_map,
-    to_svg,
-)
+from twin.framework import svg
 from twin.monitor.image_quality import POSITIONS, ImageQuality, PupilOutline
 from twin.targets.target_images import DIRECTION_NAMES, DIRECTIONS
 from twin.targets.target_measurement import NYQUIST, BarReading, CameraTargets, EdgeReading
 
-COLOURS = {"before": BLUE, "after": VERMILION}
+COLOURS = {"before": svg.BLUE, "after": svg.VERMILION}
 MARKS = {"before": "o", "after": "D"}
 BAND = 2.0
 """Half-width of the uncertainty band about zero in the panels of MTF differences, in sigmas."""
@@ -60,8 +47,8 @@ PEAK_TO_LINEAR = 100.0
 
 def curves_svg(name: str, camera: CameraTargets) -> str:
     """Draw measured and true MTF, a row for each direction and a column for each position in the field."""
-    with look(f"mtf-{name}"):
-        figure = new_figure(8.4)
+    with svg.look(f"mtf-{name}"):
+        figure = svg.new_figure(8.4)
         heights = (3.0, 1.2) * len(DIRECTIONS)
         panels = figure.subplots(
             len(heights), len(camera.places), sharex=True, sharey="row", squeeze=False, height_ratios=heights
@@ -71,11 +58,11 @@ def curves_svg(name: str, camera: CameraTargets) -> str:
                 axes, below = panels[2 * row : 2 * row + 2, column]
                 nyquist = 1e-3 * NYQUIST / camera.pitch
                 for panel in (axes, below):
-                    plain_axes(panel)
-                    panel.grid(color=LIGHT, lw=0.5)
+                    svg.plain_axes(panel)
+                    panel.grid(color=svg.LIGHT, lw=0.5)
                     panel.set_axisbelow(True)
-                    panel.axvline(nyquist, color=GREY, lw=0.9, ls=(0, (1, 2)), zorder=0)
-                below.axhline(0.0, color=GREY, lw=0.8)
+                    panel.axvline(nyquist, color=svg.GREY, lw=0.9, ls=(0, (1, 2)), zorder=0)
+                below.axhline(0.0, color=svg.GREY, lw=0.8)
                 for when, shots in targets.shots.items():
                     _curve(axes, when, shots.edges[direction])
                     _difference(below, when, shots.edges[direction])
@@ -96,7 +83,7 @@ def curves_svg(name: str, camera: CameraTargets) -> str:
         figure.align_ylabels()
         unique = dict(zip(labels, handles, strict=True))
         figure.legend(unique.values(), unique.keys(), loc="outside upper center", ncols=len(unique))
-        return to_svg(figure)
+        return svg.to_svg(figure)
 
 
 def _curve(axes: Axes, when: str, edge: EdgeReading) -> None:
@@ -141,8 +128,10 @@ def images_svg(name: str, camera: CameraTargets) -> str:
     """Draw mean images: a row for each target, columns for the positions in the field, each before and after."""
     columns = [(position, when) for position in camera.places for when in COLOURS]
     names = [name for name in next(iter(camera.places.values())).before.frames if name in {*_IMAGE_NAMES, *TARGETS}]
-    with look(f"targets-{name}"):
-        figure = new_figure(0.45 + 1.68 * len(names), {"w_pad": 0.02, "h_pad": 0.02, "wspace": 0.01, "hspace": 0.01})
+    with svg.look(f"targets-{name}"):
+        figure = svg.new_figure(
+            0.45 + 1.68 * len(names), {"w_pad": 0.02, "h_pad": 0.02, "wspace": 0.01, "hspace": 0.01}
+        )
         grid = figure.subplots(len(names), len(columns), squeeze=False)
         for column, (position, when) in enumerate(columns):
             shots = camera.places[position].shots[when]
@@ -158,7 +147,7 @@ def images_svg(name: str, camera: CameraTargets) -> str:
                     axes.set_title(f"{position}, {when}")
                 if column == 0:
                     axes.set_ylabel(_IMAGE_NAMES.get(target, target.replace("_", " ")))
-        return to_svg(figure)
+        return svg.to_svg(figure)
 
 
 _RIM = np.exp(2j * np.pi * np.arange(181) / 180)
@@ -170,8 +159,8 @@ def pupils_svg(quality: ImageQuality) -> str:
     Shadows of the nominal state are filled, those of the perturbed state outlined.
     """
     where = {position: quality.fields.index(field) for position, field in POSITIONS.items()}
-    with look("pupils"):
-        figure = new_figure(0.6 + 2.9 * len(quality.cameras))
+    with svg.look("pupils"):
+        figure = svg.new_figure(0.6 + 2.9 * len(quality.cameras))
         panels = figure.subplots(len(quality.cameras), len(where), squeeze=False, sharex=True, sharey=True)
         for row, (name, camera) in zip(panels, quality.cameras.items(), strict=True):
             for axes, (position, k) in zip(row, where.items(), strict=True):
@@ -183,20 +172,20 @@ def pupils_svg(quality: ImageQuality) -> str:
             row[0].set_ylabel("along the track, X\N{PRIME}")
         for axes in panels[-1]:
             axes.set_xlabel("along the line, Y\N{PRIME}")
-        return to_svg(figure)
+        return svg.to_svg(figure)
 
 
 def _draw(axes: Axes, states: list[PupilOutline]) -> None:
     axes.set_aspect("equal")
-    plain_axes(axes)
+    svg.plain_axes(axes)
     for k, pupil in enumerate(states):
         rim = np.stack([_RIM.real, _RIM.imag], axis=-1) @ pupil.axes.T
         if k == 0:
-            axes.add_patch(Polygon(rim, fc=SKY, alpha=0.25, lw=0))
-            axes.plot(*rim.T, color=INK, lw=0.9)
+            axes.add_patch(Polygon(rim, fc=svg.SKY, alpha=0.25, lw=0))
+            axes.plot(*rim.T, color=svg.INK, lw=0.9)
         for piece in pupil.pieces:
-            nominal = Polygon(piece, fc=INK, alpha=0.75, lw=0)
-            axes.add_patch(nominal if k == 0 else Polygon(piece, fill=False, ec=ORANGE, lw=1.1))
+            nominal = Polygon(piece, fc=svg.INK, alpha=0.75, lw=0)
+            axes.add_patch(nominal if k == 0 else Polygon(piece, fill=False, ec=svg.ORANGE, lw=1.1))
     axes.set(xlim=(-1.15, 1.15), ylim=(-1.15, 1.15))
 
 
@@ -210,12 +199,12 @@ def deformation_svg(faces: Mapping[str, NodalDeformation]) -> str:
     They show the change itself, what remains after the Zernike terms are subtracted, and what remains after the
     interpolating grid is subtracted as well.
     """
-    with look("deformation"):
-        figure = new_figure(3.3 * len(faces))
+    with svg.look("deformation"):
+        figure = svg.new_figure(3.3 * len(faces))
         rows = figure.subplots(len(faces), 3, squeeze=False)
         for axes, (path, face) in zip(rows, faces.items(), strict=True):
             _deformation(figure, axes, path, face)
-        return to_svg(figure)
+        return svg.to_svg(figure)
 
 
 def _deformation(figure: Figure, axes: Any, path: str, face: NodalDeformation) -> None:
@@ -234,7 +223,7 @@ def _deformation(figure: Figure, axes: Any, path: str, face: NodalDeformation) -
     ):
         shown = np.where(distance <= 2.0 * face.spacing, 1e9 * values[inside][nearest], np.nan)
         most = max(float(np.nanmax(np.abs(shown))), 1e-6)
-        picture = signed_map(panel, shown, most, extent=ends, origin="lower", interpolation="nearest")
+        picture = svg.signed_map(panel, shown, most, extent=ends, origin="lower", interpolation="nearest")
         panel.set_title(
             f"{title}\n{1e9 * face.rms(values):.3g} nm rms, {1e9 * face.range(values):.3g} nm PV", fontsize=8.5
         )

@@ -118,10 +118,8 @@ def _changed(run: JobRun) -> tuple[str, str]:
         elif not np.isfinite(after):
             worst.append(f"the image quality{camera_text} after it is not known: {camera.reasons[1]}")
         elif moved:
-            worst.append(
-                f"the worst wavefront error{camera_text} goes from {significant(before, 3)} to {significant(after, 3)} "
-                "waves rms"
-            )
+            change = f"from {significant(before, 3)} to {significant(after, 3)} waves rms"
+            worst.append(f"the worst wavefront error{camera_text} goes {change}")
         else:
             worst.append(f"the worst wavefront error{camera_text} is {significant(before, 3)} waves rms")
     share, _, change = sharpness_lost(run.quality)
@@ -148,9 +146,9 @@ def _undetectable(run: RenderRun, rows: tuple[Reading, ...]) -> str:
         for p, sigma_values in sigmas.items()
         if sigma_values
     ]
-    source = (
-        f"with {run.frames} frames the noise of the images hides" if _noise_only(run) else "noise and disturbances hide"
-    )
+    source = "noise and disturbances hide"
+    if _noise_only(run):
+        source = f"with {run.frames} frames the noise of the images hides"
     return f"{source} changes below {', '.join(parts)} ({FAR:g} σ)"
 
 

@@ -21,8 +21,7 @@ from analysis.monitor.monitor_formulas import PER_SI
 from analysis.monitor.parameters import CameraCalibration
 from twin.monitor.monitor_derivative import spot_jacobian
 from twin.monitor.monitor_experiment import MonitorExperiment
-from twin.monitor.motions import ElementaryMotion, line_family, other_motions
-from twin.monitor.truth import truth_jacobian
+from twin.monitor.truth import ElementaryMotion, line_family, other_motions, truth_jacobian
 
 _SEEN_WITHIN = 0.1
 """Largest relative error of an estimate for which the report says that the monitor observes the change."""

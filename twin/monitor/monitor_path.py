@@ -2,7 +2,7 @@
 
 The matrix Fourier transform of a traced beam gives its image on the CCD's own pixels (``optics.waves.diffraction``);
 the pinhole is an incoherent disk imaged at unit magnification. Every image uses as many rays as it needs and is
-checked (``image_sampling``).
+checked (``monitor_beams``).
 """
 
 from __future__ import annotations
@@ -20,18 +20,7 @@ from optics.raytrace.system import changed_bodies
 from optics.waves.diffraction import PixelResponse, UnsampledImageError, image
 from scenes.models.instrument_model import Instrument
 from scenes.specs.instrument import BASE, Channel
-from twin.monitor.image_sampling import (
-    GOOD,
-    SPOT_RANGES,
-    WINGS,
-    WRONG,
-    ImageChecks,
-    NodeClasses,
-    UncertainImageError,
-    energy_excess,
-    quadrature_difference,
-)
-from twin.monitor.monitor_beams import CcdRays, CoarseTrace, MonitorBeams
+from twin.monitor import monitor_beams
 
 _MOST_RAYS = 400_000
 """Largest number of rays traced at once, to limit memory: blurred spots need many."""
@@ -43,7 +32,7 @@ Filters are computed for apertures in this ratio to one another.
 """
 
 
-class MonitorPath(MonitorBeams):
+class MonitorPath(monitor_beams.MonitorBeams):
     """Ray trace and images of the monitor channels of one instrument.
 
     A channel is the light of one pinhole: through the camera to the return face and back to an area CCD.
@@ -76,18 +65,18 @@ class MonitorPath(MonitorBeams):
     ) -> None:
         super().__init__(instrument, backend, nodes, cameras)
         self._sized = nodes is None
-        self.checked = ImageChecks()
-        self._class_beams: dict[int, MonitorBeams] = {}
-        self._second: dict[int, MonitorBeams] = {}
+        self.checked = monitor_beams.ImageChecks()
+        self._class_beams: dict[int, monitor_beams.MonitorBeams] = {}
+        self._second: dict[int, monitor_beams.MonitorBeams] = {}
         self._responses: dict[int, PixelResponse] = {}
         self._parts: dict[tuple[str, ...], MonitorPath] = {}
         self._rested: dict[bool, tuple[np.ndarray, int]] = {}
 
     @cached_property
-    def node_classes(self) -> NodeClasses:
+    def node_classes(self) -> monitor_beams.NodeClasses:
         """Series of ever finer pupil quadratures (classes of nodes) that the images of this instrument use."""
         phase = 2.0 * np.pi * self.numerical_aperture * self.pitch / self.wavelength
-        return NodeClasses(phase, (0.5 * self.shape[0], 0.5 * self.shape[1]))
+        return monitor_beams.NodeClasses(phase, (0.5 * self.shape[0], 0.5 * self.shape[1]))
 
     @property
     def nodes(self) -> PupilNodes:
@@ -108,11 +97,13 @@ class MonitorPath(MonitorBeams):
     def _image_class(self) -> int:
         """Index of the class of pupil nodes (see ``NodeClasses``) that the unperturbed instrument needs."""
         coarse = self.coarse_trace([{}])
-        far = np.broadcast_to((1.0 - 1e-9) * SPOT_RANGES[-1] * 0.5 * np.array(self.shape), coarse.centre.shape)
+        far = np.broadcast_to(
+            (1.0 - 1e-9) * monitor_beams.SPOT_RANGES[-1] * 0.5 * np.array(self.shape), coarse.centre.shape
+        )
         number = int(self.node_classes.class_of(far, 0, coarse.blur, coarse.aperture / self.numerical_aperture)[0])
         return self._require_class(number, coarse, 0)
 
-    def class_beams(self, number: int) -> MonitorBeams:
+    def class_beams(self, number: int) -> monitor_beams.MonitorBeams:
         """Return the monitor's beams traced at the pupil nodes of the class with index ``number``."""
         if not self._sized or number == self._image_class:
             return self
@@ -120,7 +111,7 @@ class MonitorPath(MonitorBeams):
             self._class_beams[number] = self._with(self.node_classes.nodes(number))
         return self._class_beams[number]
 
-    def class_of(self, coarse: CoarseTrace, margin: int = 0) -> np.ndarray:
+    def class_of(self, coarse: monitor_beams.CoarseTrace, margin: int = 0) -> np.ndarray:
         """Return the class of nodes that suffices for all spots of each of S states, (S,), estimated from a few rays.
 
         A class is one of the pupil quadratures in ``NodeClasses``.
@@ -139,14 +130,14 @@ class MonitorPath(MonitorBeams):
         position = np.where(coarse.aperture[..., None] > 0.0, coarse.centre, 0.0)
         return self.node_classes.class_of(position, margin, coarse.blur, widening)
 
-    def _require_class(self, number: int, coarse: CoarseTrace, state: int) -> int:
+    def _require_class(self, number: int, coarse: monitor_beams.CoarseTrace, state: int) -> int:
         """Return the number of a class of pupil nodes (a pupil quadrature) if it exists.
 
         UncertainImageError is raised for a spot that is blurred too much for the finest class.
         """
         if number >= len(self.node_classes.reached):
             worst = int(np.argmax(coarse.blur[:, state]))
-            raise UncertainImageError(
+            raise monitor_beams.UncertainImageError(
                 f"the spot {self.channels[worst].key} is too blurred for its image to be computed: its rays "
                 f"spread over {2.0 * coarse.blur[worst, state]:.3g} px or "
                 f"{2e3 * self.pitch * coarse.blur[worst, state]:.3g} mm; refocus the camera, or make its aberrations "
@@ -175,7 +166,7 @@ class MonitorPath(MonitorBeams):
             self._responses[wider] = PixelResponse.fit(self.pitch, pinhole, cutoff)
         return self._responses[wider]
 
-    def _response_of(self, coarse: CoarseTrace) -> PixelResponse:
+    def _response_of(self, coarse: monitor_beams.CoarseTrace) -> PixelResponse:
         """Return the response of pixel and pinhole for the images of some states.
 
         Raises
@@ -188,7 +179,7 @@ class MonitorPath(MonitorBeams):
             return self._response(max(0, int(np.ceil(np.log(widening) / np.log(WIDEST))) - 1))
         except UnsampledImageError as error:
             problem = f"beams have {widening:.3g} times the designed aperture: {error}"
-            raise UncertainImageError(f"{problem}; allowed: {error.remedy}") from error
+            raise monitor_beams.UncertainImageError(f"{problem}; allowed: {error.remedy}") from error
 
     def expected_photons(
         self, states: Sequence[State], margin: int = 0, chunk: int = 32, single: bool = True
@@ -313,7 +304,7 @@ class MonitorPath(MonitorBeams):
         return self._rested[single]
 
     def _render(
-        self, states: Sequence[State], margin: int, single: bool, coarse: CoarseTrace | None = None
+        self, states: Sequence[State], margin: int, single: bool, coarse: monitor_beams.CoarseTrace | None = None
     ) -> tuple[np.ndarray, np.ndarray]:
         """Return the expected photons of states, and the class of pupil nodes with which each was computed.
 
@@ -347,7 +338,7 @@ class MonitorPath(MonitorBeams):
         return out, chosen
 
     def _images(
-        self, states: Sequence[State], coarse: CoarseTrace, number: int, margin: int, single: bool
+        self, states: Sequence[State], coarse: monitor_beams.CoarseTrace, number: int, margin: int, single: bool
     ) -> tuple[np.ndarray, np.ndarray]:
         """Return the photons of states, computed with nodes of one class, and the class that each state needs.
 
@@ -375,10 +366,10 @@ class MonitorPath(MonitorBeams):
             if number not in self._second:
                 self._second[number] = self._with(self.node_classes.second_nodes(number))
             second = self._second[number]
-            difference = quadrature_difference(waves, second.field_of(second.rays(states, coarse)), x, y)
+            difference = monitor_beams.quadrature_difference(waves, second.field_of(second.rays(states, coarse)), x, y)
             difference = difference.reshape(-1, len(states))
             if number + 2 <= last:
-                wanted[np.any(difference > GOOD, axis=0)] += 2
+                wanted[np.any(difference > monitor_beams.GOOD, axis=0)] += 2
             wanted[~np.all(rays.valid.reshape(len(self.channels), len(states), -1), axis=(0, 2))] = last
             self._require_alike(np.where(wanted == number, difference, 0.0), rays)
         photons = response.apply(waves)
@@ -389,7 +380,7 @@ class MonitorPath(MonitorBeams):
         photons *= self.light_per_pixel[:, None, None, None]
         return np.swapaxes(photons, 0, 1), wanted
 
-    def _require_alike(self, difference: np.ndarray, rays: CcdRays) -> None:
+    def _require_alike(self, difference: np.ndarray, rays: monitor_beams.CcdRays) -> None:
         """Raise UncertainImageError if two quadratures over the pupil give images that differ too much.
 
         ``difference`` is relative to the images' peaks, (C, S).
@@ -397,7 +388,7 @@ class MonitorPath(MonitorBeams):
         Dimensions: C channels, S states.
         """
         channel, state = np.unravel_index(np.argmax(difference), difference.shape)
-        if difference[channel, state] > WRONG:
+        if difference[channel, state] > monitor_beams.WRONG:
             lost = 1.0 - float(np.mean(rays.valid[channel * difference.shape[1] + state]))
             why = (
                 f"an aperture stops {100.0 * lost:.2g} % of its rays; widen it, or move the beam to its centre"
@@ -405,13 +396,13 @@ class MonitorPath(MonitorBeams):
                 else "its wavefront is too rough for the nodes; make figures and deformations smoother, or motions "
                 "smaller"
             )
-            raise UncertainImageError(
+            raise monitor_beams.UncertainImageError(
                 f"the image of the spot {self.channels[channel].key} is uncertain by "
                 f"{100.0 * difference[channel, state]:.2g} % of its peak: {why}"
             )
 
     def _require_energy(
-        self, images: np.ndarray, rays: CcdRays, share: np.ndarray, margin: int, known_bad: np.ndarray
+        self, images: np.ndarray, rays: monitor_beams.CcdRays, share: np.ndarray, margin: int, known_bad: np.ndarray
     ) -> np.ndarray:
         """Raise UncertainImageError if the light of an image does not equal that of the rays that fall on it.
 
@@ -434,14 +425,18 @@ class MonitorPath(MonitorBeams):
             Light beyond the allowed range, as a fraction of the channel's light.
         """
         half = 0.5 * np.array(self.shape) + margin
-        wings = np.full(len(images), WINGS * self.wavelength / (2.0 * np.pi * self.numerical_aperture * self.pitch))
+        wings = np.full(
+            len(images), monitor_beams.WINGS * self.wavelength / (2.0 * np.pi * self.numerical_aperture * self.pitch)
+        )
         light = np.sum(images, axis=(-2, -1)) * self.pitch**2
-        excess = energy_excess(light, rays.position[..., 1::-1] / self.pitch, share * rays.valid, half, wings)
+        excess = monitor_beams.energy_excess(
+            light, rays.position[..., 1::-1] / self.pitch, share * rays.valid, half, wings
+        )
         excess = np.where(np.tile(known_bad, len(self.channels)), 0.0, excess)
         worst = int(np.argmax(np.abs(excess)))
         if excess[worst]:
             channel = self.channels[worst // len(known_bad)]
-            raise UncertainImageError(
+            raise monitor_beams.UncertainImageError(
                 f"the image of the spot {channel.key} has {100.0 * abs(excess[worst]):.2g} % of its light too "
                 f"{'much' if excess[worst] > 0.0 else 'little'} for its rays, beyond the limit of diffraction; its "
                 "beam is folded or distorted: refocus the camera, or make its aberrations smaller"
@@ -457,16 +452,16 @@ class MonitorPath(MonitorBeams):
         return np.array([channel.photons * self.pitch**2 for channel in self.channels])
 
 
-class _OnSpots(MonitorBeams):
+class _OnSpots(monitor_beams.MonitorBeams):
     """Monitor beams whose positions on the CCD are measured from the centre of their own spot."""
 
-    def _with(self, nodes: PupilNodes) -> MonitorBeams:
+    def _with(self, nodes: PupilNodes) -> monitor_beams.MonitorBeams:
         return _OnSpots(self.instrument, self.backend, nodes, self.cameras)
 
     def _require_on_ccd(self, channel: Channel, position: np.ndarray) -> None:
         """Do nothing, since every CCD is centred on its spot."""
 
-    def rays(self, states: Sequence[State], coarse: CoarseTrace | None = None) -> CcdRays:
+    def rays(self, states: Sequence[State], coarse: monitor_beams.CoarseTrace | None = None) -> monitor_beams.CcdRays:
         rays = super().rays(states, coarse)
         share = self.nodes.share * rays.valid
         middle = np.einsum("bn,bnk->bk", share / np.sum(share, axis=1, keepdims=True), rays.position)
@@ -479,6 +474,6 @@ class SpotPath(_OnSpots, MonitorPath):
     It is used for instruments that are not built as designed, whose spots are not at their nominal positions.
     """
 
-    def class_of(self, coarse: CoarseTrace, margin: int = 0) -> np.ndarray:
+    def class_of(self, coarse: monitor_beams.CoarseTrace, margin: int = 0) -> np.ndarray:
         """Return the class of pupil nodes that suffices for all spots of each of S states, (S,), with centred spots."""
         return super().class_of(replace(coarse, centre=np.zeros_like(coarse.centre)), margin)

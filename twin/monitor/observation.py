@@ -16,7 +16,7 @@ import numpy as np
 from analysis.arrays import shows
 from analysis.monitor.recovery import MeasuredSpots, Recovery, judged_spots, recover_monitor
 from analysis.spots.centroid import mean_frames
-from analysis.spots.spot_positions import SpotError
+from analysis.spots.spot_image import SpotError
 from optics.geometry.tree import PlacedBodies, State
 from optics.numerics.backend import cores, one_blas_thread, one_kernel_thread
 from optics.raytrace.aim import AimError
@@ -252,7 +252,8 @@ def read(experiment: MonitorExperiment, light: Light, how: ObservationOptions) -
         images, count = mean_of(after), after.shape[-3]
         before = mean_of(before) if isinstance(before, np.ndarray) else before
     channels = experiment.path.channels
-    good = np.arange(len(after))
+    good, calibration = np.arange(len(after)), experiment.calibration
+    prior, models = (experiment.disturbances, experiment.motion_models) if how.use_prior else (None, None)
     while len(good):
         whole = len(good) == len(after)
         first = before
@@ -260,17 +261,9 @@ def read(experiment: MonitorExperiment, light: Light, how: ObservationOptions) -
             first = before[good]
         try:
             with one_blas_thread(), one_kernel_thread():
-                recovery = recover_monitor(
-                    first,
-                    images if whole else images[good],
-                    experiment.calibration,
-                    how.centroid,
-                    cores() if len(good) > 1 else 1,
-                    experiment.disturbances if how.use_prior else None,
-                    how.keep_parts,
-                    experiment.motion_models if how.use_prior else None,
-                    count,
-                )
+                threads, after_images = cores() if len(good) > 1 else 1, images if whole else images[good]
+                options = calibration, how.centroid, threads, prior, how.keep_parts, models, count
+                recovery = recover_monitor(first, after_images, *options)
             return Observation(light, good, after, recovery)
         except SpotError as error:
             if how.omit is None:

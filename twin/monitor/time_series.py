@@ -14,7 +14,7 @@ from analysis.monitor.monitor_formulas import GroundGeometry
 from analysis.monitor.parameters import CameraCalibration
 from analysis.monitor.recovery import Curvature, Recovery, SpotEvidence, estimates_of
 from analysis.monitor.series_smoother import smooth_series, window_of
-from analysis.spots.spot_positions import NoiseParts, SeriesNoise, SpotError
+from analysis.spots.spot_image import NoiseParts, SeriesNoise, SpotError
 from analysis.statistics import limit_of
 from optics.geometry.tree import Motion, State
 from optics.numerics.backend import one_blas_thread
@@ -27,8 +27,7 @@ from scenes.specs.resolved import ResolvedJob
 from scenes.yaml.errors import InputError, names_text
 from twin.framework.artefact import significant
 from twin.framework.record import Quantity, Record
-from twin.monitor.monitor_experiment import MonitorExperiment
-from twin.monitor.monitor_memory import largest_piece
+from twin.monitor.monitor_experiment import MonitorExperiment, largest_piece
 from twin.monitor.observation import LOST, ObservationOptions, observe, shared_detector, why_lost
 from twin.monitor.reading_table import ReadingTable, reading_table
 
@@ -282,20 +281,14 @@ def run_series(
     shown_photons, angle = np.empty(photons.shape[1:]), np.nan
     tables: list[ReadingTable] = []
     recoveries: list[Recovery] = []
-    together = CourseSmoother(experiment.disturbances, experiment.cameras, experiment.ground, course.times)
+    prior, cameras, ground = experiment.disturbances, experiment.cameras, experiment.ground
+    together = CourseSmoother(prior, cameras, ground, course.times)
     record, size, done = shared_detector(experiment, frames, seed), largest_piece(each * frames), 0
-    how = ObservationOptions(record, job.analysis.centroid, size, keep_parts=experiment.disturbances is not None)
+    how = ObservationOptions(record, job.analysis.centroid, size, keep_parts=prior is not None)
     try:
         for observation in observe(experiment, states, how):
             piece, expected = slice(done, done + len(observation.numbers)), observation.light.photons
-            arguments = (
-                observation.recovery,
-                experiment.cameras,
-                observation.truth,
-                experiment.ground,
-                experiment.disturbances,
-            )
-            tables.append(reading_table(*arguments))
+            tables.append(reading_table(observation.recovery, cameras, observation.truth, ground, prior))
             recoveries.append(together.add(observation.recovery))
             angle = observation.truth.angle
             photons[piece], first[piece] = expected, observation.after[:, :, 0]
@@ -316,7 +309,7 @@ def run_series(
         raise too_large(job, done + k, reason) from error
     shift = np.concatenate([r.shift for r in recoveries])
     spread = np.concatenate([r.shift_covariance for r in recoveries])
-    prior, agrees = experiment.disturbances, np.ones(len(shift), bool)
+    agrees = np.ones(len(shift), bool)
     if prior is not None and np.any(spread):
         agrees = chi_squares(shift, spread, prior) <= limit_of(FALSE_ALARM / len(shift), shift.shape[1])
     state_motions = [motions_of(job, k) for k in range(len(states))]
@@ -575,14 +568,5 @@ class CourseSmoother:
         count = len(times)
         each = series.consistency.degrees // count
         at, rest = part(slice(count)), part(slice(count, None))
-        return SmoothedCourse(
-            prior.name,
-            at,
-            between,
-            rest,
-            series.innovations,
-            each,
-            series.consistency,
-            series.jumps,
-            prior.jump_false_alarm,
-        )
+        test, jumps, false_alarm = series.consistency, series.jumps, prior.jump_false_alarm
+        return SmoothedCourse(prior.name, at, between, rest, series.innovations, each, test, jumps, false_alarm)

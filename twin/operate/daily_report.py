@@ -10,7 +10,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from datetime import UTC, datetime
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -40,9 +40,6 @@ from twin.operate.overview import (
 )
 from twin.operate.record.entries import MICRO, micros, utc_text
 from twin.operate.record.history import History
-
-if TYPE_CHECKING:
-    pass
 
 BANDS = ((1.9600, 0.22, "95 %"), (0.9945, 0.42, "68 %"))
 """Confidence bands of a figure: multiple of sigma, opacity and name of each, the widest first."""
@@ -358,10 +355,8 @@ def _motion_section(overview: Overview) -> Section | None:
     rows: list[tuple[float, list[Cell]]] = []
     for name, unit in {moving_component.name: moving_component.unit for moving_component in moving}.items():
         selected = np.array([label == name for label in motions.labels], np.float64)
-        mean, sigma = (
-            float(selected @ motions.mean),
-            math.sqrt(max(float(selected @ motions.covariance @ selected), 0.0)),
-        )
+        mean = float(selected @ motions.mean)
+        sigma = math.sqrt(max(float(selected @ motions.covariance @ selected), 0.0))
         decimals = decimals_for(sigma)
         ratio = abs(mean) / sigma if sigma else 0.0
         numbers = DecimalNumber(mean, decimals), DecimalNumber(sigma, decimals), DecimalNumber(ratio, 1)
@@ -388,14 +383,8 @@ def _prediction_section(overview: Overview) -> Section:
             words = Marked("yes" if coverage.holds else "no", look=look, key=f"coverage {coverage.sigmas}")
             row: list[Cell] = [f"within {coverage.sigmas}σ", DecimalNumber(100.0 * coverage.expected, 2)]
             rows.append([*row, DecimalNumber(100.0 * coverage.share, 2), interval, coverage.count, words])
-    heads = (
-        "components",
-        "expected [%]",
-        "observed [%]",
-        f"{100.0 * CONFIDENCE:.0f} % confidence interval [%]",
-        "number",
-        "consistent",
-    )
+    confidence = f"{100.0 * CONFIDENCE:.0f} % confidence interval [%]"
+    heads = ("components", "expected [%]", "observed [%]", confidence, "number", "consistent")
     caption = (
         "Each reading was predicted from all readings before it. Its normalised, independent components lie "
         "within 1 and 2σ as often as those of a normal distribution if the plan's disturbances are right; the "
@@ -421,11 +410,11 @@ def _explained_sentence(overview: Overview) -> str:
     known = {name: share for name, share in overview.filter_result.explained.items() if math.isfinite(share)}
     if not known:
         return ""
+    any_of_them = not overview.filter_result.requirements
     parts = [
         f"{100.0 * known[quantity.name]:.0f} % for {name_of(quantity.name, overview.quantities)}"
         for quantity in overview.quantities
-        if known.get(quantity.name, 0.0) >= 0.005
-        and (overview.required(quantity) or not overview.filter_result.requirements)
+        if known.get(quantity.name, 0.0) >= 0.005 and (any_of_them or overview.required(quantity))
     ]
     if not parts:
         return "Temperatures explain none of the scatter of the required quantities"
@@ -530,14 +519,10 @@ def _excluded_section(history: History, overview: Overview) -> Section:
         caption = "In the record, but not used for the estimate. Times are UTC."
         artefacts.append(_newest("excluded", "Excluded readings", caption, ("time", "kind", "subject", "reason"), rows))
     if refused:
-        refused_rows: list[list[Cell]] = [
-            [
-                entry["refused_utc"],
-                f"{entry['file']}{'' if entry['line'] is None else ':' + str(entry['line'])}",
-                entry["reason"],
-            ]
-            for entry in refused[::-1]
-        ]
+        refused_rows: list[list[Cell]] = []
+        for entry in refused[::-1]:
+            line = "" if entry["line"] is None else f":{entry['line']}"
+            refused_rows.append([entry["refused_utc"], f"{entry['file']}{line}", entry["reason"]])
         caption = "Refused at the ingest of their files, and not in the record."
         artefacts.append(_newest("refused", "Refused", caption, ("refused [UTC]", "file", "reason"), refused_rows))
     words = () if artefacts else ("Nothing was excluded or refused.",)

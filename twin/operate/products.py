@@ -45,7 +45,7 @@ from twin.operate.overview import day_text, minute_text
 from twin.operate.record.entries import MICRO, digest_of_data, instrument_digest, micros, utc_text
 from twin.operate.record.schema import ENTRY
 from twin.orbit.export.export_report import LINE, export_files
-from twin.orbit.export.export_run import USUAL_HEIGHTS, Export, run_export
+from twin.orbit.export.export_run import USUAL_HEIGHTS, Export, ExportSource, run_export
 from twin.orbit.export.ground_accuracy import EstimatedChange
 
 if TYPE_CHECKING:
@@ -54,7 +54,6 @@ if TYPE_CHECKING:
     from twin.operate.estimate.operation_filter import Operation
     from twin.operate.estimate.reported_estimate import Course, FilterResult
     from twin.operate.record.history import History
-    from twin.orbit.export.export_run import ExportSource
 
 SHARE = 0.2
 """Relative increase of the root mean square error of an estimate, used at another time, that ends its validity."""

@@ -31,8 +31,7 @@ from twin.framework.reference_frames import described
 from twin.framework.run_folder import RunFolder
 from twin.main_job.monitor_reading import MonitorReading, stated
 from twin.monitor.crosstalk import CameraCrosstalk, crosstalk
-from twin.monitor.monitor_experiment import MonitorExperiment
-from twin.monitor.monitor_memory import largest_piece
+from twin.monitor.monitor_experiment import MonitorExperiment, largest_piece
 from twin.monitor.observation import Observation, ObservationOptions, observe, shared_detector
 from twin.monitor.reading_table import ReadingTable, reading_table
 from twin.operate.record.entries import MICRO, utc_text

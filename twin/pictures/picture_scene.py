@@ -18,19 +18,8 @@ from matplotlib.figure import Figure
 from scenes.models.instrument_model import Instrument
 from scenes.models.meshes import behind
 from scenes.specs.instrument import BASE
+from twin.pictures import scene_file
 from twin.pictures.light_paths import LightPaths
-from twin.pictures.scene_file import (
-    BLOCK,
-    BRASS,
-    DARK,
-    GLASS,
-    MIRROR,
-    SILICON,
-    beam_colour,
-    build_scene,
-    drawn_rays,
-    is_mirror,
-)
 
 
 @dataclass(frozen=True, eq=False)
@@ -173,12 +162,12 @@ _BSDF: dict[str, dict[str, Any]] = {
     "floor": {"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.80, 0.80, 0.80]}},
 }
 _MATERIALS = (
-    (MIRROR, "mirror"),
-    (DARK, "board"),
-    (SILICON, "silicon"),
-    (BRASS, "gold"),
-    (GLASS, "glass"),
-    (BLOCK, "block"),
+    (scene_file.MIRROR, "mirror"),
+    (scene_file.DARK, "board"),
+    (scene_file.SILICON, "silicon"),
+    (scene_file.BRASS, "gold"),
+    (scene_file.GLASS, "glass"),
+    (scene_file.BLOCK, "block"),
 )
 """Pairs of a body's material in ``scene.glb`` and the name of the corresponding material of the rendered picture."""
 
@@ -220,13 +209,13 @@ def studio_parts(instrument: Instrument, paths: LightPaths, pixel: float) -> lis
     pixel : float
         Size of a picture's pixel at the instrument, metres, from which the thickness of lines follows.
     """
-    scene = build_scene(instrument, paths, tube=BEAM_PIXELS * pixel)
+    scene = scene_file.build_scene(instrument, paths, tube=BEAM_PIXELS * pixel)
     backs = {
         f"{BASE}/{camera}/{mirror}": behind(model, mirror)
         for camera, model in instrument.cameras.items()
         for mirror in model.mirrors
         if model.spec.mirrors[mirror].light is None
-    } | {solid.path: -1.0 for solid in instrument.solids if is_mirror(solid)}
+    } | {solid.path: -1.0 for solid in instrument.solids if scene_file.is_mirror(solid)}
     parts: list[Part] = []
     lowest = np.inf
     for name in scene.graph.nodes_geometry:
@@ -259,9 +248,9 @@ def still_png(instrument: Instrument, paths: LightPaths, size: tuple[int, int] =
 
     ``size`` is the largest width and height, pixels; each has two samples.
     """
-    scene = build_scene(instrument, replace(paths, beams=()))
+    scene = scene_file.build_scene(instrument, replace(paths, beams=()))
     bodies = points_in_world(scene)
-    rays = [drawn_rays(beam) for beam in paths.beams]
+    rays = [scene_file.drawn_rays(beam) for beam in paths.beams]
     whole = np.concatenate([*bodies.values(), *(ray.reshape(-1, 3) for ray in rays)])
     extent = np.ptp(whole, axis=0)
     order = [2, 0, 1] if np.argmax(extent) == 2 else [0, 1, 2]  # what is tall lies down
@@ -284,7 +273,7 @@ def still_png(instrument: Instrument, paths: LightPaths, size: tuple[int, int] =
         wide = np.cross(end - start, view.forward)
         wide *= half_width / np.maximum(np.linalg.norm(wide, axis=-1, keepdims=True), 1e-300)
         corners.append(np.stack([start - wide, start + wide, end + wide, end - wide], axis=1))
-        colours.append(np.tile(beam_colour(instrument, beam), (len(start), 1)))
+        colours.append(np.tile(scene_file.beam_colour(instrument, beam), (len(start), 1)))
     facets, colour = np.concatenate(corners), np.concatenate(colours)
     far = np.argsort(-facets.mean(axis=1) @ view.forward)
     flat = view.project(facets.reshape(-1, 3)).reshape(-1, 4, 2)

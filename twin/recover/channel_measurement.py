@@ -8,6 +8,7 @@ import numpy as np
 
 from analysis.monitor.parameters import MonitorCalibration
 from analysis.monitor.recovery import measure_spots
+from analysis.spots import learnt_template
 from analysis.spots.frame_screening import (
     Finding,
     FramesError,
@@ -17,19 +18,11 @@ from analysis.spots.frame_screening import (
     screen_frames,
     subtracted_level,
 )
-from analysis.spots.learnt_template import (
-    FittedSpot,
-    LearntShift,
-    LearntTemplate,
-    learn_template,
-    learnt_shift,
-    without_slopes,
-)
 from analysis.spots.likelihood import widened
 from analysis.spots.noise import NoiseModel
 from analysis.spots.photon_transfer import PixelCorrection
 from analysis.spots.screened_fit import CORE_SHARE, ScreenedFit, one_shape
-from analysis.spots.spot_positions import NoiseParts, SpotError, SpotPositions, difference_covariance, noise_parts
+from analysis.spots.spot_image import NoiseParts, SpotError, SpotPositions, difference_covariance, noise_parts
 from analysis.spots.spot_template import SpotTemplate
 from analysis.spots.static_defects import Examined, examine, outlier_pixels, refit, repaired_centroid
 from scenes.specs.monitor_frames import MeasurementSpec
@@ -153,9 +146,9 @@ class ChannelMeasurement:
         self._examined: list[Examined | None] = []
         self._costs: dict[int, float] = {}
         self._widened: list[float] = []
-        self._learnt_from: LearntTemplate | None = None
-        self._fitted: list[FittedSpot] = []
-        self._shifts: list[LearntShift] = []
+        self._learnt_from: learnt_template.LearntTemplate | None = None
+        self._fitted: list[learnt_template.FittedSpot] = []
+        self._shifts: list[learnt_template.LearntShift] = []
         self._templates: dict[tuple[int, int], SpotTemplate] = {}
         self.positions: list[SpotPositions] = []
 
@@ -297,7 +290,7 @@ class ChannelMeasurement:
             screened, mean=part.corrected(screened.mean), good=good, findings=(*screened.findings, *findings)
         )
 
-    def _learn(self, screened: ScreenedFrames) -> tuple[ScreenedFrames, LearntTemplate]:
+    def _learn(self, screened: ScreenedFrames) -> tuple[ScreenedFrames, learnt_template.LearntTemplate]:
         """Return frames without outlier pixels, and the spot's shape (template) learnt from them."""
         if self._searches:
             outliers = outlier_pixels(screened, self.channel.noise)
@@ -306,8 +299,8 @@ class ChannelMeasurement:
                     "bad pixels", f"{np.count_nonzero(outliers)} hot, dead or otherwise deviating pixels are excluded"
                 )
                 screened = replace(screened, good=screened.good & ~outliers, findings=(*screened.findings, finding))
-            screened = without_slopes(screened, self.channel.noise)
-        return screened, learn_template(screened, self.channel.noise)
+            screened = learnt_template.without_slopes(screened, self.channel.noise)
+        return screened, learnt_template.learn_template(screened, self.channel.noise)
 
     def _examine(self, number: int, state: StateFrames) -> Examined | None:
         """Search the mean image of state ``number`` for artefacts; return None if no search is requested."""
@@ -332,7 +325,7 @@ class ChannelMeasurement:
                 if self._learnt_from is not None and number and self._fitted:
                     first, second = self._fitted[0], self._fitted[-1]
                     noise, ccd = self.channel.noise, self.channel.ccd
-                    self._shifts.append(learnt_shift(self._learnt_from, first, second, noise, ccd))
+                    self._shifts.append(learnt_template.learnt_shift(self._learnt_from, first, second, noise, ccd))
             except SpotError as error:
                 issues.append(self._lost(state, error))
         return issues
@@ -366,14 +359,14 @@ class ChannelMeasurement:
             return 1.0
         return examined.fit.core_widening(None if first is None else first.fit)
 
-    def _as_fitted(self, positions: SpotPositions, number: int, state: StateFrames) -> FittedSpot:
+    def _as_fitted(self, positions: SpotPositions, number: int, state: StateFrames) -> learnt_template.FittedSpot:
         """Return the data of a spot's fit from which its noise is computed if the spot's shape was learnt."""
         examined, screened = self._examined[number], self._screened[number]
         counts, jitter = screened.counts, screened.jitter / float(np.median(screened.counts))
         others, smear = np.zeros((0, 3)), np.zeros((2, 2))
         if examined is not None and not examined.clean:
             others, smear = examined.fit.others, examined.fit.smear
-        return FittedSpot(positions, counts, jitter, others, smear, state.offset)
+        return learnt_template.FittedSpot(positions, counts, jitter, others, smear, state.offset)
 
     def shift_covariance(self, number: int) -> np.ndarray:
         """Return the (1, 2, 2) noise covariance of the spot's shift from before to after, in px^2.

@@ -17,7 +17,7 @@ from analysis.monitor.parameters import CameraCalibration, MonitorCalibration
 from analysis.monitor.recovery import MotionModel, Recovery, judged_spots, recover_monitor, recovery_of
 from analysis.spots.noise import NoiseModel
 from analysis.spots.screened_fit import one_shape
-from analysis.spots.spot_positions import NoiseParts, SpotError, SpotPositions
+from analysis.spots.spot_image import NoiseParts, SpotError, SpotPositions
 from optics.numerics.backend import Backend, one_blas_thread
 from scenes.models.camera_sharpness import blur_warnings
 from scenes.specs.course import moment
@@ -28,8 +28,7 @@ from twin.framework.frame_store import mean_of
 from twin.framework.procedure import Advance, silent
 from twin.main_job.monitor_reading import MonitorReading, contradicted, stated
 from twin.monitor.crosstalk import CameraCrosstalk, crosstalk
-from twin.monitor.monitor_experiment import MonitorExperiment
-from twin.monitor.monitor_memory import pieces
+from twin.monitor.monitor_experiment import MonitorExperiment, pieces
 from twin.monitor.time_series import CourseSmoother, SmoothedCourse
 from twin.recover.channel_measurement import ChannelMeasurement, ChannelResult, SpotResult, remedy
 from twin.recover.measured_frames import (

@@ -56,8 +56,7 @@ from twin.main_job.render_job import render_job
 from twin.monitor.crosstalk import estimator_gains
 from twin.monitor.monitor_derivative import spot_jacobian
 from twin.monitor.monitor_experiment import MonitorExperiment
-from twin.monitor.motions import ElementaryMotion
-from twin.monitor.truth import truth_jacobian
+from twin.monitor.truth import ElementaryMotion, truth_jacobian
 from twin.scripting.results import Found, Shot, as_frames, found_table, name_html
 from twin.scripting.results import shot_of as _shot_of
 from twin.sensors.area_detector import coarse_warnings

@@ -28,17 +28,7 @@ import numpy as np
 from optics.numerics.backend import one_kernel_thread
 from optics.numerics.llvm import ensure_llvm
 from twin.framework.frame_store import release_memory
-from twin.sensors.poisson_numbers import (
-    CELLS_PER_UNIT,
-    MOST_IN_TABLE,
-    SERIES_END,
-    TABLE_BITS,
-    TABLE_END,
-    poisson_quantile,
-    quantile_table,
-    split_stream,
-    words_of,
-)
+from twin.sensors import poisson_numbers
 
 FEWEST = 50_000
 """Smallest number of random numbers of an exposure for which kernels are used.
@@ -292,9 +282,11 @@ class _Group:
         self.last: list[Future[np.ndarray | None] | None] = [None] * len(streams)
         for image, sequence in enumerate(streams):
             mean = numbers.mean[self.lanes(image)]
-            self.huge.append(np.flatnonzero(mean >= SERIES_END))
+            self.huge.append(np.flatnonzero(mean >= poisson_numbers.SERIES_END))
             rng = np.random.Generator(np.random.SFC64(sequence))
-            self.sources.append((*split_stream(rng, mean[self.huge[image]], frames, pixels, together), rng))
+            self.sources.append(
+                (*poisson_numbers.split_stream(rng, mean[self.huge[image]], frames, pixels, together), rng)
+            )
 
     def lanes(self, image: int) -> slice:
         """Return the range of lanes (entries of the kernels' arrays) that hold an image's pixels."""
@@ -328,7 +320,7 @@ class _Group:
 
         def draw() -> None:
             nonlocal huge_numbers
-            numbers.words[:count, lanes] = words_of(words, count, self.pixels)
+            numbers.words[:count, lanes] = poisson_numbers.words_of(words, count, self.pixels)
             huge_numbers = huge.poisson(numbers.mean[lanes][which], (count, which.size)) if which.size else None
             if numbers.normals is not None:
                 for row in numbers.normals[:count]:
@@ -369,7 +361,7 @@ class _Drawn:
         numbers, group = self.numbers, self.group
         frame, lane = _kernels(group.how, numbers, self.out)
         if frame.size:
-            self._put(frame, lane, poisson_quantile(numbers.mean[lane], numbers.words[frame, lane]))
+            self._put(frame, lane, poisson_numbers.poisson_quantile(numbers.mean[lane], numbers.words[frame, lane]))
         for image, (which, huge_numbers) in enumerate(zip(group.huge, huge, strict=True)):
             if huge_numbers is not None:
                 frame, lane = np.divmod(np.arange(huge_numbers.size), which.size)
@@ -427,7 +419,7 @@ def _table() -> _Table:
     import drjit as dr
     from drjit.llvm import Float32, UInt32
 
-    cells, law, bound = quantile_table()
+    cells, law, bound = poisson_numbers.quantile_table()
     table = _Table(UInt32(cells.view(np.uint32)), Float32(law.astype(np.float32)), Float32(bound + _SINGLE))
     dr.make_opaque(table.known, table.law, table.bound)
     return table
@@ -494,8 +486,8 @@ def _cell(mean: Any, word: Any) -> tuple[Any, Any, Any]:
     import drjit as dr
     from drjit.llvm import UInt32
 
-    row = UInt32(dr.select(mean < TABLE_END, mean, 0.0) * float(CELLS_PER_UNIT))
-    position = (row << TABLE_BITS) + UInt32(word >> (64 - TABLE_BITS))
+    row = UInt32(dr.select(mean < poisson_numbers.TABLE_END, mean, 0.0) * float(poisson_numbers.CELLS_PER_UNIT))
+    position = (row << poisson_numbers.TABLE_BITS) + UInt32(word >> (64 - poisson_numbers.TABLE_BITS))
     cell = (dr.gather(UInt32, _table().known, position >> 2) >> ((position & 3) << 3)) & 255
     return row, cell & 127, cell >= 128
 
@@ -511,7 +503,7 @@ def _looked_up(mean: Any, word: Any, normal: Any, shift: Any, numbers: Sequence[
     _, number, open_ = _cell(mean, word)
     electrons, open_ = dr.if_stmt(
         (Float64(number), open_, mean, word),
-        mean >= TABLE_END,
+        mean >= poisson_numbers.TABLE_END,
         lambda electrons, open_, mean, word: _by_series(mean, word),
         lambda electrons, open_, mean, word: (electrons, open_),
         mode="symbolic",
@@ -550,14 +542,14 @@ def _compared(
     normal = None if normal is None else dr.gather(Float64, normal, position)
     table = _table()
     row, number, _ = _cell(mean, word)
-    small = mean < TABLE_END
+    small = mean < poisson_numbers.TABLE_END
     u = Float32(UInt32(word >> 32)) * 2.0**-32
-    share = Float32(mean * float(CELLS_PER_UNIT) - Float64(row))
-    index, bound = row * MOST_IN_TABLE + number, dr.gather(Float32, table.bound, row)
+    share = Float32(mean * float(poisson_numbers.CELLS_PER_UNIT) - Float64(row))
+    index, bound = row * poisson_numbers.MOST_IN_TABLE + number, dr.gather(Float32, table.bound, row)
 
     def passed(going: Any, number: Any, index: Any, close: Any) -> tuple[Any, Any, Any, Any]:
         law = dr.gather(Float32, table.law, index, going)
-        law = dr.fma(share, dr.gather(Float32, table.law, index + MOST_IN_TABLE, going) - law, law)
+        law = dr.fma(share, dr.gather(Float32, table.law, index + poisson_numbers.MOST_IN_TABLE, going) - law, law)
         ahead = u - law
         close = close | (going & (dr.abs(ahead) <= bound))
         going = going & (ahead > bound)

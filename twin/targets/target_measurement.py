@@ -196,16 +196,19 @@ class TargetRun:
 
         Frames have H rows and W columns.
         """
+        for camera, position, when, shots in self._shots():
+            targets = self.cameras[camera]
+            for name, frames in shots.frames.items():
+                note = f"{name}, {position}, {when}"
+                facts = FrameFacts(f"{camera}, line CCD {targets.band}", targets.pitch, note=note)
+                yield f"{camera}_{position}_{name}_{when}", name, frames, facts
+
+    def _shots(self) -> Iterator[tuple[str, str, str, TargetShots]]:
+        """Yield camera, position and state of all targets, with their frames and readings."""
         for camera, targets_of_camera in self.cameras.items():
             for position, targets in targets_of_camera.places.items():
                 for when, shots in targets.shots.items():
-                    for name, frames in shots.frames.items():
-                        facts = FrameFacts(
-                            f"{camera}, line CCD {targets_of_camera.band}",
-                            targets_of_camera.pitch,
-                            note=f"{name}, {position}, {when}",
-                        )
-                        yield f"{camera}_{position}_{name}_{when}", name, frames, facts
+                    yield camera, position, when, shots
 
     @property
     def has_edges(self) -> bool:
@@ -216,17 +219,14 @@ class TargetRun:
     def warnings(self) -> tuple[str, ...]:
         """Warnings about targets that could not be measured, with the reason."""
         out = []
-        for camera, targets_of_camera in self.cameras.items():
-            for position, targets in targets_of_camera.places.items():
-                for when, shots in targets.shots.items():
-                    kinds = (("knife edge", shots.edges), ("bars", shots.bars))
-                    for what, readings in kinds:
-                        for direction, reading in readings.items():
-                            if reading.measured is None:
-                                out.append(
-                                    f"{what} ({direction}) at the {position} of {camera} {when}: no MTF at Nyquist "
-                                    f"(true value {reading.true_nyquist:.3f}): {reading.reason}"
-                                )
+        for camera, position, when, shots in self._shots():
+            for what, readings in (("knife edge", shots.edges), ("bars", shots.bars)):
+                for direction, reading in readings.items():
+                    if reading.measured is None:
+                        out.append(
+                            f"{what} ({direction}) at the {position} of {camera} {when}: no MTF at Nyquist "
+                            f"(true value {reading.true_nyquist:.3f}): {reading.reason}"
+                        )
         return tuple(out)
 
     def to_dict(self) -> dict[str, Any]:

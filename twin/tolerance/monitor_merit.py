@@ -36,8 +36,7 @@ from scenes.yaml.errors import names_text, unknown
 from scenes.yaml.units import LENGTH
 from twin.framework.artefact import unit_for_reports
 from twin.monitor.crosstalk import estimator_gains
-from twin.monitor.information import noise_as_built, quantity_rows, spot_noise
-from twin.monitor.monitor_derivative import derivative_changes
+from twin.monitor.monitor_derivative import derivative_changes, noise_as_built, quantity_rows, spot_noise
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.monitor.monitor_path import SpotPath
 from twin.targets.target_path import TargetPath

@@ -21,7 +21,7 @@ from scenes.specs.resolved import ResolvedJob
 from scenes.yaml.errors import InputError, Issue
 from twin.framework.procedure import Advance, silent
 from twin.framework.random_streams import stream
-from twin.monitor.image_sampling import ImageChecks
+from twin.monitor.monitor_beams import ImageChecks
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.monitor.observation import ObservationOptions, observe
 from twin.monitor.reading_table import reading_table

@@ -22,7 +22,7 @@ from analysis.monitor.limits import (
 from analysis.monitor.parameters import ANGLE_GROUP, GROUND_GROUP
 from analysis.monitor.recovery import MeasuredSpots, joint, judged_spots
 from analysis.spots.likelihood import EDGE_PX
-from analysis.spots.spot_positions import SpotError, difference_covariance
+from analysis.spots.spot_image import SpotError, difference_covariance
 from scenes.models.disturbances import states_of
 from scenes.models.instrument_model import MisplacedError
 from scenes.specs.instrument import BASE

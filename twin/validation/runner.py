@@ -13,7 +13,6 @@ from typing import Any
 from optics.numerics.backend import Backend
 from twin.framework.artefact import Artefact
 from twin.framework.provenance import versions
-from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.validation.check import SKIPPED, VERDICTS, CheckResult, Verdict
 from twin.validation.group import CheckGroup, Context
 from twin.validation.registry import Selection
@@ -185,13 +184,13 @@ def run_checks(
         Results of all groups.
     """
     started, clock = time.time(), time.monotonic()
-    experiments: dict[str, MonitorExperiment] = {}
+    context_of = partial(Context, backend, seed, fast=fast, real=real, experiments={})
     runs = []
     done = 0.0
     for selection in selections:
         seconds = selection.group.rough_seconds(fast)
         advance = partial(_advance, progress, done, selection.group, seconds)
-        runs.append(_run_group(selection, backend, seed, fast, advance, folder, experiments, real))
+        runs.append(_run_group(selection, partial(context_of, report_progress=advance), advance, folder))
         done += seconds
     progress(done, "done")
     took = time.monotonic() - clock
@@ -204,14 +203,7 @@ def _advance(progress: Progress, start: float, group: CheckGroup, seconds: float
 
 
 def _run_group(
-    selection: Selection,
-    backend: Backend,
-    seed: int,
-    fast: bool,
-    advance: Callable[[float, str], None],
-    folder: Path | None,
-    experiments: dict[str, MonitorExperiment],
-    real: Path,
+    selection: Selection, context_of: Callable[..., Context], advance: Progress, folder: Path | None
 ) -> GroupRun:
     group = selection.group
     group_folder = None if folder is None else folder / FILES / group.prefix
@@ -220,7 +212,7 @@ def _run_group(
     checks = {check.id: check for check in group.checks}
     results_by_id = {name: checks[name].without_comparison() for name in selection.ids if checks[name].not_checkable}
     wanted = selection.ids - set(results_by_id)
-    context = Context(backend, seed, wanted, checks, fast, advance, group_folder, real, experiments, group.artefacts)
+    context = context_of(selected=wanted, checks=checks, folder=group_folder, texts=group.artefacts)
     begin = last = time.monotonic()
     why = "the group gave no result for it"
     advance(0.0, "start")

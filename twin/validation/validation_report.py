@@ -45,11 +45,9 @@ def summary_files(validation: Validation) -> dict[str, bytes]:
 
 def _head(validation: Validation) -> Iterator[str]:
     real = {r.paper for r in validation.results} == {REAL}
-    yield "# Measured data of others" if real else "# What the simulation says of the papers"
-    yield ""
-    took = duration_text(validation.seconds)
-    yield f"Made by `{command(validation)}` in {took}; its validation.html has every row in full."
-    yield ""
+    title = "# Measured data of others" if real else "# What the simulation says of the papers"
+    made = f"Made by `{command(validation)}` in {duration_text(validation.seconds)}"
+    yield from (title, "", f"{made}; its validation.html has every row in full.", "")
     counted = ((v, str(validation.counts[v]), meaning) for v, meaning in VERDICTS.items() if validation.counts[v])
     yield from _table_lines(("verdict", "checks", "meaning"), counted, right=(1,))
     if real:
@@ -73,8 +71,7 @@ def _tables(validation: Validation) -> Iterator[str]:
         if number == REAL:
             yield from _real_table(title, rows)
             continue
-        yield f"## Paper {number}: {title}"
-        yield ""
+        yield from (f"## Paper {number}: {title}", "")
         cells = []
         for r in rows:
             names, about = " = ".join(f"`{name}`" for name in (r.id, *r.also)), f"{r.equation}: {r.statement}"
@@ -86,27 +83,21 @@ def _tables(validation: Validation) -> Iterator[str]:
 
 def _real_table(title: str, rows: Sequence[CheckResult]) -> Iterator[str]:
     """Yield the lines of the table of rows on measured data."""
-    yield f"## {title}"
-    yield ""
+    yield from (f"## {title}", "")
     cells = []
     for r in rows:
         unit = "" if r.unit == "1" or r.measured is None else f" {r.unit}"
         refuted = ""
         if r.power is not None and r.claim is not None:
-            side = {
-                "two-sided": "off by more than",
-                "at most": "above it by more than",
-                "at least": "below it by more than",
-            }
-            refuted = f"{side[r.comparison]} {plain(r.power, 2)}{unit} ({r.because}); the alternative, {r.against}, is "
+            side = {"two-sided": "off", "at most": "above it", "at least": "below it"}[r.comparison]
+            refuted = f"{side} by more than {plain(r.power, 2)}{unit} ({r.because}); the alternative, {r.against}, is "
             refuted += f"{plain(r.tells or 0.0, 2)}{unit} away"
         about = f"{r.equation}: {r.statement}"
         measured = f"{measured_text(r)}{unit}"
         cells.append((f"`{r.id}`", about, claim_text(r), measured, sigma_text(r), r.verdict, refuted))
     heads = "row, statement, printed by others, measured here, sigma, verdict, what would have refuted it".split(", ")
     yield from _table_lines(heads, cells, right=(2, 3, 4))
-    yield "## Numbers of each row"
-    yield ""
+    yield from ("## Numbers of each row", "")
     for r in rows:
         # the last line is the comparison, which the table has
         lines = r.how.splitlines() if r.power is None else r.how.splitlines()[:-1]
@@ -136,10 +127,8 @@ def _chosen(validation: Validation) -> Iterator[str]:
     results = [result for result in validation.results if result.inputs]
     if not results:
         return
-    yield "## Chosen inputs"
-    yield ""
-    yield "What the paper does not print and these rows need, and where each may be moved before its row fails."
-    yield ""
+    about = "What the paper does not print and these rows need, and where each may be moved before its row fails."
+    yield from ("## Chosen inputs", "", about, "")
     for result in results:
         yield f"- `{result.id}`: {_cell('; '.join(i.text for i in result.inputs))}"
     yield ""
@@ -150,8 +139,7 @@ def _corrections(validation: Validation) -> Iterator[str]:
     results = [result for result in validation.results if result.verdict not in AGREED.values()]
     if not results:
         return
-    yield "## Corrections, refutations, the undecided and gaps"
-    yield ""
+    yield from ("## Corrections, refutations, the undecided and gaps", "")
     for result in results:
         lines = result.how.splitlines()
         # how it was measured, reason, comparison; without a comparison only the reason
@@ -258,12 +246,8 @@ def _papers(validation: Validation) -> Iterator[Section]:
     for number, title in PAPERS.items():
         results = [result for result in validation.results if result.paper == number]
         if results:
-            yield Section(
-                "Measured data" if number == REAL else f"Paper {number}",
-                (title,),
-                (_paper_table(number, results),),
-                name=f"paper-{number}",
-            )
+            head = "Measured data" if number == REAL else f"Paper {number}"
+            yield Section(head, (title,), (_paper_table(number, results),), name=f"paper-{number}")
 
 
 def _paper_table(paper: str, results: Sequence[CheckResult]) -> Table:
@@ -393,11 +377,6 @@ def write_validation(validation: Validation, folder: RunFolder) -> None:
     folder.write_text("validation.html", render_report(validation))
     for name, content in summary_files(validation).items():
         folder.write_bytes(f"{SUMMARY}/{name}", content)
-    entries: dict[str, Any] = {
-        "backend": validation.backend,
-        "seed": validation.seed,
-        "only": validation.only,
-        "fast": validation.fast,
-    }
+    entries: dict[str, Any] = {name: getattr(validation, name) for name in ("backend", "seed", "only", "fast")}
     again = _words(validation)
     write_manifest(folder, PROGRAM, validation.started, validation.seconds, **entries, again=again)

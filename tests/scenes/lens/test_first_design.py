@@ -13,8 +13,8 @@ from optics.camera.telescopes import TELESCOPES, first_design
 from scenes.lens.__main__ import app
 from scenes.specs.load import load_camera
 from tests.tiers import quick
+from twin.camera.aberrations import distortion
 from twin.camera.camera_optics import CameraOptics
-from twin.camera.field_maps import distortion
 
 WAVE = 650e-9
 SHARP = 0.0714

@@ -21,9 +21,8 @@ from typing import TYPE_CHECKING, Literal, TypeAlias
 import numpy as np
 from scipy.ndimage import distance_transform_edt, gaussian_filter, map_coordinates, spline_filter, zoom
 
-from analysis.matching.correlation import MatchOptions, Reason, distinct_points
+from analysis.matching.correlation import MatchOptions, Reason, distinct_points, resampled
 from analysis.matching.matches import DisplacementField, consensus, match_windows
-from analysis.matching.spline import resampled
 from optics.numerics.array_math import PhysicalError
 from optics.numerics.number_tree import FrozenMap
 from twin.orbit.flight.sensor import Sensor

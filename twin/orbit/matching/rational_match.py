@@ -15,9 +15,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from analysis.matching.correlation import MatchOptions, Reason, distinct_points, search
+from analysis.matching.correlation import MatchOptions, Reason, distinct_points, resampled, search
 from analysis.matching.matches import DisplacementField, Matches, consensus, match_windows
-from analysis.matching.spline import resampled
 from optics.numerics.number_tree import FrozenMap
 from twin.framework.procedure import Advance, BenchError, silent
 from twin.framework.record import Quantity, Record

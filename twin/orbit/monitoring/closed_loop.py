@@ -27,7 +27,7 @@ from analysis.monitor.jump_detection import Jump
 from analysis.monitor.kalman_filter import SeriesFilter
 from analysis.monitor.recovery import MeasuredSpots, Recovery, SpotEvidence, judged_spots
 from analysis.spots.centroid import mean_frames
-from analysis.spots.spot_positions import SpotError
+from analysis.spots.spot_image import SpotError
 from analysis.statistics import limit_of, p_value_of
 from optics.geometry.tree import State, compose
 from optics.numerics.backend import cores, one_blas_thread
@@ -43,9 +43,8 @@ from twin.framework.random_streams import stream
 from twin.monitor.image_quality import ImageQuality, image_quality
 from twin.monitor.monitor_derivative import single_states, spot_jacobian
 from twin.monitor.monitor_experiment import MonitorExperiment
-from twin.monitor.motions import ElementaryMotion
 from twin.monitor.observation import LOST, ObservationOptions, observe
-from twin.monitor.truth import truth_jacobian
+from twin.monitor.truth import ElementaryMotion, truth_jacobian
 from twin.orbit.monitoring.monitor_series import states_of
 from twin.orbit.monitoring.pair_flight import TOO_FAR, motions_at
 

@@ -16,7 +16,7 @@ from analysis.monitor.monitor_formulas import CameraParameters
 from analysis.monitor.recovery import MeasuredSpots, Recovery, SpotEvidence, judged_spots
 from analysis.monitor.series_smoother import smooth_series, window_of
 from analysis.spots.centroid import mean_frames
-from analysis.spots.spot_positions import SeriesNoise, SpotError
+from analysis.spots.spot_image import SeriesNoise, SpotError
 from optics.geometry.tree import State, compose
 from optics.numerics.backend import cores, one_blas_thread
 from optics.thermal.heat import Temperature

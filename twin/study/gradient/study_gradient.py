@@ -40,8 +40,7 @@ from twin.framework.procedure import Advance, silent
 from twin.monitor.image_quality import quality_dicts
 from twin.monitor.monitor_derivative import hit_slopes, spot_gradient
 from twin.monitor.monitor_experiment import MonitorExperiment
-from twin.monitor.motions import ElementaryMotion
-from twin.monitor.truth import ACROSS, LINE_POINTS, line_in_world
+from twin.monitor.truth import ACROSS, LINE_POINTS, ElementaryMotion, line_in_world
 from twin.study.runs.base_job import Failure, Run, leaf
 from twin.study.runs.plan import number_at, number_of, ratios, scaled
 from twin.study.runs.render_base import PERTURB, JobMaker, run_results

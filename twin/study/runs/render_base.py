@@ -27,8 +27,7 @@ from scenes.yaml.spec import Spec, validate
 from scenes.yaml.yaml_file import YamlFile
 from twin.main_job.render_results import JobRun, RenderRun
 from twin.monitor.image_quality import QUALITY, quality_dicts
-from twin.monitor.monitor_experiment import MonitorExperiment
-from twin.monitor.monitor_memory import pieces
+from twin.monitor.monitor_experiment import MonitorExperiment, pieces
 from twin.monitor.observation import ObservationOptions, observe
 from twin.monitor.truth import Truth
 from twin.study.runs.base_job import PHYSICS, Failure, Outcome, Run, Tree, one_line, with_values

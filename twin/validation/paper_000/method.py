@@ -33,14 +33,8 @@ from optics.numerics.backend import Backend, one_blas_thread
 from optics.numerics.number_tree import FrozenMap
 from scenes.specs.orbit.angle import LINES
 from scenes.specs.orbit.setup import AngleSetup
+from twin.orbit.angle import angle_run
 from twin.orbit.angle.angle_flight import AngleCamera, AnglePass, Measurement, angle_camera, fly
-from twin.orbit.angle.angle_run import (
-    effect_rows,
-    line_of_sight_angles,
-    reduce_to_station,
-    resect_measurement,
-    values_of,
-)
 from twin.orbit.flight.line_camera import dihedral_angle
 from twin.orbit.flight.sensor import NO_EFFECTS, SPEED_OF_LIGHT, standard_refractivity
 from twin.validation.check import CheckResult, mean_of
@@ -76,7 +70,7 @@ class Passes:
     @cached_property
     def sections(self) -> tuple[Resection, ...]:
         """Space resection of every measurement: attitude and look angles adjusted from the ground points."""
-        return tuple(resect_measurement(m) for m in self.measured)
+        return tuple(angle_run.resect_measurement(m) for m in self.measured)
 
     def normal(self, line: str) -> np.ndarray:
         """Return the true unit normal of the plane that a camera line spans, (3,), in the ITRS.
@@ -396,9 +390,9 @@ def _vertical(planes: Planes) -> CheckResult:
 
 def _angle(planes: Planes, which: int, identifier: str) -> CheckResult:
     flight = planes.passes.flight
-    truth = values_of(flight.dihedral)[which]
+    truth = angle_run.values_of(flight.dihedral)[which]
     off = planes.angles[:, which] - truth
-    facts: dict[str, Any] = {"truth": truth, "off": off, "look": values_of(flight.look)[which] - truth}
+    facts: dict[str, Any] = {"truth": truth, "off": off, "look": angle_run.values_of(flight.look)[which] - truth}
     return planes.row(identifier, *mean_of(off / ARCSEC), 0.0, **facts)
 
 
@@ -447,7 +441,7 @@ def run_suppositions(context: Context) -> Iterator[CheckResult]:
 
 def _light(context: Context, passes: Passes) -> Iterator[CheckResult]:
     flight = passes.flight
-    rows = {row.what: row for row in effect_rows(flight)}
+    rows = {row.what: row for row in angle_run.effect_rows(flight)}
     looks = dict(flight.look)
     speed = float(np.linalg.norm(flight.velocity)) / SPEED_OF_LIGHT
     aberration = {"alpha": 1.0 - np.cos(looks["alpha"]), "beta": np.cos(looks["beta"]) - 1.0}
@@ -495,7 +489,9 @@ def _traced(context: Context, passes: Passes) -> Iterator[CheckResult]:
         alpha = np.array([angles_between(fits, [(0, 1)]).printed[0] for fits in planes])
         return mean_of((alpha - lab - trace) / ARCSEC)
 
-    common = [reduce_to_station(m, section) for m, section in zip(passes.measured, passes.sections, strict=True)]
+    common = [
+        angle_run.reduce_to_station(m, section) for m, section in zip(passes.measured, passes.sections, strict=True)
+    ]
     value, sigma = off(common)
     facts: dict[str, Any] = {"passes": passes, "trace": trace, "by_planes": trace / ARCSEC + value}
     yield context.row("000.traced", value, sigma, 0.0, **facts)
@@ -559,7 +555,7 @@ def _height(context: Context, flight: AnglePass) -> Iterator[CheckResult]:
 def _outlook(context: Context, passes: Passes) -> Iterator[CheckResult]:
     flight = passes.flight
     along = np.array(
-        [line_of_sight_angles(m, s)[1].values for m, s in zip(passes.measured, passes.sections, strict=True)]
+        [angle_run.line_of_sight_angles(m, s)[1].values for m, s in zip(passes.measured, passes.sections, strict=True)]
     )
     names = list(flight.pairs)
     for name in ("high_resolution", "multispectral"):

@@ -31,8 +31,8 @@ from scenes.models.instrument_model import Instrument
 from scenes.specs.instrument import BASE
 from scenes.specs.resolved import ResolvedJob
 from twin.monitor.monitor_experiment import MonitorExperiment
-from twin.monitor.motions import ElementaryMotion, line_family
 from twin.monitor.observation import ObservationOptions, observe, shared_detector
+from twin.monitor.truth import ElementaryMotion, line_family
 from twin.validation.group import load_printed
 from twin.validation.paper_001.formulas import PARAMETERS as NAMES
 from twin.validation.paper_001.formulas import focal_lengths

@@ -14,8 +14,13 @@ from scipy.stats import norm
 
 from analysis.arrays import ARCSEC, Array
 from analysis.statistics import rms
-from analysis.turntable.angle_network import NotConvergedError
-from analysis.turntable.dividing_error import FITS, CalibrationSeries, fit_dividing_error, rejection_rate
+from analysis.turntable.dividing_error import (
+    FITS,
+    CalibrationSeries,
+    NotConvergedError,
+    fit_dividing_error,
+    rejection_rate,
+)
 from optics.numerics.backend import one_blas_thread
 from scenes.specs.camera_tests import TurntableTestSpec
 from scenes.specs.resolved import TurntableSetup

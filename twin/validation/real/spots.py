@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from scipy import linalg
 
 from analysis.arrays import Array
+from analysis.spots.likelihood import fit_spot
 from analysis.spots.noise import NoiseModel
-from analysis.spots.spot_fit import fit_spot
 from analysis.spots.window_series import CAUSES, WindowSeries, chi_square_about, fit_window_series
 from analysis.statistics import rms
 from twin.framework.svg import AFTER, BEFORE, INK
