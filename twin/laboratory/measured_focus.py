@@ -237,8 +237,8 @@ def _scan(table: Table, site: _Site, shift: Array, mtf: Array, sigma: Array, rea
             if bad:
                 text += f"; reason for its first image without an edge: {bad}"
             raise table.error(int(rows[0]), "shift", text) from error
-    curves = [{edge: values[rows] for edge, rows in site.rows.items()} for values in (shift, mtf, sigma)]
-    return SiteScan(*curves, vertex=vertex, frames={}, target=np.empty(0))
+    shifts, heights, sigmas = ({edge: v[rows] for edge, rows in site.rows.items()} for v in (shift, mtf, sigma))
+    return SiteScan(shifts, heights, sigmas, vertex, frames={}, target=np.empty(0))
 
 
 def _from_images(

@@ -196,9 +196,9 @@ class CalibrationSetup(PayloadSetup[OrbitCalibrationSpec]):
         _require_known("line", test, ("drift",), test.drift, LINES)
         _require_movable(test, (*test.perturb, *test.drift), camera)
         if "nadir" in test.perturb and any(test.perturb["nadir"].principal_point):
-            problem, key = "the nadir line's principal point is the gauge", ("perturb", "nadir", "principal_point")
+            problem, where = "the nadir line's principal point is the gauge", ("perturb", "nadir", "principal_point")
             allowed = "no change; rotate the whole camera instead, by errors.star_tracker.bias"
-            raise test.error(problem, key, allowed=allowed)
+            raise test.error(problem, where, allowed=allowed)
         fewest = min(camera.pixels_of(name) for name in LINES)
         if test.points is not None:
             _require_ends(test, "points", (test.points.first, test.points.last), fewest, f"the lines of {camera.name}")
