@@ -98,10 +98,16 @@ KINDS = (
 
 _PI = Decimal("3.14159265358979323846264338327950288419716939937511")
 _DEGREE = _PI / 180
-_ARCSEC = _DEGREE / 3600
 _DEFINED: dict[str, dict[str, Decimal | str | int]] = {
-    "rad": {"rad": 1, "mrad": "1e-3", "urad": "1e-6", "deg": _DEGREE, "arcmin": _DEGREE / 60, "arcsec": _ARCSEC}
-    | {"mas": _ARCSEC / 1000},
+    "rad": {
+        "rad": 1,
+        "mrad": "1e-3",
+        "urad": "1e-6",
+        "deg": _DEGREE,
+        "arcmin": _DEGREE / 60,
+        "arcsec": _DEGREE / 3600,
+        "mas": _DEGREE / 3_600_000,
+    },
     "m": {"km": 1000, "m": 1, "mm": "1e-3", "um": "1e-6", "nm": "1e-9", "pm": "1e-12"},
     "": {"ppm": "1e-6", "percent": "1e-2", "um/m": "1e-6"},
     "s": {"d": 86_400, "h": 3600, "min": 60, "s": 1, "ms": "1e-3", "us": "1e-6"},
