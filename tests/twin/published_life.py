@@ -15,7 +15,7 @@ import numpy as np
 
 from scenes.specs.operation import OperationSetup, read_operation
 from scenes.specs.resolved import resolve_with
-from twin.operate.record.entries import MICRO, Entry, FileContent, digest_of_data, micros
+from twin.operate.record.entries import MICRO, Entry, FileContent, digest_of_data, micros, utc_text
 from twin.operate.record.history import History, initialise_record
 
 EXAMPLE = Path(__file__).resolve().parents[2] / "scenes/examples/focus_life.yaml"
@@ -123,15 +123,52 @@ def entries_of(life: Life, seed: int, shown: slice = slice(None)) -> list[Entry]
 
 def move_entry(day: str, size: float, sigma: float = 0.3, time_sigma: float = 0.0, hour: float = 0.0) -> Entry:
     content = {"values": [1e-6 * size], "sigma": 1e-6 * sigma, "unit": "m", "time_sigma": time_sigma}
-    return Entry("move", MIRROR, micros_of(days_since_launch(day) + hour / 24.0), content)
+    return Entry("move", MIRROR, micros(f"{day}T00:00:00Z") + round(3600.0 * hour) * MICRO, content)
 
 
 def given(name: str, entries: list[Entry]) -> FileContent:
     return FileContent(name, digest_of_data([name, [one.digest for one in entries]]), "", entries, {})
 
 
-def plan() -> OperationSetup:
-    return read_operation(EXAMPLE)
+def plan(folder: Path, changes: dict[str, str] | None = None, causes: str = "") -> OperationSetup:
+    """The shipped plan with parts of its text changed, and with other causes of disturbance."""
+    text, disturbances = EXAMPLE.read_text(), (EXAMPLE.parent / "focus_disturbances.yaml").read_text()
+    for old, new in (changes or {}).items():
+        assert old in text
+        text = text.replace(old, new)
+    head = disturbances[: disturbances.index("causes:")]
+    folder.mkdir(exist_ok=True)
+    (folder / "focus_disturbances.yaml").write_text(f"{head}causes:\n{causes}" if causes else disturbances)
+    (folder / "plan.yaml").write_text(text)
+    return read_operation(folder / "plan.yaml")
+
+
+def cause(name: str, sigma: str, law: str) -> str:
+    place = f"{{bodies: base/<camera>/M2, shift: [0 um, 0 um, {sigma}], time: {{{law}}}, reason: a test}}"
+    return f"  {name}: {place}\n"
+
+
+BLIND = cause("jumps", "5 um", "jump: 8766 h")
+"""Moves are not told: one a year."""
+LAW_ALONE = cause("creep", "0.05 um", "drift: 4800 h")
+
+
+def tables(seed: int = 1990, every: float = 90.0) -> dict[str, str]:
+    """The tables of the shipped example: file -> text."""
+    life = drawn(seed, every=every)
+    rng = np.random.default_rng([seed, 2])
+    focus, inputs = ["time,focus_um"], [f"time,{','.join(INPUTS)},light_shield"]
+    for k, day in enumerate(life.days):
+        time = micros_of(day)
+        focus.append(f"{utc_text(time)},{life.read[k]:.2f}")
+        for i, shield in enumerate(life.shield[k].tolist()):
+            last = i == SAMPLES - 1
+            cells = [f"{v[k] + SENSOR * rng.normal():.2f}" if last else "" for v in life.inputs.values()]
+            at = time - round(STEP * (SAMPLES - 1 - i)) * MICRO
+            inputs.append(",".join([utc_text(at), *cells, f"{shield + SENSOR * rng.normal():.2f}"]))
+    moves = ["date,move_um", *(f"{day}T00:00:00Z,{size}" for day, size in MOVES.items())]
+    rows = {"focus.csv": focus, "inputs.csv": inputs, "moves.csv": moves}
+    return {name: "\n".join(lines) + "\n" for name, lines in rows.items()}
 
 
 def record_of(folder: Path, *files: list[Entry]) -> History:

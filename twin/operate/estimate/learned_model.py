@@ -15,13 +15,13 @@ import numpy as np
 from analysis.arrays import Array
 from analysis.monitor.disturbances import FALSE_ALARM, Disturbances
 from analysis.monitor.filter_state import FilterState, Observed
-from analysis.monitor.kalman_filter import SeriesFilter, smoothed
+from analysis.monitor.kalman_filter import SeriesFilter
 from analysis.monitor.learned_terms import Decay, Input, Move, Slope, Term, Terms
 from analysis.statistics import limit_of
 from scenes.specs.operation import OperationSpec, TermSpec, motion_kind
 from scenes.yaml.errors import Problem, names_text, nearest
 from scenes.yaml.units import parse_quantity
-from twin.framework.artefact import decimals_for, fixed, plain
+from twin.framework.artefact import decimals_for, fixed
 from twin.operate.record.entries import DECISION, MICRO, micros, utc_text
 from twin.operate.record.history import History, content_of
 
@@ -31,7 +31,8 @@ UNDETERMINED = 0.9
 """Ratio of sigma to that of the prior above which the readings do not determine a term."""
 NEAR = 10
 """Number of readings before and after a move among which its true day is sought."""
-_DAY = 86_400.0
+_PREFERRED = 5.0
+"""Gain in log likelihood by which another size must exceed a wrong sign, a wrong day or no move, to be named."""
 
 
 def terms_of(plan: OperationSpec, prior: Disturbances, history: History, epoch: int, kind: str) -> Terms | None:
@@ -202,13 +203,36 @@ def _input_doubts(terms: Terms, term: Input) -> Iterator[str]:
         yield f"the window of {term.name} is longer than the series of its input"
 
 
+@dataclass(frozen=True, eq=False)
+class _Mistake:
+    """Possible mistake in the entry of a move.
+
+    Attributes
+    ----------
+    move : int
+        Index of the move among the terms.
+    text : str
+        Sentence on the mistake.
+    readings : slice
+        Readings that it changes.
+    factor : float or None
+        Change of these readings, in prior standard deviations of the motion; None if it is unknown.
+    """
+
+    move: int
+    text: str
+    readings: slice
+    factor: float | None
+
+
 def contradicted_moves(
     how: SeriesFilter, start: FilterState, observed: Sequence[Observed], inflation: float, text: Callable[[float], str]
 ) -> dict[str, str]:
     """Return the moves that the readings contradict, with a warning that names the likely mistake.
 
-    The test is on the score and the information (inverse variance) of a different size, from all readings, at the
-    false-alarm probability of the program for all moves together.
+    A mistake is a wrong sign, a move that did not happen, another day or another size. The gain in log likelihood is
+    exact, since the whitened readings are linear in the readings. The largest gain comes first, and is removed from the
+    readings before the next. The false-alarm probability of the program is that of all tests together.
 
     Parameters
     ----------
@@ -223,68 +247,86 @@ def contradicted_moves(
     text : callable
         Function that writes a time of the filter in seconds as a date.
     """
-    terms = how.terms
-    moves = [] if terms is None else [k for k, term in enumerate(terms.terms) if isinstance(term, Move)]
-    if terms is None or not moves or not observed:
+    times = np.array([reading.time for reading in observed])
+    terms = () if how.terms is None else how.terms.terms
+    cases = [case for k, term in enumerate(terms) if isinstance(term, Move) for case in _mistakes(k, term, times, text)]
+    if not cases:
         return {}
-    at, found = how.space.term_states, []
-
-    def note(number: int, score: Array, information: Array) -> None:
-        if number == 0:
-            found.append((score[at], np.diag(information)[at]))
-
-    nothing = [np.zeros(len(how.walking))] * len(observed)
-    smoothed(how, start, observed, np.zeros(0), nothing, how.parameters_of, note)
-    score, information = found[0]
-    limit = float(limit_of(FALSE_ALARM / len(moves), 1)) * inflation**2
-    wrong = [k for k in moves if score[k] ** 2 > limit * information[k] > 0.0]
-    out = {}
-    for k in sorted(wrong, key=lambda k: -(score[k] ** 2) / information[k]):
-        term = terms.terms[k]
+    white, response = _whitened_response(how, start, observed, [(terms[c.move].motion, c.readings) for c in cases])
+    information = np.sum(response**2, axis=0)
+    limit = 0.5 * float(limit_of(FALSE_ALARM / len(cases), 1)) * inflation**2
+    out: dict[str, str] = {}
+    while cases:
+        score = response.T @ white
+        best = np.divide(score, information, out=np.zeros_like(score), where=information > 0.0)
+        factors = np.array([b if c.factor is None else c.factor for b, c in zip(best.tolist(), cases, strict=True)])
+        gains = factors * score - 0.5 * factors**2 * information
+        k = cases[int(np.argmax(gains))].move
+        mine = [i for i, case in enumerate(cases) if case.move == k]
+        free = next(i for i in mine if cases[i].factor is None)
+        if gains[mine].max() < limit:
+            break
+        # another size explains as much as a wrong sign, but is less likely
+        chosen = max(mine, key=lambda i: gains[i] + (_PREFERRED if i != free else 0.0))
+        term = terms[k]
         unit, name = float(how.prior.sigmas[term.motion]), how.prior.units[term.motion].replace("um", "µm")
-        shown, sigma = unit * (term.mean + score[k] / information[k]), unit / math.sqrt(information[k])
+        sigma = unit / math.sqrt(information[free])
         digits = decimals_for(sigma)
-        seen = f"{fixed(shown, digits, True)} ± {fixed(sigma, digits)} {name}, not {plain(unit * term.mean)} {name}"
-        cause = _likely_mistake(how, start, observed, k, text)
-        out[term.name] = f"{term.name}, contradicts the readings, which show {seen}: {cause}"
+        seen = f"{fixed(unit * (term.mean + best[free]), digits, True)} ± {fixed(sigma, digits)} {name}"
+        entered = f"{fixed(unit * term.mean, digits, True)} {name}"
+        out[term.name] = f"{term.name}, of {entered} contradicts the readings, in which it is {seen}: {cases[chosen].text}"
+        white = white - factors[chosen] * response[:, chosen]
+        left = [i for i, case in enumerate(cases) if case.move != k]
+        cases, response, information = [cases[i] for i in left], response[:, left], information[left]
     return out
 
 
-def _likely_mistake(
-    how: SeriesFilter, start: FilterState, observed: Sequence[Observed], k: int, text: Callable[[float], str]
-) -> str:
-    """Return which change of a move explains the readings best: another sign, no move, another day or another size."""
-    assert how.terms is not None
-    move = how.terms.terms[k]
-    assert isinstance(move, Move)
-    times = np.array([reading.time for reading in observed])
-    first = int(np.searchsorted(times, move.time))
-    near = [(times[i - 1], times[i]) for i in range(max(first - NEAR, 1), min(first + NEAR + 1, len(times))) if i != first]
-    cases: list[tuple[str, Move]] = [
-        ("its sign seems to be wrong", replace(move, mean=-move.mean)),
-        ("it seems not to have happened", replace(move, mean=0.0)),
-        ("its size seems to be wrong", replace(move, sigma=move.sigma + 2.0 * abs(move.mean))),
-    ]
-    cases += [
-        (f"its day seems to be wrong, rather between {text(a)} and {text(b)}", replace(move, time=0.5 * (a + b), time_sigma=0.0))
-        for a, b in near
-    ]
-    scores = [_log_score(_with_term(how, k, other), start, observed) for _, other in cases]
-    return cases[int(np.argmax(scores))][0]
+def _mistakes(k: int, move: Move, times: Array, text: Callable[[float], str]) -> Iterator[_Mistake]:
+    """Yield the possible mistakes in the entry of a move, of which the readings at given times can show something."""
+    first, count = int(np.searchsorted(times, move.time)), len(times)
+    if first == count:
+        return
+    later = slice(first, count)
+    yield _Mistake(k, "its size seems to be wrong", later, None)
+    yield _Mistake(k, "its sign seems to be wrong", later, -2.0 * move.mean)
+    yield _Mistake(k, "it seems not to have happened", later, -move.mean)
+    for j in range(max(first - NEAR, 1), min(first + NEAR + 1, count)):
+        day = f"its day seems to be wrong, rather between {text(float(times[j - 1]))} and {text(float(times[j]))}"
+        if j < first:
+            yield _Mistake(k, day, slice(j, first), move.mean)
+        elif 0 < first < j:
+            yield _Mistake(k, day, slice(first, j), -move.mean)
 
 
-def _with_term(how: SeriesFilter, k: int, term: Term) -> SeriesFilter:
-    """Return a filter with one term replaced."""
-    assert how.terms is not None
-    terms = (*how.terms.terms[:k], term, *how.terms.terms[k + 1 :])
-    return replace(how, terms=replace(how.terms, terms=terms))
+def _whitened_response(
+    how: SeriesFilter, start: FilterState, observed: Sequence[Observed], changes: Sequence[tuple[int, slice]]
+) -> tuple[Array, Array]:
+    """Return the whitened readings, (N d,), and their response to changes of the readings, (N d, C).
 
-
-def _log_score(how: SeriesFilter, start: FilterState, observed: Sequence[Observed]) -> float:
-    """Return the logarithm of the predicted density of all readings."""
-    current, total = replace(how.start(start.time), search=None), 0.0
-    for reading in observed:
+    Parameters
+    ----------
+    how : SeriesFilter
+        Filter that does not search for jumps.
+    start : FilterState
+        State before the first reading.
+    observed : sequence of Observed
+        N readings of d values in the order of time.
+    changes : sequence of (int, slice)
+        For each of C changes a motion, and the readings that see one standard deviation of it.
+    """
+    current, states = start, np.zeros((how.space.size, len(changes)))
+    effects = how.prior.spots[:, [motion for motion, _ in changes]]
+    inside = np.zeros((len(observed), len(changes)))
+    for column, (_, readings) in enumerate(changes):
+        inside[readings, column] = 1.0
+    white, response = [], []
+    for k, reading in enumerate(observed):
+        states = how.space.moved(states, current.time, reading.time)
         there = how.at(current, reading.time)
-        track, innovation = how.ingested(there.state, reading)
-        current, total = replace(there, state=track), total + innovation.log_score
-    return total
+        whitened = how.whitened(there.state, reading)
+        seen = whitened.picked[:, : len(effects)] @ (effects * inside[k]) - whitened.rows @ states
+        states = states + whitened.gain.T @ seen
+        current = replace(there, state=how.ingested(there.state, reading, whitened)[0])
+        white.append(whitened.white)
+        response.append(seen)
+    return np.concatenate(white), np.concatenate(response)
