@@ -170,7 +170,7 @@ class Input(Term):
             return float("nan"), float("nan")
         reach = self.window if self.lag is None else _FORGOTTEN * self.lag * np.exp(x)
         begin = end - 1 if reach is None else int(np.searchsorted(self.times, time - reach, side="right"))
-        begin = min(begin, end - 1)
+        begin = min(begin if self.lag is None else max(begin - 1, 0), end - 1)
         weights = np.full(end - begin, 1.0 / (end - begin))
         if self.lag is not None:
             weights = _lag_weights(self.times[begin:end], time, self.lag * float(np.exp(x)))

@@ -463,7 +463,7 @@ class StateSpace:
         return values, rows, left + self._gain_noise(mean, covariance, time)
 
     def _gain_noise(self, mean: Array, covariance: Array, time: float) -> Array | float:
-        """Return the covariance of the outputs due to uncertain gains of the terms, (D + P, D + P); 0 if there are none."""
+        """Return the covariance (D + P, D + P) of the outputs due to uncertain gains of the terms; 0 without terms."""
         if self.terms is None:
             return 0.0
         at, spread = self.term_states, self._gains(time)[1]

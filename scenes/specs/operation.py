@@ -17,7 +17,20 @@ from scenes.specs.disturbances import NONE, DisturbancesSpec
 from scenes.specs.load import DISTURBANCES, INSTRUMENTS, portable_reference
 from scenes.specs.resolved import ResolvedJob, resolve_on
 from scenes.yaml.errors import Problem, names_text, nearest, shown, unknown
-from scenes.yaml.spec import Name, Named, Number, Paths, Ref, Reference, Spec, Text, Whole, not_empty, short_for, validate
+from scenes.yaml.spec import (
+    Name,
+    Named,
+    Number,
+    Paths,
+    Ref,
+    Reference,
+    Spec,
+    Text,
+    Whole,
+    not_empty,
+    short_for,
+    validate,
+)
 from scenes.yaml.unit_fields import ClockReading, Quantity, TimeScale
 from scenes.yaml.units import ANGLE, LENGTH, MOMENT, SCALE, TEMPERATURE, TEMPERATURE_DIFFERENCE, Kind, parse_quantity
 from scenes.yaml.yaml_file import read_yaml
@@ -215,12 +228,16 @@ class TermSpec(Spec):
     def _is_one_kind(self) -> TermSpec:
         kinds = [key for key in ("decay", "per", "input") if getattr(self, key) is not None]
         if len(kinds) > 1:
-            raise Problem("two kinds of term", names_text(kinds), "one of them, or none for a constant", within=(kinds[1],))
+            raise Problem(
+                "two kinds of term", names_text(kinds), "one of them, or none for a constant", within=(kinds[1],)
+            )
         for key in ("window", "relative", "lag"):
             if getattr(self, key) and not self.input:
                 raise Problem(f"{key} without an input", None, "input: NAME", within=(key,))
         if self.relative and self.window is None:
-            raise Problem("relative to no mean", None, "window: the time over which the mean is taken", within=("relative",))
+            raise Problem(
+                "relative to no mean", None, "window: the time over which the mean is taken", within=("relative",)
+            )
         if self.window is not None and self.lag is not None:
             raise Problem("a window and a lag", None, "one of them; two terms for both", within=("lag",))
         if self.since is not None and not (self.decay or self.per):
@@ -393,7 +410,6 @@ MOVE = "move"
 def value_kinds(kind: str, subject: str) -> tuple[Kind, Kind]:
     """Return the kinds of quantity of a reading or move in a table, and of its sigma; raise Problem for no motion."""
     return (motion_kind(subject),) * 2 if kind == MOVE else VALUES[kind]
-
 
 
 RUNS = ("monitor", "calibration", "angle")

@@ -231,7 +231,12 @@ def _new_alarms(call: Call, page: Path | None) -> list[str]:
         from twin.operate.overview import reading_span
 
         write_report(
-            call, call.history, operation, end_of_day(None, reading_span(call.history, call.reading_kind)[1]), [call.location], page
+            call,
+            call.history,
+            operation,
+            end_of_day(None, reading_span(call.history, call.reading_kind)[1]),
+            [call.location],
+            page,
         )
     return [f"alarm: {alarm.text}" for alarm in new]
 
@@ -313,7 +318,8 @@ def status(
         else:
             print_line(
                 console,
-                f"no estimate: the record has no reading of the {call.reading_kind}; python -m twin.operate ingest adds readings",
+                f"no estimate: the record has no reading of the {call.reading_kind}; "
+                "python -m twin.operate ingest adds readings",
             )
         if power:
             show_power(power, console)

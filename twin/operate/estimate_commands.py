@@ -381,12 +381,18 @@ def _show_terms(result: FilterResult, console: Console) -> None:
 
     rows = []
     for term in result.terms:
-        cells = [with_sigma(term.amount, term.sigma, term.unit, True), with_sigma(term.prior, term.prior_sigma, term.unit, True)]
+        cells = [
+            with_sigma(term.amount, term.sigma, term.unit, True),
+            with_sigma(term.prior, term.prior_sigma, term.unit, True),
+        ]
         constant, spread = term.time_constant_h, term.time_constant_h_sigma
         days = "" if constant is None or spread is None else with_sigma(constant / 24.0, spread / 24.0, "days")
         rows.append([term.name, *cells, days])
     if rows:
         show_table(console, ("term or move", "amount", "before any reading", "time constant"), rows, (1, 2, 3))
+    for term in result.terms:
+        if term.note:
+            print_line(console, term.note)
 
 
 def show_power(powers: Sequence[DetectionPower], console: Console) -> None:

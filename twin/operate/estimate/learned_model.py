@@ -86,9 +86,7 @@ def _motion(name: str, prior: Disturbances) -> tuple[int, float]:
     return k, float(prior.sigmas[k]) * parse_quantity(f"1 {prior.units[k]}", motion_kind(name))
 
 
-def _term(
-    plan: OperationSpec, name: str, spec: TermSpec, prior: Disturbances, history: History, epoch: int
-) -> Term:
+def _term(plan: OperationSpec, name: str, spec: TermSpec, prior: Disturbances, history: History, epoch: int) -> Term:
     """Return one term of a plan; raise Problem if its motion or its input does not exist."""
     k, size = _motion(spec.motion, prior)
     mean, sigma = spec.amount.si(spec.kind)
@@ -131,8 +129,10 @@ class LearnedTerm:
         Time of a move; None for other terms.
     undetermined : bool
         True if the readings do not determine the amount or the time constant.
+    note : str
+        What the readings do not determine, and where its input was not measured; empty for nothing.
     warning : str
-        What is doubtful about it; empty if nothing is.
+        Likely mistake in the entry of a move that the readings contradict; empty for none.
     """
 
     name: str
@@ -146,6 +146,7 @@ class LearnedTerm:
     time_constant_h_sigma: float | None
     time_utc: str | None
     undetermined: bool
+    note: str = ""
     warning: str = ""
 
 
@@ -189,9 +190,9 @@ def learned_terms(
             texts += _input_doubts(terms, term)
         when = utc_text(epoch + round(term.time * MICRO)) if isinstance(term, Move) else None
         values = (unit * float(v) for v in (mean[k], sigma[k], term.mean, term.sigma))
-        warning = "; ".join([*texts, *([contradicted[term.name]] if term.name in contradicted else [])])
+        note, warning = "; ".join(texts), contradicted.get(term.name, "")
         what = prior.labels[term.motion], prior.units[term.motion]
-        out.append(LearnedTerm(term.name, *what, *values, constant, constant_sigma, when, vague, warning))
+        out.append(LearnedTerm(term.name, *what, *values, constant, constant_sigma, when, vague, note, warning))
     return tuple(out)
 
 
@@ -274,7 +275,9 @@ def contradicted_moves(
         digits = decimals_for(sigma)
         seen = f"{fixed(unit * (term.mean + best[free]), digits, True)} ± {fixed(sigma, digits)} {name}"
         entered = f"{fixed(unit * term.mean, digits, True)} {name}"
-        out[term.name] = f"{term.name}, of {entered} contradicts the readings, in which it is {seen}: {cases[chosen].text}"
+        out[term.name] = (
+            f"{term.name}, of {entered} contradicts the readings, in which it is {seen}: {cases[chosen].text}"
+        )
         white = white - factors[chosen] * response[:, chosen]
         left = [i for i, case in enumerate(cases) if case.move != k]
         cases, response, information = [cases[i] for i in left], response[:, left], information[left]

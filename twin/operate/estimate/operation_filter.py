@@ -38,14 +38,7 @@ from scenes.yaml.errors import Problem
 from twin.framework.provenance import source_digest
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.operate.estimate.estimate_snapshot import EntryFilter, EstimatorState, Violation, packed, unpacked
-from twin.operate.estimate.learned_model import (
-    MOVE,
-    NEAR,
-    LearnedTerm,
-    contradicted_moves,
-    learned_terms,
-    terms_of,
-)
+from twin.operate.estimate.learned_model import MOVE, NEAR, LearnedTerm, contradicted_moves, learned_terms, terms_of
 from twin.operate.estimate.operation_model import OperationModel, focus_model, plan_digest, traced_model
 from twin.operate.estimate.reported_estimate import (
     Course,
@@ -120,7 +113,9 @@ class Operation:
         first = history.first(self.reading_kind)
         if first is None or (focus is not None and focus.camera not in history.subjects("focus")):
             if focus is not None:
-                raise Problem(f"the record has no reading of the focus of {focus.camera}", None, "a table of kind focus")
+                raise Problem(
+                    f"the record has no reading of the focus of {focus.camera}", None, "a table of kind focus"
+                )
             allowed = "python -m twin.operate ingest RECORD RUN adds a run of twin.recover or twin.render"
             raise Problem("the record has no reading of the monitor", None, allowed)
         self.epoch = int(first["time_us"])

@@ -176,7 +176,9 @@ class History:
         with writing(self._engine) as connection:
             row = connection.execute(select(ENTRY).where(c.id == number, c.kind.in_(DECIDED))).mappings().first()
             if row is None:
-                allowed = "a reading of the monitor, a temperature, a focus or a move; export writes the numbers of all entries"
+                allowed = (
+                    "a reading of the monitor, temperature, focus or move; export writes the numbers of all entries"
+                )
                 raise Problem("no such reading", str(number), allowed)
             decisions = select(c.content).where(c.kind == DECISION, c.subject == str(number)).order_by(c.id)
             before = [parse_json(decision, "the record") for decision in connection.execute(decisions).scalars()]
