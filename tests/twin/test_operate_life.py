@@ -11,7 +11,10 @@ import numpy as np
 import pytest
 from scipy.stats import binomtest, chi2, norm
 
+from optics.numerics.backend import load_backend
 from scenes.yaml.errors import InputError, Problem
+from tests.twin.operation_records import life_of, monitor_entry, plan_of
+from tests.twin.operation_records import record_of as monitored_record
 from tests.twin.published_life import (
     AMPLITUDE,
     BLIND,
@@ -38,8 +41,9 @@ from tests.twin.published_life import (
     tables,
 )
 from tests.twin.test_operate import run
+from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.operate.estimate.operation_filter import Operation
-from twin.operate.record.entries import MICRO, micros
+from twin.operate.record.entries import MICRO, Entry, micros
 
 FALSE_ALARM = 1e-3
 """Of every statistical assertion here: seeds are fixed, and another seed fails so often."""
@@ -104,7 +108,7 @@ def test_told_moves_have_their_sizes_within_their_sigmas():
         own = [k for k, term in enumerate(result.terms) if term.time_utc]
         off = size * state.mean[at][own] - list(MOVES.values())
         square += off @ np.linalg.solve(size**2 * state.covariance[at, at][np.ix_(own, own)], off)
-        assert all(result.terms[k].sigma < 1.3 for k in own)  # 2 um before the readings
+        assert np.median([result.terms[k].sigma for k in own]) < 1.2  # 2 um before the readings
     number = len(MOVES) * len(TOLD)
     assert chi2.ppf(FALSE_ALARM / 2, number) < square < chi2.isf(FALSE_ALARM / 2, number)
 
@@ -166,43 +170,37 @@ def test_moves_that_are_not_told_are_found_where_noise_allows():
     assert np.mean(np.square(white)) < chi2.isf(FALSE_ALARM, len(white)) / len(white)
 
 
-MISTAKES = {
-    "sign": (
-        {"1996-03-14": ("1996-03-14", -6.0)},
-        "1996-03-14",
-        "of −6.00 µm contradicts",
-        "its sign seems to be wrong",
+SIGN, ABSENT, SIZE = "its sign seems to be wrong", "it seems not to have happened", "its size seems to be wrong"
+MISTAKES = (
+    (("1995-08-28", "1996-01-15", 6.5, "its day seems to be wrong, rather between 1995-07"),),
+    (
+        (
+            "1994-03-07",
+            "1994-03-07",
+            9.5,
+            f"of +9.5 µm contradicts the readings, in which it is +94.9 ± 1.0 µm: {SIZE}",
+        ),
+        ("1996-03-14", "1996-03-14", -6.0, SIGN),
+        ("2006-07-31", "2006-02-10", 5.34, "its day seems to be wrong, rather between 2006-06"),
+        ("", "2010-08-01", 6.0, ABSENT),
     ),
-    "late": (
-        {"1995-08-28": ("1996-01-15", 6.5)},
-        "1996-01-15",
-        "its day seems to be wrong, rather between 1995-07",
-        "",
-    ),
-    "early": (
-        {"2006-07-31": ("2006-02-10", 5.34)},
-        "2006-02-10",
-        "its day seems to be wrong, rather between 2006-06",
-        "",
-    ),
-    "none": ({"2008-01-01": ("2008-01-01", 6.0)}, "2008-01-01", "it seems not to have happened", ""),
-    "factor": ({"1994-03-07": ("1994-03-07", 9.5)}, "1994-03-07", "its size seems to be wrong", ""),
-}
+)
+"""Day of a move as it was, day and size as entered, and what a warning says."""
 
 
 @pytest.mark.second
-@pytest.mark.parametrize("mistake", MISTAKES)
-def test_a_move_entered_wrongly_is_named_with_the_mistake(mistake: str, tmp_path: Path):
-    changes, day, *texts = MISTAKES[mistake]
-    moves = [move_entry(*entered) for entered in ({d: (d, s) for d, s in MOVES.items()} | changes).values()]
-    with record_of(
-        tmp_path / "r", sorted(moves, key=lambda one: one.time), entries_of(drawn(3, every=40.0), 3)
-    ) as history:
+@pytest.mark.parametrize("mistakes", MISTAKES)
+def test_moves_entered_wrongly_are_named_with_the_mistakes(mistakes: tuple, tmp_path: Path):
+    sizes = {day: size for day, size in MOVES.items() if day not in [true for true, *_ in mistakes]}
+    entered = sizes | {day: size for _, day, size, _ in mistakes}
+    moves = [move_entry(day, entered[day]) for day in sorted(entered)]
+    with record_of(tmp_path / "r", moves, entries_of(drawn(3, every=40.0), 3)) as history:
         warnings = Operation(history, plan(tmp_path / "plan")).filter_readings().warnings
     named = [text for text in warnings if "the move of" in text]
-    assert len(named) == 1, warnings
-    assert f"the move of {day}" in named[0]
-    assert all(text in named[0] for text in texts)
+    assert len(named) == len(mistakes), warnings
+    for text, (_, day, _, said) in zip(named, mistakes, strict=True):
+        assert f"the move of {day}" in text
+        assert said in text
 
 
 def few(folder: Path, *files: list, changes: dict[str, str] | None = None, causes: str = LAW_ALONE) -> tuple:
@@ -334,3 +332,29 @@ def test_the_example_runs_from_the_command_line(tmp_path: Path):
     assert "focus of ritchey_chretien" in command("forecast", record)
     assert "report" in command("report", record, "--out", tmp_path / "day.html")
     assert "excluded" in command("exclude", record, "1", "--why", "entered twice")
+
+
+@pytest.mark.second
+def test_a_move_of_a_body_of_a_monitored_instrument_is_no_jump(tmp_path: Path):
+    setup = plan_of(tmp_path)
+    own = MonitorExperiment(setup.model, load_backend())
+    stated = own.disturbances
+    assert stated is not None
+    label = "base/backward/M2 shift x"
+    motion = stated.labels.index(label)
+    life = life_of(stated, 80.0, 4.0, 3, {50.0: {motion: 30.0}})  # 60 um: a slip that the monitor sees
+    entries = [monitor_entry(own, stated, life, k, 3) for k in range(len(life.times))]
+    content = {"values": [60e-6], "sigma": 1e-6, "unit": "m", "time_sigma": 0.0}
+    entry = Entry("move", label, int(life.times[0]) + 50 * 86_400 * MICRO - MICRO, content)
+    results = []
+    for name, moves in (("told", [entry]), ("untold", [])):
+        with monitored_record(tmp_path / name, setup) as history:
+            history.ingest(given("all", [*moves, *entries]))
+            results.append(Operation(history, setup).filter_readings())
+    told_result, untold = results
+    assert not told_result.jumps
+    assert [jump.body for jump in untold.jumps] == ["base/backward/M2"]
+    (term,) = told_result.terms
+    assert term.amount == pytest.approx(60.0, abs=4.0 * term.sigma)
+    assert term.sigma <= 1.0
+    assert not [text for text in told_result.warnings if "move" in text]

@@ -56,7 +56,18 @@ def terms_of(plan: OperationSpec, prior: Disturbances, history: History, epoch: 
     Problem
         The disturbances have no such motion, or the record has no such input.
     """
-    terms = [_term(plan, name, spec, prior, history, epoch) for name, spec in plan.terms.items()]
+    inputs = {spec.input for spec in plan.terms.values() if spec.input is not None}
+    samples: dict[str, list[tuple[float, float, float]]] = {}
+    for sample in history.entries(INPUT) if inputs else ():
+        if (subject := str(sample["subject"])) in inputs:
+            content = content_of(sample)
+            numbers = (sample["time_us"] - epoch) / MICRO, float(content["values"][0]), float(content["sigma"])
+            samples.setdefault(subject, []).append(numbers)
+    if absent := sorted(inputs - samples.keys()):
+        known = names_text(history.subjects(INPUT)) or "none"
+        allowed = f"a table of kind input with it; the record has {known}"
+        raise Problem(f"the record has no readings of the input {absent[0]}", None, allowed)
+    terms = [_term(name, spec, prior, epoch, samples) for name, spec in plan.terms.items()]
     for entry in moves_of(history):
         content, motion = content_of(entry), str(entry["subject"])
         k, size = _motion(motion, prior)
@@ -65,7 +76,7 @@ def terms_of(plan: OperationSpec, prior: Disturbances, history: History, epoch: 
         terms.append(Move(name, k, *amounts, (entry["time_us"] - epoch) / MICRO, float(content["time_sigma"])))
     if not terms:
         return None
-    readings = np.array([(entry["time_us"] - epoch) / MICRO for entry in history.entries(kind)])
+    readings = [(entry["time_us"] - epoch) / MICRO for entry in history.entries(kind)] if inputs else []
     return Terms(tuple(terms), np.unique(readings))
 
 
@@ -86,8 +97,14 @@ def _motion(name: str, prior: Disturbances) -> tuple[int, float]:
     return k, float(prior.sigmas[k]) * parse_quantity(f"1 {prior.units[k]}", motion_kind(name))
 
 
-def _term(plan: OperationSpec, name: str, spec: TermSpec, prior: Disturbances, history: History, epoch: int) -> Term:
-    """Return one term of a plan; raise Problem if its motion or its input does not exist."""
+def _term(
+    name: str,
+    spec: TermSpec,
+    prior: Disturbances,
+    epoch: int,
+    samples: Mapping[str, Sequence[tuple[float, float, float]]],
+) -> Term:
+    """Return one term of a plan, with the times [s], values and sigmas of the samples of its input."""
     k, size = _motion(spec.motion, prior)
     mean, sigma = spec.amount.si(spec.kind)
     given = name, k, mean / size, sigma / size
@@ -98,17 +115,10 @@ def _term(plan: OperationSpec, name: str, spec: TermSpec, prior: Disturbances, h
         return Decay(*given, since, spec.decay.value, spec.decay.sigma or None)
     if spec.input is None:
         return Term(*given)
-    samples = [entry for entry in history.entries(INPUT) if entry["subject"] == spec.input]
-    if not samples:
-        known = history.subjects(INPUT)
-        allowed = f"a table of kind input with it; the record has {names_text(known) if known else 'none'}"
-        raise Problem(f"the record has no readings of the input {spec.input} of {name}", None, allowed)
-    contents = [content_of(sample) for sample in samples]
-    times = np.array([(sample["time_us"] - epoch) / MICRO for sample in samples])
-    values = np.array([float(content["values"][0]) - spec.reference for content in contents])
-    lag = (None, None) if spec.lag is None else (spec.lag.value, spec.lag.sigma or None)
-    noise = float(np.median([float(content["sigma"]) for content in contents]))
-    return Input(*given, times, values, noise, spec.window, spec.relative, *lag, spec.gap)
+    times, values, sigmas = np.array(samples[spec.input]).T
+    lag, spread = (None, None) if spec.lag is None else (spec.lag.value, spec.lag.sigma or None)
+    noise = float(np.median(sigmas))
+    return Input(*given, times, values - spec.reference, noise, spec.window, spec.relative, lag, spread, spec.gap)
 
 
 @dataclass(frozen=True)
@@ -240,9 +250,9 @@ def contradicted_moves(
     how : SeriesFilter
         Filter that does not search for jumps; its steps are those that no move explains.
     start : FilterState
-        State before the first reading.
+        State before the first of the readings.
     observed : sequence of Observed
-        All readings in the order of time.
+        Readings from there on, in the order of time; only moves between them are tested.
     inflation : float
         Factor of all sigmas.
     text : callable
@@ -287,7 +297,7 @@ def contradicted_moves(
 def _mistakes(k: int, move: Move, times: Array, text: Callable[[float], str]) -> Iterator[_Mistake]:
     """Yield the possible mistakes in the entry of a move, of which the readings at given times can show something."""
     first, count = int(np.searchsorted(times, move.time)), len(times)
-    if first == count:
+    if first in (0, count):  # a move before all readings is part of a constant
         return
     later = slice(first, count)
     yield _Mistake(k, "its size seems to be wrong", later, None)
@@ -297,7 +307,7 @@ def _mistakes(k: int, move: Move, times: Array, text: Callable[[float], str]) ->
         day = f"its day seems to be wrong, rather between {text(float(times[j - 1]))} and {text(float(times[j]))}"
         if j < first:
             yield _Mistake(k, day, slice(j, first), move.mean)
-        elif 0 < first < j:
+        elif j > first:
             yield _Mistake(k, day, slice(first, j), -move.mean)
 
 

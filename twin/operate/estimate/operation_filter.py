@@ -61,6 +61,8 @@ HEAD_READINGS = 16
 
 Filtering so many readings again takes as long as saving the state.
 """
+CHECKED_READINGS = 2000
+"""Number of the latest readings among which commanded moves are compared with the readings."""
 MOST_PASSES, GROWTH = 6, 1.25
 """Largest number of linearisations at one number of readings, and ratio of that number to the next one."""
 _MODEL, _HEAD = -1, 0
@@ -389,7 +391,8 @@ class Operation:
     def _learned_terms(self) -> tuple[LearnedTerm, ...]:
         """Return the estimates of the terms and moves from all readings, with the moves that the readings contradict.
 
-        That test assumes all jumps but those near a move, which may be the mistake itself.
+        That test, of moves among the last `CHECKED_READINGS`, assumes all jumps but those near a move, which may be the
+        mistake itself.
         """
         series_filter = self._entry_filter.series_filter
         if series_filter.terms is None:
@@ -397,14 +400,16 @@ class Operation:
         contradicted = {}
         if self.history.first(MOVE) is not None:
             moves = [term.time for term in series_filter.terms.terms if isinstance(term, Move)]
-            times = np.unique([(time - self.epoch) / MICRO for time, _, _ in self._segment_innovations()])
+            read = sorted(time for time, _, _ in self._segment_innovations())
+            begin = self._begin() if len(read) <= CHECKED_READINGS else read[-CHECKED_READINGS]
+            times = [(time - self.epoch) / MICRO for time in read]
             apart = []
             for found, step in zip(self.estimator_state.jumps, self._steps(), strict=True):
                 places = np.searchsorted(times, [found.jump.after, found.jump.until, *moves])
                 if not np.any((places[2:] > places[0] - NEAR) & (places[2:] < places[1] + NEAR)):
                     apart.append(step)
             with one_blas_thread():
-                how, start, observed, _ = self._smoothing_inputs(self._begin())
+                how, start, observed, _ = self._smoothing_inputs(begin)
                 how = replace(how, steps=(*series_filter.steps, *apart), include_undetected=False)
                 contradicted = contradicted_moves(
                     how,
