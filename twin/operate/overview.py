@@ -262,8 +262,9 @@ class Overview:
     def of(cls, history: History, operation: Operation) -> Overview:
         """Return the overview of a record and its estimate after all readings."""
         known = operation.plan.operation.events
-        dated = ((int(entry["time_us"]), str(entry["subject"])) for entry in history.entries("event"))
-        events = tuple((time, name, tuple(known.get(name, ()))) for time, name in dated)
+        dated = [(int(entry["time_us"]), str(entry["subject"])) for entry in history.entries("event")]
+        dated += [(int(entry["time_us"]), "commanded_move") for entry in history.entries("move")]
+        events = tuple((time, name, tuple(known.get(name, ()))) for time, name in sorted(dated))
         begin = reading_span(history, operation.reading_kind)[0]
         return cls(operation, operation.filter_readings(), tuple(history.alarms()), events, begin)
 
