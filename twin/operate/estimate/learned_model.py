@@ -199,10 +199,11 @@ def learned_terms(
         if isinstance(term, Input):
             texts += _input_doubts(terms, term)
         when = utc_text(epoch + round(term.time * MICRO)) if isinstance(term, Move) else None
-        values = (unit * float(v) for v in (mean[k], sigma[k], term.mean, term.sigma))
+        amount, spread, before, before_sigma = unit * np.array([mean[k], sigma[k], term.mean, term.sigma])
         note, warning = "; ".join(texts), contradicted.get(term.name, "")
         what = prior.labels[term.motion], prior.units[term.motion]
-        out.append(LearnedTerm(term.name, *what, *values, constant, constant_sigma, when, vague, note, warning))
+        found = float(amount), float(spread), float(before), float(before_sigma)
+        out.append(LearnedTerm(term.name, *what, *found, constant, constant_sigma, when, vague, note, warning))
     return tuple(out)
 
 
