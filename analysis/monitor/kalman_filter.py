@@ -90,6 +90,7 @@ from analysis.monitor.jump_detection import (
     most_likely_jump,
     subthreshold_share,
 )
+from analysis.monitor.learned_terms import Terms
 from analysis.monitor.state_space import HeatInputs, StateSpace
 from analysis.statistics import limit_of
 from optics.numerics.array_math import covariance_root
@@ -156,6 +157,8 @@ class SeriesFilter:
         Time before the first reading of spots in which bodies may have jumped, s; 0 if there is none.
     leaving_out : bool
         True if a reading may be excluded as bad.
+    terms : Terms or None
+        Known functions of time with learned amounts, such as decays and commanded moves; None if there are none.
     candidates : tuple of Candidate
         Candidates for jumps, single motions and those of a body together.
     """
@@ -171,6 +174,7 @@ class SeriesFilter:
     include_undetected: bool = True
     before_s: float = 0.0
     leaving_out: bool = True
+    terms: Terms | None = None
     candidates: tuple[Candidate, ...] = field(init=False, default=())
 
     def __post_init__(self) -> None:
@@ -179,7 +183,7 @@ class SeriesFilter:
     @cached_property
     def space(self) -> StateSpace:
         """State space (states, their transitions and their effects) of the disturbances."""
-        return StateSpace(self.prior, self.reference_noise, self.heat, self.stepping)
+        return StateSpace(self.prior, self.reference_noise, self.heat, self.stepping, self.terms)
 
     @cached_property
     def _step_levels(self) -> list[Array]:

@@ -222,6 +222,8 @@ here is its key.
 """
 ANGLE = Parameter("change_arcsec", "Δθ", "change of the angle between the cameras' lines of sight, opening positive", 4)
 """Change of the angle between the lines of sight of two cameras, as a quantity that the monitor reads."""
+FOCUS = Parameter("focus_um", "focus", "amount of the motion in which readings of focus are expressed", 2)
+"""Focus of a camera in operation, estimated from readings of focus in place of a monitor's."""
 GROUND = (
     Parameter("along_m", "along", "error on the ground along the track", 3),
     Parameter("across_m", "across", "error on the ground across the track, to the right", 3),

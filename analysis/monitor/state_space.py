@@ -29,6 +29,7 @@ from numpy.typing import NDArray
 
 from analysis.arrays import Array
 from analysis.monitor.disturbances import Disturbances, TimeLaw
+from analysis.monitor.learned_terms import Terms
 
 _INTERVALS = 200
 """Number of intervals between readings whose state transitions are kept in memory."""
@@ -67,7 +68,7 @@ class HeatInputs:
 
 
 _Stepping = tuple[tuple[TimeLaw, Array], ...]
-_Kind = Literal["level", "law", "heat", "factor", "reference"]
+_Kind = Literal["level", "law", "heat", "factor", "term", "reference"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,7 +81,8 @@ class _Block:
     ----------
     kind : str
         `level` for everything that changes by steps, `law` for another time law, `heat` for temperatures with sensors,
-        `factor` for the factors of the effect of heat, `reference` for the error of the reference positions.
+        `factor` for the factors of the effect of heat, `term` for learned terms, `reference` for the error of the
+        reference positions.
     law : TimeLaw
         Law in time.
     at : slice
@@ -147,6 +149,8 @@ class StateSpace:
         Temperatures that sensors read; None if there is none.
     stepping : tuple of int
         Indices of motions of any law that may step, beside those with a law of steps.
+    terms : Terms or None
+        Known functions of time with learned amounts, such as decays and commanded moves; None if there are none.
 
     Raises
     ------
@@ -158,6 +162,7 @@ class StateSpace:
     reference_noise: Array | None = None
     heat: HeatInputs | None = None
     stepping: tuple[int, ...] = ()
+    terms: Terms | None = None
     _blocks: tuple[_Block, ...] = field(init=False, default=())
 
     def __post_init__(self) -> None:
@@ -223,6 +228,9 @@ class StateSpace:
             rows = np.zeros((len(scale), self.width))
             rows[: self.width] = np.eye(self.width)
             add("reference", TimeLaw(), rows, self.reference_noise, np.empty(0, int))
+        if self.terms is not None:
+            moved = np.array(self.terms.motions, int)
+            add("term", TimeLaw(), outputs[:, moved], np.diag(self.terms.sigma**2), moved)
         return out
 
     @cached_property
@@ -305,7 +313,10 @@ class StateSpace:
             self._add(spread, block, block.covariance * _variance(block.law, time))
             for law, steps in block.steps:
                 self._add(spread, block, _step_variance(law, time) * steps)
-        return np.zeros(self.size), spread
+        mean = np.zeros(self.size)
+        if self.terms is not None:
+            mean[self.term_states] = self.terms.mean
+        return mean, spread
 
     @staticmethod
     def _add(spread: Array, block: _Block, what: Array) -> None:
@@ -448,7 +459,34 @@ class StateSpace:
         time : float
             Time, s.
         """
-        return self.acting(self._rows(time), mean, covariance)
+        values, rows, left = self.acting(self._rows(time), mean, covariance)
+        return values, rows, left + self._gain_noise(mean, covariance, time)
+
+    def _gain_noise(self, mean: Array, covariance: Array, time: float) -> Array | float:
+        """Return the covariance (D + P, D + P) of the outputs due to uncertain gains of the terms; 0 without terms."""
+        if self.terms is None:
+            return 0.0
+        at, spread = self.term_states, self._gains(time)[1]
+        if not np.any(spread):
+            return 0.0
+        effect = self.basis[:, at]
+        return np.asarray(effect @ (spread * (np.outer(mean[at], mean[at]) + covariance[at, at])) @ effect.T)
+
+    def _gains(self, time: float) -> tuple[Array, Array]:
+        assert self.terms is not None
+        if time not in self._gains_at:
+            self._gains_at.clear()
+            self._gains_at[time] = self.terms.gains(time)
+        return self._gains_at[time]
+
+    @cached_property
+    def _gains_at(self) -> dict[float, tuple[Array, Array]]:
+        return {}
+
+    @cached_property
+    def term_states(self) -> slice:
+        """Range, among all states, of those of the terms."""
+        return next((block.at for block in self._blocks if block.kind == "term"), slice(0, 0))
 
     def acting(self, rows: Array, mean: Array, covariance: Array) -> tuple[Array, Array, Array]:
         """Return linear combinations of the states, in which estimated factors multiply the effect of temperatures.
@@ -521,6 +559,7 @@ class StateSpace:
         for i, j in itertools.product(range(count), repeat=2):
             across = covariance[i, :, j]
             out[i, :, j] = single[i][1] @ across @ single[j][1].T + self._second(plain[i], plain[j], across)
+            out[i, :, j] += self._gain_noise(means[i], across, float(times[i])) if i == j else 0.0
         return values, out
 
     def _rows(self, time: float) -> Array:
@@ -529,6 +568,8 @@ class StateSpace:
             rows = self.basis.copy()
             for block in self._growing_blocks:
                 rows[:, block.at] *= _gain(block.law, time)
+            if self.terms is not None:
+                rows[:, self.term_states] *= self._gains(time)[0]
             self._rows_at[time] = rows
         return self._rows_at[time]
 
@@ -629,6 +670,8 @@ class StateSpace:
             if block.kind == "heat":
                 for k, motion in enumerate(block.motions):
                     rows[motion, block.at.start + k] = _gain(block.law, time)
+            if block.kind == "term":
+                rows[list(block.motions), np.arange(block.at.start, block.at.stop)] = self._gains(time)[0]
             if block.kind not in ("level", "law"):
                 continue
             idx = list(block.motions)

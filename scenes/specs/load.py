@@ -396,6 +396,8 @@ def portable_reference(folder: str, reference: str, owner: Spec, key: KeyPath, o
     """
     if isinstance(reference, Inline):
         return reference.placed(owner.source, key)
+    if not is_path(reference) and any(reference in library_names(other) for other in others):
+        return reference
     path = find_named(folder, reference, owner, key, others)
     return str(path.absolute()) if is_path(reference) else reference
 

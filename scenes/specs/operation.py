@@ -17,7 +17,20 @@ from scenes.specs.disturbances import NONE, DisturbancesSpec
 from scenes.specs.load import DISTURBANCES, INSTRUMENTS, portable_reference
 from scenes.specs.resolved import ResolvedJob, resolve_on
 from scenes.yaml.errors import Problem, names_text, nearest, shown, unknown
-from scenes.yaml.spec import Name, Number, Paths, Ref, Reference, Spec, Text, Whole, not_empty, short_for, validate
+from scenes.yaml.spec import (
+    Name,
+    Named,
+    Number,
+    Paths,
+    Ref,
+    Reference,
+    Spec,
+    Text,
+    Whole,
+    not_empty,
+    short_for,
+    validate,
+)
 from scenes.yaml.unit_fields import ClockReading, Quantity, TimeScale
 from scenes.yaml.units import ANGLE, LENGTH, MOMENT, SCALE, TEMPERATURE, TEMPERATURE_DIFFERENCE, Kind, parse_quantity
 from scenes.yaml.yaml_file import read_yaml
@@ -113,6 +126,152 @@ class RequirementSpec(Spec):
         return ENDINGS[self.key.rpartition("_")[2]]
 
 
+class AmountSpec(Spec):
+    """Amount of a term before any reading, in the unit of its motion.
+
+    Attributes
+    ----------
+    value, sigma : str
+        Amount and its standard deviation, with unit.
+    """
+
+    value: Text
+    sigma: Text
+
+    def si(self, kind: Kind) -> tuple[float, float]:
+        """Return the amount and its standard deviation in SI units; raise Problem if they are not of the kind."""
+        out = []
+        for key in ("value", "sigma"):
+            try:
+                out.append(parse_quantity(getattr(self, key), kind))
+            except Problem as problem:
+                raise problem.below(key) from None
+        if out[1] < 0.0:
+            raise Problem("less than zero", shown(self.sigma), "a standard deviation", within=("sigma",))
+        return out[0], out[1]
+
+
+class TimeConstantSpec(Spec):
+    """Time constant of a decay or a lag.
+
+    Attributes
+    ----------
+    value : float
+        Time constant before any reading, in seconds.
+    sigma : float
+        Its relative standard deviation (of its natural logarithm); 0 percent for a known one.
+    """
+
+    value: Span
+    sigma: Annotated[float, Quantity(SCALE, smallest="0 percent", largest="200 percent")]
+
+
+class TermSpec(Spec):
+    """Term of a motion: a known function of time whose amount, and time constant, the readings determine.
+
+    With `decay` it is a decay, with `per` a slope, with `input` the effect of a measured input, otherwise a constant.
+
+    Attributes
+    ----------
+    motion : str
+        Motion as in the disturbances, BODY shift AXIS, BODY rotate AXIS or BODY scale, such as `base/forward/M2 shift
+        z`. A cause of the disturbances must have it.
+    amount : AmountSpec
+        Constant, amount of a decay at its date, change in the time `per`, or change per kelvin of the input.
+    since : str | None
+        UTC from which a decay or slope counts; by default the first reading. A slope is zero before.
+    decay : TimeConstantSpec | None
+        Time constant T of a decay exp(-(t - since) / T).
+    per : float | None
+        Time in which a slope changes the motion by its amount, in seconds.
+    input : str | None
+        Name of the input in the record's readings of kind `input`.
+    reference : float
+        Temperature at which the input has no effect, in kelvin.
+    window : float | None
+        Length of the window, ending at the reading, over which the input is averaged, in seconds.
+    relative : bool
+        True if the newest sample minus its mean over `window` acts.
+    lag : TimeConstantSpec | None
+        Time constant of a first-order lag with which the input acts.
+    gap : float
+        Age of the newest sample above which the input counts as not measured, in seconds.
+    """
+
+    motion: Text
+    amount: AmountSpec
+    since: ClockReading | None = None
+    decay: TimeConstantSpec | None = None
+    per: Span | None = None
+    input: Name | None = None
+    reference: Annotated[float, Quantity(TEMPERATURE)] = 273.15
+    window: Span | None = None
+    relative: bool = False
+    lag: TimeConstantSpec | None = None
+    gap: Span = 3600.0
+
+    @property
+    def kind(self) -> Kind:
+        """Kind of quantity of the amount."""
+        return motion_kind(self.motion)
+
+    @model_validator(mode="after")
+    def _is_one_kind(self) -> TermSpec:
+        kinds = [key for key in ("decay", "per", "input") if getattr(self, key) is not None]
+        if len(kinds) > 1:
+            raise Problem(
+                "two kinds of term", names_text(kinds), "one of them, or none for a constant", within=(kinds[1],)
+            )
+        for key in ("window", "relative", "lag"):
+            if getattr(self, key) and not self.input:
+                raise Problem(f"{key} without an input", None, "input: NAME", within=(key,))
+        if self.relative and self.window is None:
+            raise Problem(
+                "relative to no mean", None, "window: the time over which the mean is taken", within=("relative",)
+            )
+        if self.window is not None and self.lag is not None:
+            raise Problem("a window and a lag", None, "one of them; two terms for both", within=("lag",))
+        if self.since is not None and not (self.decay or self.per):
+            raise Problem("a date of a term that is none", None, "a term with decay or per", within=("since",))
+        try:
+            self.amount.si(motion_kind(self.motion))
+        except Problem as problem:
+            raise problem if problem.within == ("motion",) else problem.below("amount") from None
+        return self
+
+
+def motion_kind(motion: str) -> Kind:
+    """Return the kind of quantity of a motion, from its name such as `base/forward/M2 shift z`.
+
+    Raises
+    ------
+    Problem
+        The name is not of this form.
+    """
+    words = motion.split()
+    kind = {"shift": LENGTH, "rotate": ANGLE, "scale": SCALE}.get(words[1]) if len(words) > 1 else None
+    if kind is None or len(words) != (2 if words[1] == "scale" else 3):
+        allowed = "BODY shift AXIS, BODY rotate AXIS or BODY scale"
+        raise Problem("not a motion", shown(motion), allowed, within=("motion",))
+    return kind
+
+
+class FocusSpec(Spec):
+    """Readings of focus that an estimate uses in place of a monitor's spots.
+
+    Attributes
+    ----------
+    camera : str
+        Camera whose readings of kind `focus` are used.
+    motion : str
+        Shift in whose amount the readings are, such as `base/telescope/M2 shift z`. The disturbances may only have this
+        motion, since no other is distinguishable.
+    """
+
+    camera: Name
+    motion: Text
+
+
 class OperationSpec(Spec):
     """Plan of operation: the expected changes of an instrument and the requirements on it over its mission.
 
@@ -126,6 +285,10 @@ class OperationSpec(Spec):
     events : dict[str, tuple[str, ...]]
         Event of the record -> causes of the disturbances file whose motions then change by a step with their standard
         deviations. An event without causes has no effect.
+    focus : FocusSpec | None
+        Readings of focus to be used in place of a monitor's spots.
+    terms : dict[str, TermSpec]
+        Name -> term of a motion that is learned: a constant, slope, decay, or the effect of an input.
     coefficients : float
         Relative standard deviation of the computed thermal response of each body with a temperature sensor.
     mission : float
@@ -141,6 +304,8 @@ class OperationSpec(Spec):
     instrument: Ref
     disturbances: Ref
     events: Annotated[dict[str, Causes], AfterValidator(_known_events)] = Field(default_factory=FrozenMap)
+    focus: FocusSpec | None = None
+    terms: Named[TermSpec] = Field(default_factory=FrozenMap)
     coefficients: Annotated[float, Quantity(SCALE, smallest="0 percent", largest="1000 percent")] = 0.3
     mission: Span = 87_600.0 * 3600.0
     window: Annotated[Whole, Field(ge=2, le=10_000)] = 60
@@ -206,6 +371,9 @@ def resolve_operation(spec: OperationSpec) -> OperationSetup:
         update[key] = portable_reference(folder, reference, spec, (key,), others)
     spec = spec.model_copy(update=update)
     setup = OperationSetup.model_construct(operation=spec, model=resolve_on(spec, spec.instrument, spec.disturbances))
+    if spec.focus is not None and spec.focus.camera not in setup.model.instrument.cameras:
+        no_camera = unknown("no such camera", spec.focus.camera, setup.model.instrument.cameras)
+        raise spec.error(no_camera, ("focus", "camera"))
     known = setup.disturbances.causes
     for event, causes in spec.events.items():
         for k, cause in enumerate(causes):
@@ -216,11 +384,25 @@ def resolve_operation(spec: OperationSpec) -> OperationSetup:
 
 
 VALUES: Mapping[str, tuple[Kind, Kind]] = FrozenMap(
-    {"temperature": (TEMPERATURE, TEMPERATURE_DIFFERENCE), "attitude": (ANGLE, ANGLE), "focus": (LENGTH, LENGTH)}
+    {
+        "temperature": (TEMPERATURE, TEMPERATURE_DIFFERENCE),
+        "attitude": (ANGLE, ANGLE),
+        "focus": (LENGTH, LENGTH),
+        "input": (TEMPERATURE, TEMPERATURE_DIFFERENCE),
+    }
 )
 """Kind of reading that is a number in a table -> kinds of quantity (which fix the units) of the number and of its
 sigma.
 """
+MOVE = "move"
+"""Kind of a commanded move, a number whose kind of quantity depends on the motion."""
+
+
+def value_kinds(kind: str, subject: str) -> tuple[Kind, Kind]:
+    """Return the kinds of quantity of a reading or move in a table, and of its sigma; raise Problem for no motion."""
+    return (motion_kind(subject),) * 2 if kind == MOVE else VALUES[kind]
+
+
 RUNS = ("monitor", "calibration", "angle")
 """Kinds of reading that are run folders, to which a row of a table refers."""
 EVENT = "event"
@@ -240,7 +422,8 @@ class ReadingColumnSpec(Spec):
     unit : str
         Unit of the numbers; `quaternion` for a quaternion.
     sigma : str
-        Standard deviation of each number, with unit; for a quaternion that of the angle about each axis.
+        Standard deviation of each number, with unit; for a quaternion that of the angle about each axis. It is zero for
+        a move of exactly known size.
     """
 
     column: Heads
@@ -254,8 +437,9 @@ class ReadingTableSpec(Spec):
     Attributes
     ----------
     kind : str
-        Content of a row: `temperature` of bodies, `attitude` of star trackers, `focus` of cameras; `monitor`,
-        `calibration` or `angle` for a row that refers to a run folder; or `event`.
+        Content of a row: `temperature` of bodies, `attitude` of star trackers, `focus` of cameras, `input` for the
+        temperatures that a plan's terms name, `move` for commanded moves; `monitor`, `calibration` or `angle` for a row
+        that refers to a run folder; or `event`.
     files : str
         Paths of the tables, relative to this file; `*` and `?` are wildcards.
     form : {'csv', 'keywords'}
@@ -269,8 +453,11 @@ class ReadingTableSpec(Spec):
         Date and time, in that time scale, at which the times are 0, if the column has numbers instead of dates.
     time_unit : str
         Unit of the times, if the column has numbers instead of dates.
+    time_sigma : float
+        Standard deviation of the times of moves, in seconds.
     columns : Mapping[str, ReadingColumnSpec]
-        Body, star tracker or camera -> its columns, for kinds with numbers.
+        Body, star tracker, camera, input, or motion that is commanded (`base/forward/M2 shift z`) -> its columns, for
+        kinds with numbers.
     name : str | None
         Head of the column with the event or the run folder, whose path is relative to the table.
     detail : str | None
@@ -279,13 +466,14 @@ class ReadingTableSpec(Spec):
         Name of an event in the table -> kind of event.
     """
 
-    kind: Literal["temperature", "attitude", "focus", "monitor", "calibration", "angle", "event"]
+    kind: Literal["temperature", "attitude", "focus", "input", "move", "monitor", "calibration", "angle", "event"]
     files: Reference
     form: Literal["csv", "keywords"] = "csv"
     time: Text = "time"
     time_scale: TimeScale = "UTC"
     epoch: ClockReading | None = None
     time_unit: Text = "s"
+    time_sigma: Annotated[float, Quantity(MOMENT, smallest="0 s", largest="1000 h")] = 0.0
     columns: Paths[ReadingColumnSpec] = Field(default_factory=FrozenMap)
     name: Text | None = None
     detail: Text | None = None
@@ -293,7 +481,9 @@ class ReadingTableSpec(Spec):
 
     @model_validator(mode="after")
     def _has_its_columns(self) -> ReadingTableSpec:
-        numbers = self.kind in VALUES
+        numbers = self.kind in VALUES or self.kind == MOVE
+        if self.time_sigma and self.kind != MOVE:
+            raise Problem(f"a table of kind {self.kind} has no time_sigma", None, "kind: move", within=("time_sigma",))
         if numbers and not self.columns:
             raise Problem(f"no columns of a table of kind {self.kind}", None, "columns: {BODY: {column: HEAD, ...}}")
         if not numbers and self.name is None:
@@ -312,7 +502,10 @@ class ReadingTableSpec(Spec):
 
 def _is_measured(kind: str, columns: ReadingColumnSpec, where: tuple[str, ...]) -> None:
     """Raise `Problem` for columns whose number, unit or sigma do not fit a kind of reading."""
-    value, sigma = VALUES[kind]
+    try:
+        value, sigma = value_kinds(kind, where[-1])
+    except Problem as problem:
+        raise Problem(problem.problem, problem.found, problem.allowed, within=where) from None
     count = {QUATERNION: 4}.get(columns.unit, 3) if kind == "attitude" else 1
     if len(columns.column) != count:
         text = f"{len(columns.column)} columns for one {kind}"
@@ -323,7 +516,7 @@ def _is_measured(kind: str, columns: ReadingColumnSpec, where: tuple[str, ...]) 
         known = parse_quantity(columns.sigma, sigma)
     except Problem as problem:
         raise problem.below(*where, "sigma") from None
-    if not known > 0.0:
+    if not known > 0.0 and not (kind == MOVE and known == 0.0):
         raise Problem("not greater than zero", columns.sigma, sigma.allowed, within=(*where, "sigma"))
 
 

@@ -99,6 +99,7 @@ class StandIn:
 
     history: History
     plan: Any = field(default_factory=plan)
+    reading_kind: str = "monitor"
 
     @property
     def experiment(self) -> MonitorExperiment:

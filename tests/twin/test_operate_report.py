@@ -25,7 +25,7 @@ from twin.operate.daily_report import _warnings, daily_report, end_of_day, state
 from twin.operate.estimate.operation_filter import Operation
 from twin.operate.estimate.operation_model import stored_plan
 from twin.operate.estimate.reported_estimate import percent
-from twin.operate.overview import Overview, coverage, evenly_spaced, monitor_span, readings, single_readings, trend
+from twin.operate.overview import Overview, coverage, evenly_spaced, reading_span, readings, single_readings, trend
 from twin.operate.record.entries import Alarm, Entry, micros, utc_text
 from twin.operate.record.history import History, content_of, initialise_record
 
@@ -244,7 +244,7 @@ def test_points_are_what_the_readings_say(history, overview):
 def test_of_many_readings_some_are_shown_and_the_newest_is_one(history):
     found = [one["time_us"] for one in readings(history, START, START + 40 * DAY, 25)]
     assert len(found) <= 25
-    assert (START, found[-1]) == monitor_span(history)
+    assert (START, found[-1]) == reading_span(history)
     assert len(set(np.diff(found))) == 1
 
 

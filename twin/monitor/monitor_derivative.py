@@ -390,6 +390,21 @@ def disturbances_of(
         spots[:, stepped], parameters[:, stepped] = _by_differences(
             stepped_components, path, thermal, instrument, backend
         )
+    return linear_disturbances(prior, spots, parameters)
+
+
+def linear_disturbances(prior: DisturbancePrior, spots: np.ndarray, parameters: np.ndarray) -> Disturbances:
+    """Return a prior with the given effects of its M motions, as the analysis uses them.
+
+    Parameters
+    ----------
+    prior : DisturbancePrior
+        Motions of the prior.
+    spots : (D, M) ndarray
+        Change of each reading per SI unit of each motion.
+    parameters : (P, M) ndarray
+        Change of each parameter per SI unit of each motion.
+    """
     sigma = prior.sigma
     return Disturbances(
         name=prior.name,

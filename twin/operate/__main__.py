@@ -219,7 +219,7 @@ def _new_alarms(call: Call, page: Path | None) -> list[str]:
     """
     if not call.has_estimate:
         if page is not None:
-            print_error(call.errors, "no report: the record has no reading of the monitor")
+            print_error(call.errors, f"no report: the record has no reading of the {call.reading_kind}")
         return []
     try:
         operation, _, new = call.estimate()
@@ -228,10 +228,15 @@ def _new_alarms(call: Call, page: Path | None) -> list[str]:
         return []
     if page is not None:
         from twin.operate.daily_report import end_of_day
-        from twin.operate.overview import monitor_span
+        from twin.operate.overview import reading_span
 
         write_report(
-            call, call.history, operation, end_of_day(None, monitor_span(call.history)[1]), [call.location], page
+            call,
+            call.history,
+            operation,
+            end_of_day(None, reading_span(call.history, call.reading_kind)[1]),
+            [call.location],
+            page,
         )
     return [f"alarm: {alarm.text}" for alarm in new]
 
@@ -313,7 +318,8 @@ def status(
         else:
             print_line(
                 console,
-                "no estimate: the record has no reading of the monitor; python -m twin.operate ingest adds readings",
+                f"no estimate: the record has no reading of the {call.reading_kind}; "
+                "python -m twin.operate ingest adds readings",
             )
         if power:
             show_power(power, console)

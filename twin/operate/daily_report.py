@@ -285,8 +285,9 @@ def state_table(overview: Overview) -> Table:
         row += _required_cells(overview, quantity)
         rows.append(row)
         full.append([group, *(str(cell) if isinstance(cell, Marked) else cell for cell in row)])
+    what = "Amounts" if overview.operation.reading_kind == "focus" else "Changes since the reference images"
     caption = (
-        f"Changes since the reference images at {minute_text(overview.time)} UTC, from all readings until then. A "
+        f"{what} at {minute_text(overview.time)} UTC, from all readings until then. A "
         "requirement holds while the probability that the change exceeds its limit is at most the allowed one. "
         "It may be violated from the first day of the forecast on which the probability is larger."
     )

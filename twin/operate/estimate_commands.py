@@ -219,16 +219,16 @@ def report(
     Exit codes: 0 success, 2 bad input (nothing is written), 1 anything else.
     """
     from twin.operate.daily_report import end_of_day
-    from twin.operate.overview import monitor_span
+    from twin.operate.overview import reading_span
     from twin.operate.record.history import History
 
-    first, newest = monitor_span(call.history)
+    first, newest = reading_span(call.history, call.reading_kind)
     if not newest:
-        raise InputErrorText("the record has no reading of the monitor; ingest some first")
+        raise InputErrorText(f"the record has no reading of the {call.reading_kind}; ingest some first")
     with input_errors("--day"):
         end = end_of_day(day, newest)
     if end <= first:
-        raise InputErrorText(f"--day: the record has no reading of the monitor before the end of {day}")
+        raise InputErrorText(f"--day: the record has no reading of the {call.reading_kind} before the end of {day}")
     operation, _, _ = call.estimate(plan)
     words = [call.location, *([] if plan is None else [str(plan)]), *([] if day is None else ["--day", day])]
     with History(call.location, end) as then:
@@ -338,6 +338,7 @@ def show_estimate(result: FilterResult, rows: Sequence[Mapping[str, Any]], conso
         )
         text = f"{first_share:.1f} % within one sigma (68.3 % expected), {second_share:.1f} % within two (95.4 %)"
         print_line(console, f"predictions of the readings: {text}; mean log score {scores.log_score:.2f}")
+    _show_terms(result, console)
     for text in result.warnings:
         print_line(console, f"warning: {text}")
     for jump in result.jumps:
@@ -372,6 +373,26 @@ def _show_course(course: Course, console: Console) -> None:
         name = name_of(quantity.name, course.quantities)
         rows.append([name, *(with_sigma(v, s, quantity.parameter.unit, sign=True) for v, s in cells)])
     show_table(console, ("change of", *utc), rows, range(1, len(utc) + 1))
+
+
+def _show_terms(result: FilterResult, console: Console) -> None:
+    """Print a table of the learned terms and of the commanded moves."""
+    from twin.operate.estimate.reported_estimate import with_sigma
+
+    rows = []
+    for term in result.terms:
+        cells = [
+            with_sigma(term.amount, term.sigma, term.unit, True),
+            with_sigma(term.prior, term.prior_sigma, term.unit, True),
+        ]
+        constant, spread = term.time_constant_h, term.time_constant_h_sigma
+        days = "" if constant is None or spread is None else with_sigma(constant / 24.0, spread / 24.0, "days")
+        rows.append([term.name, *cells, days])
+    if rows:
+        show_table(console, ("term or move", "amount", "before any reading", "time constant"), rows, (1, 2, 3))
+    for term in result.terms:
+        if term.note:
+            print_line(console, term.note)
 
 
 def show_power(powers: Sequence[DetectionPower], console: Console) -> None:

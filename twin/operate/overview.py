@@ -31,30 +31,28 @@ if TYPE_CHECKING:
     from twin.operate.estimate.reported_estimate import Course, DetectedJump, FilterResult, RequirementStatus
     from twin.operate.record.history import History
 
-KIND = "monitor"
-"""Kind of the record's entries that are readings of the monitor."""
 _BATCH = 400
 """Number of rows in one query of the database."""
 
 
 def _rows() -> Select[Any]:
-    """Return the database query for readings of the monitor, joined with the files they came from."""
-    return select(*ENTRY.c, SOURCE.c.file).join(SOURCE, ENTRY.c.source_id == SOURCE.c.id).where(ENTRY.c.kind == KIND)
+    """Return the database query for readings, joined with the files they came from."""
+    return select(*ENTRY.c, SOURCE.c.file).join(SOURCE, ENTRY.c.source_id == SOURCE.c.id)
 
 
-def monitor_span(history: History) -> tuple[int, int]:
-    """Return the times of the first and the newest reading of the monitor; 0 if there are none.
+def reading_span(history: History, kind: str = "monitor") -> tuple[int, int]:
+    """Return the times of the first and the newest reading of a kind; 0 if there are none.
 
     Times are in microseconds of TAI since 2000.
     """
-    query = select(func.min(ENTRY.c.time_us), func.max(ENTRY.c.time_us)).where(ENTRY.c.kind == KIND)
+    query = select(func.min(ENTRY.c.time_us), func.max(ENTRY.c.time_us)).where(ENTRY.c.kind == kind)
     with history.reading() as connection:
         first, last = connection.execute(query).one()
     return int(first or 0), int(last or 0)
 
 
-def readings(history: History, begin: int, end: int, most: int) -> list[dict[str, Any]]:
-    """Return the monitor's readings in a time span, or ``most`` evenly chosen ones, in the order of time.
+def readings(history: History, begin: int, end: int, most: int, kind: str = "monitor") -> list[dict[str, Any]]:
+    """Return the readings of a kind in a time span, or ``most`` evenly chosen ones, in the order of time.
 
     Parameters
     ----------
@@ -66,6 +64,8 @@ def readings(history: History, begin: int, end: int, most: int) -> list[dict[str
         Last time of the span, inclusive.
     most : int
         Largest number of readings.
+    kind : str
+        Kind of the readings: ``monitor`` or ``focus``.
 
     Returns
     -------
@@ -73,7 +73,7 @@ def readings(history: History, begin: int, end: int, most: int) -> list[dict[str
         Rows as yielded by `History.entries`, with ``content`` as plain data.
     """
     c = ENTRY.c
-    query = select(c.id).where(c.kind == KIND, c.time_us >= begin, c.time_us <= end).order_by(c.time_us, c.id)
+    query = select(c.id).where(c.kind == kind, c.time_us >= begin, c.time_us <= end).order_by(c.time_us, c.id)
     with history.reading() as connection:
         ids = list(connection.execute(query).scalars())
         step = max(1, -(-len(ids) // most))
@@ -186,13 +186,17 @@ def single_readings(entries: Sequence[Mapping[str, Any]], quantities: Sequence[Q
     Parameters
     ----------
     entries : Sequence[Mapping[str, Any]]
-        Entries of kind ``monitor``, with ``content`` as plain data.
+        Entries of kind ``monitor`` or ``focus``, with ``content`` as plain data.
     quantities : Sequence[Quantity]
         The Q quantities.
     """
     values = np.full((len(entries), len(quantities)), np.nan)
     sigmas = values.copy()
     for n, entry in enumerate(entries):
+        if entry["kind"] == "focus":
+            content, unit = entry["content"], quantities[0].parameter.per_si
+            values[n, 0], sigmas[n, 0] = unit * content["values"][0], unit * content["sigma"]
+            continue
         numbers = entry["content"]["numbers"]
         for q, quantity in enumerate(quantities):
             group = numbers.get("cameras", {}).get(quantity.group) or numbers.get(quantity.group) or {}
@@ -258,9 +262,11 @@ class Overview:
     def of(cls, history: History, operation: Operation) -> Overview:
         """Return the overview of a record and its estimate after all readings."""
         known = operation.plan.operation.events
-        dated = ((int(entry["time_us"]), str(entry["subject"])) for entry in history.entries("event"))
-        events = tuple((time, name, tuple(known.get(name, ()))) for time, name in dated)
-        return cls(operation, operation.filter_readings(), tuple(history.alarms()), events, monitor_span(history)[0])
+        dated = [(int(entry["time_us"]), str(entry["subject"])) for entry in history.entries("event")]
+        dated += [(int(entry["time_us"]), "commanded_move") for entry in history.entries("move")]
+        events = tuple((time, name, tuple(known.get(name, ()))) for time, name in sorted(dated))
+        begin = reading_span(history, operation.reading_kind)[0]
+        return cls(operation, operation.filter_readings(), tuple(history.alarms()), events, begin)
 
     @property
     def time(self) -> int:
@@ -540,4 +546,5 @@ def trend(history: History, overview: Overview, begin: int, end: int, count: int
         }
         past = replace(past, **joined)
     future = operation.forecast(evenly_spaced(now, end, count)) if end > now else None
-    return Trend(past, future, single_readings(readings(history, begin, last, MOST_POINTS), overview.quantities))
+    shown = readings(history, begin, last, MOST_POINTS, overview.operation.reading_kind)
+    return Trend(past, future, single_readings(shown, overview.quantities))

@@ -303,6 +303,8 @@ def make_products(
     at = None if scene is None else scene_time(scene)
     if scene is not None:
         _require_same_instrument(scene, history)
+    if operation.plan.operation.focus is not None:
+        raise Problem("products need the motions that a monitor shows", None, "a plan without `focus`")
     result = operation.filter_readings()
     ends = _ends(operation, history, result)
     if not ends[0].time <= time <= ends[1].time:

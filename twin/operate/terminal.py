@@ -197,8 +197,14 @@ class Call:
 
     @property
     def has_estimate(self) -> bool:
-        """True if the record has a plan and a reading of the monitor."""
-        return self.history.plan() is not None and self.history.first("monitor") is not None
+        """True if the record has a plan and a reading that it uses."""
+        return self.history.plan() is not None and self.history.first(self.reading_kind) is not None
+
+    @property
+    def reading_kind(self) -> str:
+        """Kind of the readings that the record's plan uses: ``monitor`` or ``focus``."""
+        row = self.history.plan()
+        return "monitor" if row is None or row["content"]["operation"].get("focus") is None else "focus"
 
     def estimate(self, plan: Path | None = None) -> tuple[Operation, FilterResult, list[Alarm]]:
         """Filter the record under a plan; return the estimate, its result, and new alarms, added to the record."""

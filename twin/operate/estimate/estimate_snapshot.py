@@ -25,7 +25,7 @@ from analysis.monitor.filter_state import BadReading, FilterState, Innovation, O
 from analysis.monitor.jump_detection import Jump
 from analysis.monitor.kalman_filter import SeriesFilter
 from analysis.monitor.limits import Quantity
-from analysis.monitor.parameters import ANGLE, CAMERA_PARAMETERS, GROUND, Parameter
+from analysis.monitor.parameters import ANGLE, CAMERA_PARAMETERS, FOCUS, GROUND, Parameter
 from analysis.monitor.state_space import HeatInputs
 from analysis.statistics import limit_of
 from twin.operate.estimate.operation_model import OperationModel
@@ -34,7 +34,7 @@ from twin.operate.record.entries import MICRO
 _FILTER = (PendingReading, BadReading, FilterState, Disturbances, HeatInputs, Innovation, Jump, Observed, Quantity)
 """Classes of the filter that a serialised estimate may contain."""
 _CLASSES = (*_FILTER, SeriesFilter, TimeLaw, Track)
-_PARAMETERS = ChainMap(CAMERA_PARAMETERS, {parameter.key: parameter for parameter in (ANGLE, *GROUND)})
+_PARAMETERS = ChainMap(CAMERA_PARAMETERS, {parameter.key: parameter for parameter in (ANGLE, FOCUS, *GROUND)})
 
 
 def packed(value: Any) -> bytes:
@@ -321,6 +321,12 @@ class EstimatorState:
         Bodies whose sensors have disagreed with the prior at the same time as other sensors.
     violations : tuple[Violation, ...]
         Spans of readings at which a requirement was violated, in the order of their beginnings.
+    point : (R,) ndarray
+        Point at which the time constants of the R learned terms are linearised; empty for that of the prior.
+    due : int
+        Number of readings at which the linearisation is checked next.
+    passes : int
+        Number of passes over the first `due` readings that began with a new linearisation.
     """
 
     filter_state: FilterState
@@ -341,6 +347,9 @@ class EstimatorState:
     first_innovations: tuple[tuple[int, float, int], ...] = ()
     disagreeing: tuple[str, ...] = ()
     violations: tuple[Violation, ...] = ()
+    point: Array = field(default_factory=lambda: np.zeros(0))
+    due: int = 4
+    passes: int = 0
 
     @property
     def explained(self) -> Array:
@@ -555,7 +564,7 @@ class EntryFilter:
         for reading in warm:
             state = self._temperature(state, reading)
         for reading in entries:
-            if reading["kind"] == "monitor":
+            if reading["kind"] in ("monitor", "focus"):
                 state = self._monitor(state, reading)
         return state
 
@@ -573,6 +582,8 @@ class EntryFilter:
             number = self.series_filter.heat.sensors.index(str(entry["subject"]))
             value, noise = np.array([float(content["values"][0]) - self.temperature]), float(content["sigma"]) ** 2
             return Observed(time, value, np.array([[noise]]), (number,))
+        if entry["kind"] == "focus":
+            return Observed(time, np.array(content["values"][:1]), np.array([[float(content["sigma"]) ** 2]]))
         spots = content["numbers"]["spots"]
         spots_after = [spots[camera][channel]["after"] for camera, channel in self.model.spots]
         positions = np.array([(spot["row"], spot["column"]) for spot in spots_after])
@@ -618,9 +629,9 @@ class EntryFilter:
         return self._updated(state, entry, observed)[0]
 
     def _monitor(self, state: EstimatorState, entry: Mapping[str, Any]) -> EstimatorState:
-        """Return the estimator's state updated with a reading of the monitor (spot positions)."""
+        """Return the estimator's state updated with a reading of the monitor (spot positions) or of focus."""
         time = int(entry["time_us"])
-        if entry["content"]["numbers"].get("sigma_holds") is False:
+        if entry["content"].get("numbers", {}).get("sigma_holds") is False:
             return state.excluding(time, "monitor", "monitor", "its reported sigma does not hold")
         observed, before = self.observed(entry), state.filter_state.pending
         state, innovation = self._updated(state, entry, observed)
@@ -651,5 +662,6 @@ class EntryFilter:
         assert innovation.bad is not None
         camera, channel = self.model.spots[innovation.bad.coordinate // 2]
         axis = ("row", "column")[innovation.bad.coordinate % 2]
-        text = f"entry {number}: the {axis} of spot {camera}/{channel} is {abs(innovation.bad.z):.3g} sigma from its"
+        what = f"the focus of {camera}" if channel == "focus" else f"the {axis} of spot {camera}/{channel}"
+        text = f"entry {number}: {what} is {abs(innovation.bad.z):.3g} sigma from its"
         return f"{text} prediction, and no jump of the stated size explains it"

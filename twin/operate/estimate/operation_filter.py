@@ -30,6 +30,7 @@ from analysis.monitor.kalman_filter import (
     smoothed,
     with_indicated_jumps,
 )
+from analysis.monitor.learned_terms import Move, Terms
 from analysis.monitor.limits import Quantity
 from optics.numerics.backend import load_backend, one_blas_thread
 from scenes.specs.operation import OperationSetup
@@ -37,7 +38,8 @@ from scenes.yaml.errors import Problem
 from twin.framework.provenance import source_digest
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.operate.estimate.estimate_snapshot import EntryFilter, EstimatorState, Violation, packed, unpacked
-from twin.operate.estimate.operation_model import OperationModel, plan_digest, traced_model
+from twin.operate.estimate.learned_model import MOVE, NEAR, LearnedTerm, contradicted_moves, learned_terms, terms_of
+from twin.operate.estimate.operation_model import OperationModel, focus_model, plan_digest, traced_model
 from twin.operate.estimate.reported_estimate import (
     Course,
     DetectedJump,
@@ -59,6 +61,10 @@ HEAD_READINGS = 16
 
 Filtering so many readings again takes as long as saving the state.
 """
+CHECKED_READINGS = 2000
+"""Number of the latest readings among which commanded moves are compared with the readings."""
+MOST_PASSES, GROWTH = 6, 1.25
+"""Largest number of linearisations at one number of readings, and ratio of that number to the next one."""
 _MODEL, _HEAD = -1, 0
 """Numbers of two checkpoints in the record: the traced model, and the newest state of the estimator."""
 
@@ -104,14 +110,22 @@ class Operation:
         self._previous: tuple[EstimatorState | None, int] = None, 0
         self._newest = self._saved = 0
         self._stuck_sensors: tuple[tuple[str, int], ...] = ()
-        first = history.first("monitor")
-        if first is None:
+        focus = plan.operation.focus
+        self._kinds = USED if focus is None else ("focus",)
+        first = history.first(self.reading_kind)
+        if first is None or (focus is not None and focus.camera not in history.subjects("focus")):
+            if focus is not None:
+                raise Problem(
+                    f"the record has no reading of the focus of {focus.camera}", None, "a table of kind focus"
+                )
             allowed = "python -m twin.operate ingest RECORD RUN adds a run of twin.recover or twin.render"
             raise Problem("the record has no reading of the monitor", None, allowed)
         self.epoch = int(first["time_us"])
+        self._point: Array = np.zeros(0)
+        spots = {} if focus is not None else content_of(first)["numbers"]["spots"]
         before = [
             (camera, channel, reading["before"])
-            for camera, parts in content_of(first)["numbers"]["spots"].items()
+            for camera, parts in spots.items()
             for channel, reading in parts.items()
         ]
         self._before = {(camera, channel): reading for camera, channel, reading in before}
@@ -125,7 +139,8 @@ class Operation:
         if previous is not None and previous.key == self.key:
             known = vars(previous)
             vars(self).update({name: known[name] for name in ("experiment", "model") if name in known})
-            if "_entry_filter" in known and previous.events == self.events:
+            learns = bool(plan.operation.terms) or history.first(MOVE) is not None
+            if "_entry_filter" in known and previous.events == self.events and not learns:
                 vars(self)["_entry_filter"] = known["_entry_filter"]
                 self._previous, self._saved = (known.get("estimator_state"), previous._newest), previous._saved
 
@@ -140,14 +155,21 @@ class Operation:
 
     @cached_property
     def model(self) -> OperationModel:
-        """Traced effects of all motions on spots and cameras; read from the record if stored there."""
+        """Traced effects of all motions on spots and cameras, read from the record if stored there; or on the focus."""
         checkpoint = self.history.checkpoint(self.key, number=_MODEL)
         if checkpoint is not None:
             return cast("OperationModel", unpacked(checkpoint.content, OperationModel))
+        if self.plan.operation.focus is not None:
+            return focus_model(self.plan, self.experiment)
         sigma = np.array([(spot["row_sigma"], spot["column_sigma"]) for spot in self._before.values()])
         model = traced_model(self.plan, sigma, self._sensors, self.experiment)
         self.history.save_checkpoint(self.key, _MODEL, -(2**62), 0, packed(model))
         return model
+
+    @property
+    def reading_kind(self) -> str:
+        """Kind of the readings that are filtered: ``monitor`` or ``focus``."""
+        return self._kinds[0]
 
     @property
     def quantities(self) -> tuple[Quantity, ...]:
@@ -169,13 +191,28 @@ class Operation:
         for time, _, stepping in self.events:
             motions = tuple(k for k, cause in enumerate(causes) if cause in stepping)
             steps.append(Step(((motions, 1.0),), (((time - self.epoch) / MICRO, 1.0),)))
-        series_filter = replace(self.model.series_filter, steps=tuple(steps))
-        reference = np.array([(self._before[spot]["row"], self._before[spot]["column"]) for spot in self.model.spots])
+        terms = self._prior_terms
+        if terms is not None and len(self._point):
+            terms = replace(terms, point=self._point)
+        series_filter = replace(self.model.series_filter, steps=tuple(steps), terms=terms)
+        spots = [self._before[spot] for spot in self.model.spots if spot in self._before]
+        reference = np.array([(spot["row"], spot["column"]) for spot in spots])
         return EntryFilter(self.model, series_filter, self.epoch, reference, self.history.temperature)
+
+    @cached_property
+    def _prior_terms(self) -> Terms | None:
+        """Terms of the plan and moves of the record, linearised at the prior; None if there are none."""
+        operation = self.plan.operation
+        return terms_of(operation, self.model.series_filter.prior, self.history, self.epoch, self.reading_kind)
 
     def _moments(self, after_us: int | None) -> Iterator[list[dict[str, Any]]]:
         """Yield the entries that the estimate uses, grouped by time, in the order of time."""
-        used = (entry for entry in self.history.entries(after_us=after_us) if entry["kind"] in USED)
+        focus = self.plan.operation.focus
+        used = (
+            entry
+            for entry in self.history.entries(after_us=after_us)
+            if entry["kind"] in self._kinds and (focus is None or entry["subject"] == focus.camera)
+        )
         for _, entries in groupby(used, key=lambda row: int(row["time_us"])):
             yield [
                 {**entry, "content": content_of(entry), "decided": self._decisions.get(entry["id"])}
@@ -196,12 +233,14 @@ class Operation:
 
     def _latest_state(self) -> EstimatorState:
         """Return the estimator's state after all readings, and save checkpoints on the way."""
-        entry_filter, newest = self._entry_filter, self.history.newest_id()
+        newest = self.history.newest_id()
         self._newest = newest
         state = self._load_state()
+        curved = self._prior_terms is not None and bool(self._prior_terms.curved)
         moments = list(self._moments(None if state is None else state.time))
         count = 0
         while count < len(moments):
+            entry_filter = self._entry_filter
             if state is None:
                 state = entry_filter.start(int(moments[0][0]["time_us"]))
             before = state.scores.readings
@@ -212,11 +251,17 @@ class Operation:
                 state = self._rewind(state)
                 moments, count = list(self._moments(None if state is None else state.time)), 0
                 if state is None:
-                    state = entry_filter.start(int(moments[0][0]["time_us"]), self._stuck_sensors)
+                    state = self._entry_filter.start(int(moments[0][0]["time_us"]), self._stuck_sensors)
                 continue
             if read:
                 state = self._judged(state)
-            number = state.scores.readings // CHECKPOINT_READINGS
+            if curved and state.scores.readings >= state.due:
+                linearised = self._relinearised(state)
+                if linearised.scores.readings < state.scores.readings:
+                    moments, count = list(self._moments(None)), 0
+                state = linearised
+                continue
+            number = 0 if curved else state.scores.readings // CHECKPOINT_READINGS
             if number > before // CHECKPOINT_READINGS:
                 self._save_state(state, number, newest)
                 state = state.with_counters_reset()
@@ -226,6 +271,25 @@ class Operation:
             self._save_state(state, _HEAD, newest)
             self._saved = state.scores.readings
         return state
+
+    def _relinearised(self, state: EstimatorState) -> EstimatorState:
+        """Return the state with the next check of its linearisation, or an initial one with a new linearisation.
+
+        The points depend on the numbers of readings alone, so that the estimate does not depend on when it was asked.
+        Permanent checkpoints, which would have other points, are not made.
+        """
+        series_filter, current = self._entry_filter.series_filter, state.filter_state
+        terms, at = series_filter.terms, series_filter.space.term_states
+        assert terms is not None
+        moved = terms.relinearised(current.mean[at], current.covariance[at, at])
+        count = state.scores.readings
+        if moved is None or state.passes >= MOST_PASSES:
+            return replace(state, due=max(count + 4, round(GROWTH * count)), passes=0)
+        self._point = cast("Array", moved.point)
+        vars(self).pop("_entry_filter")
+        first = int(next(self._moments(None))[0]["time_us"])
+        start = self._entry_filter.start(first, self._stuck_sensors)
+        return replace(start, point=self._point, due=state.due, passes=state.passes + 1)
 
     def _judged(self, state: EstimatorState) -> EstimatorState:
         """Return the estimator's state with every requirement judged at its newest reading of the monitor."""
@@ -251,7 +315,8 @@ class Operation:
         self._stuck_sensors = (*state.stuck_sensors, *state.newly_stuck)
         since = min(time for _, time in state.newly_stuck)
         self.history.drop_checkpoints(self.key, since)
-        self._saved = 0
+        self._saved, self._point = 0, np.zeros(0)
+        vars(self).pop("_entry_filter", None)
         checkpoint = self.history.checkpoint(self.key, before_us=since, valid=True)
         return (
             None
@@ -271,9 +336,13 @@ class Operation:
             return None
         state = EstimatorState.from_bytes(checkpoint.content)
         self._saved = state.scores.readings
+        if len(state.point) and self._prior_terms is not None and len(state.point) == len(self._prior_terms.members):
+            self._point = state.point
+            vars(self).pop("_entry_filter", None)
         if not self._has_same_basis(state):
             self.history.drop_checkpoints(self.key, self.epoch)
-            self._saved = 0
+            self._saved, self._point = 0, np.zeros(0)
+            vars(self).pop("_entry_filter")
             return None
         # a permanent checkpoint lists the entries used before it
         return state.with_counters_reset() if checkpoint.number > _HEAD else state
@@ -316,7 +385,44 @@ class Operation:
             state.pending is not None,
             self._understated_causes(),
             state.violations,
+            self._learned_terms(),
         )
+
+    def _learned_terms(self) -> tuple[LearnedTerm, ...]:
+        """Return the estimates of the terms and moves from all readings, with the moves that the readings contradict.
+
+        That test, of moves among the last `CHECKED_READINGS`, assumes all jumps but those near a move, which may be the
+        mistake itself.
+        """
+        series_filter = self._entry_filter.series_filter
+        if series_filter.terms is None:
+            return ()
+        contradicted = {}
+        if self.history.first(MOVE) is not None:
+            moves = [term.time for term in series_filter.terms.terms if isinstance(term, Move)]
+            read = sorted(time for time, _, _ in self._segment_innovations())
+            begin = self._begin() if len(read) <= CHECKED_READINGS else read[-CHECKED_READINGS]
+            times = [(time - self.epoch) / MICRO for time in read]
+            apart = []
+            for found, step in zip(self.estimator_state.jumps, self._steps(), strict=True):
+                places = np.searchsorted(times, [found.jump.after, found.jump.until, *moves])
+                if not np.any((places[2:] > places[0] - NEAR) & (places[2:] < places[1] + NEAR)):
+                    apart.append(step)
+            with one_blas_thread():
+                how, start, observed, _ = self._smoothing_inputs(begin)
+                how = replace(how, steps=(*series_filter.steps, *apart), include_undetected=False)
+                contradicted = contradicted_moves(
+                    how,
+                    replace(start, undetected=np.zeros(0)),
+                    observed,
+                    self._sigma_inflation,
+                    lambda seconds: utc_text(self.epoch + round(seconds * MICRO))[:10],
+                )
+        return learned_terms(series_filter, self._now, self.epoch, contradicted)
+
+    def _segment_innovations(self) -> list[tuple[int, float, int]]:
+        """Return (time_us, chi-square, degrees of freedom) of all readings."""
+        return [innovation for span in self._segments(None) for innovation in span.new_innovations]
 
     def power(self) -> tuple[DetectionPower, ...]:
         """Return the smallest detectable jump of each body at the mean interval of the readings so far.
@@ -324,6 +430,9 @@ class Operation:
         The result is empty for a single reading.
         """
         count, noise = self.estimator_state.scores.readings, self.model.series_filter.reference_noise
+        if self.plan.operation.focus is not None:
+            first = cast("dict[str, Any]", self.history.first("focus"))
+            noise = np.array([[float(content_of(first)["sigma"]) ** 2]])
         if count < 2 or noise is None:
             return ()
         interval = (self.estimator_state.time - self.epoch) / MICRO / (count - 1)
@@ -495,7 +604,7 @@ class Operation:
 
         After the newest reading it is the present factor. Array dimensions: T times.
         """
-        innovations = [innovation for span in self._segments(None) for innovation in span.new_innovations]
+        innovations = self._segment_innovations()
         squares = self._unexplained(innovations)
         counts = np.searchsorted([time for time, _, _ in innovations], times, side="right")
         out = inflation_factors(squares, counts, True, self._lasting([time for time, _, _ in innovations]))
@@ -661,7 +770,7 @@ class Operation:
 
     def _begin(self) -> int:
         """Return the time of the first entry that the estimate uses, in microseconds of TAI since 2000."""
-        return min(int(entry["time_us"]) for kind in USED if (entry := self.history.first(kind)) is not None)
+        return min(int(entry["time_us"]) for kind in self._kinds if (entry := self.history.first(kind)) is not None)
 
     def _checkpoint_before(self, time: int) -> EstimatorState | None:
         """Return the newest permanent checkpoint before a time and all jumps detected since; None if there is none."""

@@ -18,7 +18,7 @@ from scipy.linalg import block_diag
 from analysis.arrays import Array
 from analysis.monitor.kalman_filter import SeriesFilter
 from analysis.monitor.limits import Quantity, quantities
-from analysis.monitor.parameters import ANGLE, ANGLE_GROUP, CAMERA_PARAMETERS, GROUND, GROUND_GROUP
+from analysis.monitor.parameters import ANGLE, ANGLE_GROUP, CAMERA_PARAMETERS, FOCUS, GROUND, GROUND_GROUP
 from analysis.monitor.state_space import HeatInputs
 from optics.thermal.heat import Temperature
 from scenes.models.disturbances import HEAT, DisturbancePrior
@@ -28,6 +28,7 @@ from scenes.specs.operation import OperationSetup, read_operation
 from scenes.yaml.errors import Problem, names_text, nearest, shown
 from scenes.yaml.spec import validate
 from scenes.yaml.yaml_file import YamlFile
+from twin.monitor.monitor_derivative import linear_disturbances
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.operate.record.entries import digest_of_data, digest_of_job
 from twin.operate.record.history import History
@@ -123,6 +124,42 @@ def traced_model(
     )
 
 
+def focus_model(setup: OperationSetup, experiment: MonitorExperiment) -> OperationModel:
+    """Return the model of an estimate from readings of focus, which are amounts of one motion.
+
+    Parameters
+    ----------
+    setup : OperationSetup
+        Plan of operation with `focus`, and its instrument.
+    experiment : MonitorExperiment
+        Experiment of the instrument, which needs no monitor.
+
+    Raises
+    ------
+    InputError
+        The plan's disturbances have another motion.
+    """
+    plan, stated = setup.operation, experiment.stated
+    assert plan.focus is not None
+    assert stated is not None  # a plan requires disturbances
+    names = [component.name for component in stated.components]
+    if set(names) != {plan.focus.motion}:
+        other = next((name for name in names if name != plan.focus.motion), "no motion")
+        problem = "the readings of focus are amounts of another motion than the disturbances have"
+        raise plan.error(problem, ("focus", "motion"), found=plan.focus.motion, allowed=f"{other}, and no other motion")
+    effect = np.ones((1, len(names)))
+    disturbances = linear_disturbances(stated, effect, effect)
+    stepping = {cause for causes in plan.events.values() for cause in causes}
+    series_filter = SeriesFilter(
+        disturbances,
+        life_s=plan.mission,
+        window=plan.window,
+        stepping=tuple(k for k, cause in enumerate(disturbances.causes) if cause in stepping),
+    )
+    quantity = Quantity(plan.focus.camera, FOCUS, np.array([FOCUS.per_si]))
+    return OperationModel(series_filter, ((plan.focus.camera, "focus"),), (quantity,), np.ones((1, 1)))
+
+
 def heat_inputs(
     prior: DisturbancePrior, thermal: ThermalModel, sensors: Sequence[str], sigma: float
 ) -> HeatInputs | None:
@@ -192,6 +229,8 @@ def read_plan(path: Path, history: History) -> OperationSetup:
         problem = f"a plan of another instrument than the record's ({digest[:12]}, not {history.sha256[:12]})"
         raise operation.error(problem, ("instrument",), found=operation.instrument, allowed=history.name)
     names = quantity_names(setup.model.instrument)
+    if operation.focus is not None:
+        names = (f"{operation.focus.camera} {FOCUS.key}",)
     for k, requirement in enumerate(operation.requirements):
         if requirement.name not in names:
             text, near = f"{history.name} has no such quantity", nearest(requirement.name, names)

@@ -19,11 +19,12 @@ from scipy.special import ndtr
 from analysis.arrays import Array
 from analysis.monitor.disturbances import FALSE_ALARM
 from analysis.monitor.limits import Quantity
-from analysis.monitor.parameters import ANGLE_GROUP, GROUND_GROUP
+from analysis.monitor.parameters import ANGLE_GROUP, FOCUS, GROUND_GROUP
 from analysis.statistics import limit_of, p_value_of
 from scenes.specs.operation import OperationSpec
 from twin.framework.artefact import decimals_for, fixed, plain
 from twin.operate.estimate.estimate_snapshot import SAME_SPAN, SPANS, Scores, Violation
+from twin.operate.estimate.learned_model import LearnedTerm
 from twin.operate.record.entries import MICRO, Alarm, utc_text
 from twin.operate.record.history import History
 
@@ -282,6 +283,8 @@ class FilterResult:
         Causes of the prior with which the sensors of several bodies jointly disagree.
     violations : tuple[Violation, ...]
         Spans of readings at which a requirement was violated, past ones and those that last.
+    terms : tuple[LearnedTerm, ...]
+        Learned terms of the plan, and commanded moves of the record.
     """
 
     time: int
@@ -301,11 +304,13 @@ class FilterResult:
     undecided: bool = False
     understated_causes: tuple[str, ...] = ()
     violations: tuple[Violation, ...] = ()
+    terms: tuple[LearnedTerm, ...] = ()
 
     @property
     def readings_text(self) -> str:
         """Number of readings of the monitor that were used, and whether the newest one is undecided, as text."""
-        text = "1 reading of the monitor" if self.readings == 1 else f"{self.readings} readings of the monitor"
+        what = "focus" if any(quantity.parameter is FOCUS for quantity in self.now.quantities) else "the monitor"
+        text = f"1 reading of {what}" if self.readings == 1 else f"{self.readings} readings of {what}"
         return f"{text} (and a newer one that may be an outlier)" if self.undecided else text
 
     @property
@@ -327,7 +332,7 @@ class FilterResult:
         if self.understated_causes:
             text = "their sigmas in the prior are too small or their time laws are wrong, and no sigma holds"
             out.append(f"sensors of several bodies jointly disagree with {', '.join(self.understated_causes)}: {text}")
-        return out
+        return [*out, *(term.warning for term in self.terms if term.warning)]
 
     def to_dict(self) -> dict[str, Any]:
         """Return the estimate with jumps, sensors, requirements and warnings as plain data for JSON."""
@@ -350,6 +355,7 @@ class FilterResult:
             "undecided": self.undecided,
             "understated_causes": list(self.understated_causes),
             "requirements": [requirement.to_dict() for requirement in self.requirements],
+            **({"terms": [vars(term) for term in self.terms]} if self.terms else {}),
         }
 
 

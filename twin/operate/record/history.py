@@ -54,6 +54,8 @@ from twin.operate.record.schema import (
 
 USED = ("monitor", "temperature")
 """Kinds of entries that the estimate uses as observations; events are used as times at which motions may step."""
+DECIDED = (*USED, "focus", "move")
+"""Kinds of entries that a person may exclude from the estimate."""
 
 
 class History:
@@ -154,7 +156,7 @@ class History:
         Parameters
         ----------
         number : int
-            Id of the entry, a reading of the monitor or a temperature.
+            Id of the entry, of one of the kinds in `DECIDED`.
         included : bool
             True to use the entry from now on, False to exclude it.
         why : str
@@ -172,9 +174,11 @@ class History:
         """
         c = ENTRY.c
         with writing(self._engine) as connection:
-            row = connection.execute(select(ENTRY).where(c.id == number, c.kind.in_(USED))).mappings().first()
+            row = connection.execute(select(ENTRY).where(c.id == number, c.kind.in_(DECIDED))).mappings().first()
             if row is None:
-                allowed = "a reading of the monitor or a temperature; export writes the numbers of all entries"
+                allowed = (
+                    "a reading of the monitor, temperature, focus or move; export writes the numbers of all entries"
+                )
                 raise Problem("no such reading", str(number), allowed)
             decisions = select(c.content).where(c.kind == DECISION, c.subject == str(number)).order_by(c.id)
             before = [parse_json(decision, "the record") for decision in connection.execute(decisions).scalars()]

@@ -164,7 +164,8 @@ class Ingest:
             text = f"the clock runs backwards: {utc_text(entry.time)} after {utc_text(before)}"
             return f"{text}; sort the rows, or remove those before the clock was set"
         if before is not None and entry.time == before:
-            return f"another reading of {entry.subject} at {utc_text(entry.time)} in this file; one of them is wrong"
+            wrong = "two moves of a day need different times" if entry.kind == "move" else "one of them is wrong"
+            return f"another reading of {entry.subject} at {utc_text(entry.time)} in this file; {wrong}"
         if newest is not None and entry.time <= newest:
             query = (
                 select(c.id).where(c.kind == entry.kind, c.subject == entry.subject, c.time_us == entry.time).limit(1)

@@ -59,6 +59,20 @@ TABLES: Mapping[str, Record[Row]] = {
         Quantity("defocus_um", _value(0), "defocus of the detector, positive downstream"),
         Quantity("defocus_um_sigma", lambda row: 1e6 * _sigma(row), "standard deviation", converted=False),
     ),
+    "input": _readings(
+        "Temperatures that are inputs of a plan's terms.",
+        _key("subject", "input"),
+        Quantity("temperature_K", _value(0), "temperature"),
+        Quantity("temperature_K_sigma", _sigma, "standard deviation of the sensor's error"),
+    ),
+    "move": _readings(
+        "Commanded moves.",
+        _key("subject", "motion"),
+        Quantity("size", _value(0), "size of the move, in SI units"),
+        Quantity("size_sigma", _sigma, "its standard deviation, in SI units"),
+        Quantity("unit", lambda row: row["content"]["unit"], "m, rad, or none for a relative change"),
+        Quantity("time_s_sigma", lambda row: row["content"]["time_sigma"], "standard deviation of the time"),
+    ),
     "attitude": _readings(
         "Attitudes of star trackers.",
         _key("subject", "star tracker"),

@@ -16,12 +16,14 @@ from typing import Any
 from scenes.specs.operation import (
     EVENT,
     EVENTS,
+    MOVE,
     QUATERNION,
     RUNS,
     VALUES,
     ReadingColumnSpec,
     ReadingTableSpec,
     TelemetrySpec,
+    value_kinds,
 )
 from scenes.specs.resolved import resolve_on
 from scenes.yaml.csv_table import rows_apart
@@ -277,7 +279,7 @@ def _items(table: ReadingTableSpec, path: Path, history: History) -> tuple[list[
         except Problem as problem:
             items.append(Refusal(f"{table.time}: {one_line(problem)}", number))
             continue
-        if table.kind in VALUES:
+        if table.kind in VALUES or table.kind == MOVE:
             read = (
                 (subject, column, [row[head] for head in column.column]) for subject, column in table.columns.items()
             )
@@ -351,7 +353,7 @@ def _reading(
     line: int,
 ) -> Entry:
     """Return one reading in SI units. Raise Problem if it is no number, or not plausible."""
-    kind, sigma_kind = VALUES[table.kind]
+    kind, sigma_kind = value_kinds(table.kind, subject)
     sigma = parse_quantity(column.sigma, sigma_kind)
     unit = QUATERNION if column.unit == QUATERNION else kind.si
     if unit == QUATERNION:
@@ -365,7 +367,10 @@ def _reading(
         values = [parse_quantity(f"{cell} {column.unit}", kind) for cell in cells]
     if table.kind == "temperature":
         _require_plausible(subject, values[0], column.unit, history)
-    return Entry(table.kind, subject, moment, {"values": values, "sigma": sigma, "unit": unit}, line)
+    content = {"values": values, "sigma": sigma, "unit": unit}
+    if table.kind == MOVE:
+        content["time_sigma"] = table.time_sigma
+    return Entry(table.kind, subject, moment, content, line)
 
 
 def _number(cell: str) -> float:
