@@ -390,6 +390,59 @@ class PositionReadingsSpec(ReadingsSpec):
         return self.values is not None
 
 
+class ImageReadingsSpec(ReadingsSpec):
+    """Images of stars, in focus or defocused, one for each field and all in one position of the focal plane.
+
+    Columns run along the line and rows along the track, toward +Y and +X of the focal plane. Position, flux and
+    background of every star are estimated with the state.
+
+    Attributes
+    ----------
+    fields : tuple[tuple[float, float], ...]
+        Fields of the stars as fractions of the half field, [along the line, along the track].
+    file : str | None
+        FITS or TIFF file with a page of the same size for each field, in their order; values are linear in light.
+    defocus : float
+        Shift of the focal plane downstream during the exposure, in metres. A shift by an actuator is one of the
+        `moves` instead, and its error is estimated.
+    seeing : float | 'free'
+        Full width at half maximum of the Gaussian blur by air and motion, in radians; `free` to estimate it for every
+        star, 0 by default.
+    gain : float
+        Electrons per grey value.
+    read_noise : float
+        Standard deviation of the noise of a pixel without light, in electrons.
+    saturation : float | None
+        Grey value from which a pixel is saturated and is not used; by default the largest that the file can hold.
+    orientation : str
+        Rotation or reflection that brings the images to columns along the line and rows along the track, in the words
+        of `check`.
+    pixels : int
+        Rows and columns of simulated images.
+    flux : float
+        Electrons of a simulated star.
+    background : float
+        Electrons of background in a pixel of simulated images.
+    """
+
+    fields: Annotated[tuple[tuple[FieldShare, FieldShare], ...], Field(min_length=1, max_length=25)]
+    file: Reference | None = None
+    defocus: Annotated[float, Quantity(LENGTH, largest="100 mm")] = 0.0
+    seeing: Literal["free"] | Annotated[float, Quantity(ANGLE, smallest="0 arcsec", largest="1 arcmin")] = 0.0
+    gain: Annotated[Number, Field(gt=0.0, le=1e6)] = 1.0
+    read_noise: Annotated[Number, Field(gt=0.0, le=1e6)]
+    saturation: Annotated[Number, Field(gt=0.0)] | None = None
+    orientation: Text = "as it is"
+    pixels: Annotated[Whole, Field(ge=8, le=256)] = 32
+    flux: Annotated[Number, Field(gt=0.0, le=1e12)] = 1e6
+    background: Annotated[Number, Field(ge=0.0, le=1e9)] = 0.0
+
+    @property
+    def has_data(self) -> bool:
+        """True if the measurement refers to a file."""
+        return self.file is not None
+
+
 def _one_for_each(positions: Any, values: Any, key: str) -> None:
     if positions is not None and values is not None and len(values) != len(positions):
         raise Problem("not one value for each position", str(len(values)), str(len(positions)), within=(key,))
@@ -416,6 +469,8 @@ class MeasurementsSpec(Spec):
         Name -> temperatures of bodies.
     positions : Mapping[str, PositionReadingsSpec]
         Name -> positions of bodies.
+    images : Mapping[str, ImageReadingsSpec]
+        Name -> images of stars in one position of the focal plane.
     """
 
     wavefronts: Annotated[Named[WavefrontReadingsSpec], NothingIsEmpty] = Field(default_factory=FrozenMap)
@@ -426,6 +481,7 @@ class MeasurementsSpec(Spec):
     sight: Annotated[Named[SightReadingsSpec], NothingIsEmpty] = Field(default_factory=FrozenMap)
     temperatures: Annotated[Named[TemperatureReadingsSpec], NothingIsEmpty] = Field(default_factory=FrozenMap)
     positions: Annotated[Named[PositionReadingsSpec], NothingIsEmpty] = Field(default_factory=FrozenMap)
+    images: Annotated[Named[ImageReadingsSpec], NothingIsEmpty] = Field(default_factory=FrozenMap)
 
     @model_validator(mode="after")
     def _names_once(self) -> MeasurementsSpec:
