@@ -20,7 +20,7 @@ FWHM = float(2.0 * np.sqrt(2.0 * np.log(2.0)))
 """Full width at half maximum of a Gaussian over its standard deviation."""
 _FAINT = 3.0
 """Number of standard deviations of the noise above the background from which a pixel counts for the centroid."""
-_STEPS = 60
+_STEPS = 30
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,7 +117,7 @@ class StarReading:
 
         first = np.array([*start, blur / unit] if free else start)
         found = least_squares(
-            lambda x: at(x)[0], first, lambda x: at(x)[1], method="lm", xtol=1e-8, max_nfev=_STEPS
+            lambda x: at(x)[0], first, lambda x: at(x)[1], method="lm", xtol=1e-5, ftol=1e-7, max_nfev=_STEPS
         ).x
         place = np.array([*found[:2], found[2] * unit if free else blur])
         share = self.image.pixels(irradiance, place[:2], place[2]) * weight

@@ -34,7 +34,7 @@ from twin.asbuilt.measured_kinds import (
     WavefrontReadings,
 )
 from twin.asbuilt.parameters import Parameters
-from twin.asbuilt.star_images import ImageReadings
+from twin.asbuilt.star_images import ImageReadings, StarResidual
 from twin.camera.camera_optics import CameraOptics
 from twin.camera.varied_beams import VariedBeams
 from twin.monitor.monitor_experiment import MonitorExperiment
@@ -297,6 +297,15 @@ class AsBuiltBench(Site):
         if not other.converged or np.linalg.norm(np.linalg.solve(state.root, other.unit - state.unit)) < _ANOTHER:
             return (state,)
         return tuple(sorted((state, other), key=lambda mode: -mode.log_evidence))
+
+    def star_images(self, data: Sequence[np.ndarray], state: StateEstimate) -> tuple[StarResidual, ...]:
+        """Return measured and predicted images of all stars in an estimated state."""
+        out: list[StarResidual] = []
+        for kind, after, values in zip(self.kinds, self.afters, data, strict=True):
+            if isinstance(kind, ImageReadings):
+                view = self.view(state.mean[None], after)
+                out += kind.about(values).expecting(view).residuals(view)
+        return tuple(out)
 
     def _nearby(self, kinds: Sequence[MeasuredKind], data: Sequence[np.ndarray]) -> np.ndarray:
         """Return a state near which an estimate from images converges, (K,).

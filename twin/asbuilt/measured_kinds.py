@@ -169,10 +169,6 @@ class MeasuredKind(ABC):
         """Return other traced quantities, (Q,), whose readings are nearly the same; None if there are none."""
         return None
 
-    def warnings(self, view: View) -> tuple[str, ...]:
-        """Return warnings about the readings in the estimated state."""
-        return ()
-
     def covariance(self) -> np.ndarray:
         """Return the covariance of the random errors of the D readings, (D, D), in squared SI units.
 

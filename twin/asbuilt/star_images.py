@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Iterable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
@@ -30,8 +31,10 @@ _RINGS, _SHADOW = 80, 24
 """Rings of the quadrature over the stop, and nodes along each side of a shadow's box."""
 COARSE = 0.1
 """Noise of the first estimate relative to the brightest pixel."""
-CUT = 0.02
-"""Share of a star's light outside its cut-out above which the report warns."""
+CUT, NEAR = 0.02, 0.25
+"""Share of a star's light outside its cut-out above which the report warns, and distance of its centroid from the middle,
+as a share of the cut-out's width.
+"""
 
 
 def star_pupil(beams: VariedBeams, number: int) -> StarPupil:
@@ -208,29 +211,79 @@ class ImageReadings(MeasuredKind):
         """Return the pixels of all images in the file, electrons; NaN where they are saturated."""
         return self._recorded.ravel()
 
-    def warnings(self, view: View) -> tuple[str, ...]:
-        """Return warnings on stars that fit badly, are cut or are saturated."""
-        out = []
-        for field, star, fit in zip(self.spec.fields, self.stars, self.fits(view), strict=True):
-            name = f"{self.name}: the star at {field_text(field)}"
-            test = star_test(star, fit)
-            if not test.passes(len(self.stars)):
-                ratio = test.chi_square / max(1, test.degrees)
-                out.append(f"{name} does not have the predicted image: chi-square {ratio:.2f} per degree of freedom")
-            outside = 1.0 - float(np.sum(fit.model - fit.background)) / fit.flux
-            if outside > CUT:
-                out.append(f"{name} has {100 * outside:.0f} % of its light outside its cut-out: use larger cut-outs")
-            elif np.max(np.abs(centroid(np.maximum(fit.model - fit.background, 0.0)) / self.shape)) > 0.25:
-                out.append(f"{name} lies at the edge of its cut-out")
-            lost = int(np.sum(~np.isfinite(star.variance)))
-            if lost:
-                out.append(f"{name} has {lost} saturated pixels, which are not used")
-        return tuple(out)
+    def residuals(self, view: View) -> list[StarResidual]:
+        """Return measured and predicted images of all stars in the estimated state."""
+        triples = zip(self.spec.fields, self.stars, self.fits(view), strict=True)
+        return [StarResidual(self.name, field, star, fit) for field, star, fit in triples]
 
 
-def star_test(star: StarReading, fit: StarFit) -> ConsistencyTest:
-    """Return the chi-square test of one image about its prediction in the estimated state."""
-    used = np.isfinite(star.variance)
-    assert star.counts is not None
-    chi_square = float(np.sum(((star.counts - fit.model) ** 2 / star.variance)[used]))
-    return ConsistencyTest.of("star", chi_square, int(np.sum(used)) - star.fitted)
+@dataclass(frozen=True, eq=False)
+class StarResidual:
+    """Recorded image of a star beside its prediction in the estimated state.
+
+    Attributes
+    ----------
+    measurement : str
+        Name of the measurement.
+    field : tuple of float
+        Field of the star, as fractions of the half field.
+    star : StarReading
+        Recorded image with the variance of its pixels.
+    fit : StarFit
+        Prediction.
+    """
+
+    measurement: str
+    field: tuple[float, float]
+    star: StarReading
+    fit: StarFit
+
+    @property
+    def pulls(self) -> np.ndarray:
+        """Recorded minus predicted light over its standard deviation, (R, C); NaN for unused pixels."""
+        assert self.star.counts is not None
+        used = np.isfinite(self.star.variance)
+        return np.where(used, (self.star.counts - self.fit.model) / np.sqrt(self.star.variance), np.nan)
+
+    @property
+    def test(self) -> ConsistencyTest:
+        """Chi-square test of the image about its prediction in the estimated state."""
+        degrees = int(np.sum(np.isfinite(self.pulls))) - self.star.fitted
+        return ConsistencyTest.of("star", float(np.nansum(self.pulls**2)), degrees)
+
+    @property
+    def outside(self) -> float:
+        """Share of the star's light outside its cut-out."""
+        return 1.0 - float(np.sum(self.fit.model - self.fit.background)) / self.fit.flux
+
+    def plain(self) -> dict[str, Any]:
+        """Return the numbers of the star as plain data."""
+        blur = FWHM * self.fit.blur / self.star.image.pitch
+        return {
+            "measurement": self.measurement,
+            "field": list(self.field),
+            "row_px": float(self.fit.position[0]),
+            "column_px": float(self.fit.position[1]),
+            "flux_e": self.fit.flux,
+            "background_e": self.fit.background,
+            "seeing_px": blur,
+            "outside": self.outside,
+            "chi_square": self.test.chi_square,
+            "degrees": self.test.degrees,
+        }
+
+    def warnings(self) -> list[str]:
+        """Return warnings on a star that fits badly, is cut or is saturated."""
+        out, name = [], f"{self.measurement}: the star at {field_text(self.field)}"
+        if not self.test.passes():
+            ratio = self.test.chi_square / max(1, self.test.degrees)
+            out.append(f"{name} does not have the predicted image: chi-square {ratio:.2f} per degree of freedom")
+        light = centroid(np.maximum(self.fit.model - self.fit.background, 0.0))
+        if self.outside > CUT:
+            out.append(f"{name} has {100 * self.outside:.0f} % of its light outside its cut-out: use larger cut-outs")
+        elif np.max(np.abs(light / self.fit.model.shape)) > NEAR:
+            out.append(f"{name} lies at the edge of its cut-out")
+        lost = int(np.sum(~np.isfinite(self.star.variance)))
+        if lost:
+            out.append(f"{name} has {lost} saturated pixels, which are not used")
+        return out
