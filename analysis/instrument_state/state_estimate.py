@@ -347,7 +347,7 @@ class StateEstimate:
     @property
     def log_evidence(self) -> float:
         """Logarithm of the probability of the measurements near this state, up to a constant (Laplace's method)."""
-        return float(np.linalg.slogdet(self.root)[1] - 0.5 * self.whole.chi_square / self.variance_factor)
+        return float(np.linalg.slogdet(self.root)[1] - 0.5 * self.whole.chi_square)
 
     def draw(self, rng: np.random.Generator, count: int) -> Array:
         """Draw random states from the posterior distribution, (count, M), SI units.
@@ -547,7 +547,7 @@ def _consistency(name: str, residual: Array, spread: Array, rows: Array) -> Cons
 
 
 def _consistency_of_many(name: str, residual: Array, left: Array, fitted: int) -> ConsistencyTest:
-    """Return the chi-square test of R whitened numbers with independent errors against their prediction from all others.
+    """Return the chi-square test of R whitened numbers with independent errors against their prediction from others.
 
     The result is that of ``_consistency`` for all of them together, without a matrix of R by R (Woodbury's formula).
 

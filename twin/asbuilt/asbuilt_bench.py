@@ -69,8 +69,7 @@ the parameter in standard deviations.
 _CLOSE = 10e-9
 """Accuracy to which the coefficients of mirrored wavefronts are to be reached, metres."""
 _MOST, _STARTS = 3.0, 25
-"""Largest amount of the wavefront's largest uncertainty, in standard deviations, at which estimates start; their number.
-"""
+"""Largest amount of the wavefront's largest uncertainty, in prior standard deviations, and number of states tried."""
 _REACHED = 0.5
 """Largest part of a mirrored wavefront that a state may miss for an estimate to start there."""
 _ANOTHER = 3.0
@@ -191,11 +190,7 @@ class AsBuiltBench(Site):
         return self._predicted(values, self.kinds, self.afters)
 
     def _predicted(
-        self,
-        values: np.ndarray,
-        kinds: Sequence[MeasuredKind],
-        afters: Sequence[str | None],
-        traced: bool = False,
+        self, values: np.ndarray, kinds: Sequence[MeasuredKind], afters: Sequence[str | None], traced: bool = False
     ) -> np.ndarray:
         """Return the readings of some kinds in S states, or only what a trace determines of them, side by side."""
 

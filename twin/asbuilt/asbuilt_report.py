@@ -294,12 +294,26 @@ def _image_sections(run: AsBuiltRun) -> tuple[Section, ...]:
         ]
         for image in run.images
     ]
-    heads = ("measurement", "x", "y", "flux [e-]", "background [e-]", "seeing [px]", "outside [%]", "chi-square / degree", "p")
-    caption = "Field as shares of the half field; seeing: full width at half maximum; outside: light beyond the cut-out."
+    heads = (
+        "measurement",
+        "x",
+        "y",
+        "flux [e-]",
+        "background [e-]",
+        "seeing [px]",
+        "outside [%]",
+        "chi-square / degree",
+        "p",
+    )
+    caption = (
+        "Field as shares of the half field; seeing: full width at half maximum; outside: light beyond the cut-out."
+    )
     table = Table("star_images", "Stars", caption, heads, rows, (None, 2, 2, 0, 1, 2, 2, 3, 4))
     text = "Images of stars, the prediction in the estimated state, and their difference in standard deviations."
     return (
-        Section("Images of stars", (text,), (SvgFigure("stars", "Images and residuals", "", figure), table), name="stars"),
+        Section(
+            "Images of stars", (text,), (SvgFigure("stars", "Images and residuals", "", figure), table), name="stars"
+        ),
     )
 
 

@@ -206,9 +206,12 @@ def run_asbuilt(
 
 
 def probabilities(modes: Sequence[StateEstimate]) -> np.ndarray:
-    """Return the posterior probability of each of several states that explain the measurements, (modes,)."""
+    """Return the posterior probability of each of several states that explain the measurements, (modes,).
+
+    The first is the most probable; errors are multiplied by its variance factor.
+    """
     evidence = np.array([mode.log_evidence for mode in modes])
-    share = np.exp(evidence - np.max(evidence))
+    share = np.exp((evidence - evidence[0]) / modes[0].variance_factor)
     return np.asarray(share / np.sum(share))
 
 

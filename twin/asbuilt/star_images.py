@@ -32,8 +32,8 @@ _RINGS, _SHADOW = 80, 24
 COARSE = 0.1
 """Noise of the first estimate relative to the brightest pixel."""
 CUT, NEAR = 0.02, 0.25
-"""Share of a star's light outside its cut-out above which the report warns, and distance of its centroid from the middle,
-as a share of the cut-out's width.
+"""Share of a star's light outside its cut-out, and distance of its centroid from the middle as a share of the width, above
+which the report warns.
 """
 
 
@@ -57,7 +57,8 @@ def star_pupil(beams: VariedBeams, number: int) -> StarPupil:
     cosines, launched = beams.cosines[0, number], (starts[1:] - starts[0]) @ plane.T
     along = [matrix @ beams.solve for matrix in slopes(beams.nodes, beams.degree)]
     area = [
-        np.abs(np.linalg.det(np.stack([matrix @ values for matrix in along], axis=-1))) for values in (cosines, launched)
+        np.abs(np.linalg.det(np.stack([matrix @ values for matrix in along], axis=-1)))
+        for values in (cosines, launched)
     ]
     light = stop.weight[0] * (table @ area[1])
     amplitude = stop.weight[0] * (table @ np.sqrt(area[0] * area[1])) / np.sqrt(np.sum(light))
@@ -101,7 +102,9 @@ class ImageReadings(MeasuredKind):
         image = StarImage(self.pupils[number], self.beams.degree, self.shape, self.pitch, blur=most)
         first = StarFit(np.zeros(2), blur, spec.flux, spec.background, np.zeros(self.shape), np.zeros((0, 0)))
         star = StarReading(image, self.blur, first, None, np.ones(self.shape))
-        return star.with_noise(star.predict(self._terms(self.beams.designed.eikonals)[0, number]).model, spec.read_noise)
+        return star.with_noise(
+            star.predict(self._terms(self.beams.designed.eikonals)[0, number]).model, spec.read_noise
+        )
 
     def _terms(self, eikonals: np.ndarray) -> np.ndarray:
         """Return the coefficients of the eikonals of F fields, (S, F, T), for those at N nodes, (S, F, N)."""
@@ -139,9 +142,7 @@ class ImageReadings(MeasuredKind):
         """Return the derivatives of the pixels, without those that position, flux and background can explain."""
         terms = traced.reshape(len(self.stars), -1)
         directions = slope.reshape(len(self.stars), terms.shape[1], -1)
-        return np.concatenate(
-            [star.slope(c, d.T) for star, c, d in zip(self.stars, terms, directions, strict=True)]
-        )
+        return np.concatenate([star.slope(c, d.T) for star, c, d in zip(self.stars, terms, directions, strict=True)])
 
     def covariance(self) -> np.ndarray:
         """Return the variances of the pixels, squared electrons; infinite for saturated ones."""
