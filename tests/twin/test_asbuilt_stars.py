@@ -11,7 +11,6 @@ import pytest
 from astropy.io import fits
 from scipy.stats import binom
 
-from analysis.instrument_state.star_readings import StarFit, StarReading
 from analysis.instrument_state.state_estimate import MeasuredGroup, StatePrior, estimate_state
 from optics.numerics.quadrature import disk
 from optics.waves.diffraction import Grid, PupilField, airy, image
@@ -22,6 +21,7 @@ from scenes.yaml.yaml_file import dump_yaml
 from tests.twin.star_bench import PRIOR, TWO, independent_share, judged, measured, star_bench
 from twin.asbuilt.asbuilt_bench import AsBuiltBench
 from twin.asbuilt.asbuilt_run import probabilities, run_asbuilt
+from twin.asbuilt.star_readings import StarFit, StarReading
 from twin.validation.real.stars import FILE, star_file, star_images
 
 WAVE, APERTURE = 650e-9, 1.0 / 20.0

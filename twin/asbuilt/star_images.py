@@ -12,7 +12,6 @@ import numpy as np
 
 from analysis.arrays import MeasurementError
 from analysis.images.image_file import ImageError, ImageFile, Region
-from analysis.instrument_state.star_readings import FWHM, StarFit, StarReading, centroid
 from analysis.instrument_state.state_estimate import ConsistencyTest, MeasuredGroup
 from analysis.wavefront_maps.pupil_fit import Orientation
 from optics.numerics.backend import one_blas_thread
@@ -21,6 +20,7 @@ from optics.waves.pupil_terms import orders, products, slopes
 from optics.waves.star_image import StarImage, StarPupil
 from scenes.specs import asbuilt as specs
 from twin.asbuilt.measured_kinds import MeasuredKind, View, field_text
+from twin.asbuilt.star_readings import FWHM, StarFit, StarReading, centroid
 from twin.camera.varied_beams import VariedBeams
 
 TYPICAL_SEEING = 1.5
@@ -32,8 +32,9 @@ _RINGS, _SHADOW = 80, 24
 COARSE = 0.1
 """Noise of the first estimate relative to the brightest pixel."""
 CUT, NEAR = 0.02, 0.25
-"""Share of a star's light outside its cut-out, and distance of its centroid from the middle as a share of the width, above
-which the report warns.
+"""Share of a star's light outside its cut-out, and distance of its centroid from the middle as a share of the width.
+
+The report warns above them.
 """
 
 

@@ -11,11 +11,11 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from analysis.instrument_state.star_readings import FWHM, StarFit, StarReading
 from analysis.instrument_state.state_estimate import MeasuredGroup, StateEstimate, StatePrior, estimate_state
 from optics.numerics.quadrature import disk
 from optics.waves.imaging import orthonormal_rows
 from optics.waves.star_image import StarImage, StarPupil
+from twin.asbuilt.star_readings import FWHM, StarFit, StarReading
 from twin.validation.check import CheckResult
 from twin.validation.group import Context, drawing, group_of, load_printed
 from twin.validation.row_names import REAL, matches
