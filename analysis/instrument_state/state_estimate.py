@@ -502,7 +502,8 @@ def _tested(
     left = table @ root
     # to the first order this is the residual's inverse marginal covariance, times the residual about the prior's mean
     total = float(residual @ residual + unit @ unit)
-    measurements, blocks = [], {}
+    measurements: list[ConsistencyTest] = []
+    blocks: dict[str, tuple[ConsistencyTest, ...]] = {}
     start = 0
     for group, white in zip(groups, whiteners, strict=True):
         rows = slice(start, start + white.shape[0])
@@ -635,7 +636,7 @@ def combinations(estimate: StateEstimate, most: int | None = None) -> tuple[Comb
     """
     slope = estimate.slope
     # the triangle of a tall matrix has its singular values and right vectors, without a square matrix of its rows
-    slope = np.linalg.qr(slope, mode="r") if len(slope) > 4 * slope.shape[1] else slope
+    slope = np.asarray(np.linalg.qr(slope, mode="r")) if len(slope) > 4 * slope.shape[1] else slope
     _, values, rows = np.linalg.svd(slope, full_matrices=True)
     values = np.pad(values, (0, len(rows) - len(values)))
     back = np.linalg.pinv(estimate.prior.root, rcond=1e-12) * estimate.prior.sigma
