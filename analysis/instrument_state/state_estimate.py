@@ -23,11 +23,13 @@ predicted before it is made.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from scipy.optimize import lsq_linear
+from scipy.sparse import diags_array
 
 from analysis.arrays import Array, UndeterminedError, shows
 from analysis.statistics import limit_of, p_value_of
@@ -129,14 +131,18 @@ class MeasuredGroup:
         Names of the D numbers.
     values : (D,) ndarray
         Measured values, SI units.
-    covariance : (D, D) ndarray
-        Covariance of their errors, SI units.
+    covariance : (D, D) or (D,) ndarray
+        Covariance of their errors, SI units; or their variances if they are independent and have no biases, as for
+        pixels of images. A number of infinite variance is not used.
     biases : (D, B) ndarray
         Derivatives of the numbers with respect to each bias.
     bias_sigmas : (B,) ndarray
         Standard deviations of the biases; infinite for a free one.
     blocks : tuple of str
         For each number, the name of its block: the numbers that one gross error would affect together, such as a field.
+    fitted : int
+        Number of quantities of the measurement alone that the prediction fits to these numbers in every state, such as
+        the fluxes of stars (variable projection: Golub & Pereyra, SIAM J. Numer. Anal. 10, 413, 1973).
     """
 
     name: str
@@ -147,11 +153,13 @@ class MeasuredGroup:
     biases: Array
     bias_sigmas: Array
     blocks: tuple[str, ...]
+    fitted: int = 0
 
     def __post_init__(self) -> None:
         """Raise ValueError if the lengths of values, covariance, biases and labels do not match."""
         count = len(self.values)
-        if self.covariance.shape != (count, count) or self.biases.shape != (count, len(self.bias_sigmas)):
+        shapes = ((count, count),) if len(self.bias_sigmas) else ((count, count), (count,))
+        if self.covariance.shape not in shapes or self.biases.shape != (count, len(self.bias_sigmas)):
             raise ValueError(f"measurement {self.name}: covariance or biases do not have the shape for {count} numbers")
         if len(self.labels) != count or len(self.blocks) != count:
             raise ValueError(f"measurement {self.name}: {count} numbers need as many labels and blocks")
@@ -161,12 +169,12 @@ class MeasuredGroup:
 
         Dimensions: D measured numbers.
         """
-        return MeasuredGroup(
-            self.name, self.kind, self.labels, values, self.covariance, self.biases, self.bias_sigmas, self.blocks
-        )
+        return replace(self, values=values)
 
-    def whitener(self, without: Sequence[str] = ()) -> Array:
+    def whitener(self, without: Sequence[str] = ()) -> Any:
         """Return the matrix (R, D) that makes the errors independent with unit variance and eliminates free biases.
+
+        It is a sparse array for independent errors.
 
         Dimensions: R whitened measured numbers, D measured numbers.
 
@@ -181,6 +189,11 @@ class MeasuredGroup:
             The covariance is not positive definite.
         """
         included = np.array([block not in without for block in self.blocks])
+        if self.covariance.ndim == 1:
+            included &= np.isfinite(self.covariance)
+            if not np.all(self.covariance > 0.0):
+                raise UndeterminedError(f"measurement {self.name}: the standard deviation of a number is zero")
+            return diags_array(1.0 / np.sqrt(self.covariance), format="csr")[included]
         out = np.zeros((0, len(self.values)))
         if not included.any():
             return out
@@ -331,6 +344,11 @@ class StateEstimate:
         """Chi-square per degree of freedom of all measurements together if their test fails, else 1."""
         return 1.0 if self.whole.passes() else self.whole.chi_square / self.whole.degrees
 
+    @property
+    def log_evidence(self) -> float:
+        """Logarithm of the probability of the measurements near this state, up to a constant (Laplace's method)."""
+        return float(np.linalg.slogdet(self.root)[1] - 0.5 * self.whole.chi_square)
+
     def draw(self, rng: np.random.Generator, count: int) -> Array:
         """Draw random states from the posterior distribution, (count, M), SI units.
 
@@ -439,6 +457,8 @@ def _gauss_newton(
     moved, steps = np.inf, 0
     while True:
         table = whitened(slope(prior.mean + prior.root @ unit) @ prior.root)
+        if not np.all(np.isfinite(table)):
+            raise UndeterminedError("the estimate ended where small motions of the instrument lose its light")
         normal = np.eye(len(unit)) + table.T @ table
         if moved < STEP_TOLERANCE or steps >= MOST_STEPS:
             break
@@ -468,7 +488,7 @@ def _gauss_newton(
 def _tested(
     prior: StatePrior,
     groups: Sequence[MeasuredGroup],
-    whiteners: Sequence[Array],
+    whiteners: Sequence[Any],
     unit: Array,
     table: Array,
     residual: Array,
@@ -482,12 +502,18 @@ def _tested(
     left = table @ root
     # to the first order this is the residual's inverse marginal covariance, times the residual about the prior's mean
     total = float(residual @ residual + unit @ unit)
-    measurements, blocks = [], {}
+    measurements: list[ConsistencyTest] = []
+    blocks: dict[str, tuple[ConsistencyTest, ...]] = {}
     start = 0
     for group, white in zip(groups, whiteners, strict=True):
-        rows = slice(start, start + len(white))
-        start += len(white)
-        part, spread = residual[rows], np.eye(len(white)) - left[rows] @ left[rows].T
+        rows = slice(start, start + white.shape[0])
+        start += white.shape[0]
+        part = residual[rows]
+        if group.covariance.ndim == 1:
+            measurements.append(_consistency_of_many(group.name, part, left[rows], group.fitted))
+            blocks[group.name] = (replace(measurements[-1], name=group.blocks[0]),)
+            continue
+        spread = np.eye(len(white)) - left[rows] @ left[rows].T
         measurements.append(_consistency(group.name, part, spread, np.eye(len(white))))
         tests = []
         for block in dict.fromkeys(group.blocks):
@@ -495,7 +521,7 @@ def _tested(
             if np.any(columns):
                 tests.append(_consistency(block, part, spread, columns))
         blocks[group.name] = tuple(tests)
-    whole = ConsistencyTest.of("all", total, len(residual))
+    whole = ConsistencyTest.of("all", total, len(residual) - sum(group.fitted for group in groups))
     return StateEstimate(
         prior, tuple(groups), unit, root, table, residual, whole, tuple(measurements), blocks, (), steps, moved
     )
@@ -519,6 +545,29 @@ def _consistency(name: str, residual: Array, spread: Array, rows: Array) -> Cons
     held = values > _NO_RANK * max(1.0, float(values[-1]))
     parts = (vectors.T @ pull)[held]
     return ConsistencyTest.of(name, float(np.sum(parts**2 / values[held])), int(np.sum(held)))
+
+
+def _consistency_of_many(name: str, residual: Array, left: Array, fitted: int) -> ConsistencyTest:
+    """Return the chi-square test of R whitened numbers with independent errors against their prediction from others.
+
+    The result is that of ``_consistency`` for all of them together, without a matrix of R by R (Woodbury's formula).
+
+    Dimensions: R whitened measured numbers, U independent units of the prior.
+
+    Parameters
+    ----------
+    name : str
+        Name of the measurement.
+    residual : (R,) ndarray
+        Whitened residuals.
+    left : (R, U) ndarray
+        Whitened derivatives times the root of the posterior covariance.
+    fitted : int
+        Number of quantities that were fitted to these numbers alone.
+    """
+    pull = left.T @ residual
+    inner = np.linalg.solve(np.eye(len(pull)) - left.T @ left, pull)
+    return ConsistencyTest.of(name, float(residual @ residual + pull @ inner), max(0, len(residual) - fitted))
 
 
 DETERMINED = 0.5
@@ -585,7 +634,10 @@ def combinations(estimate: StateEstimate, most: int | None = None) -> tuple[Comb
     most : int or None
         Number of combinations; all by default.
     """
-    _, values, rows = np.linalg.svd(estimate.slope, full_matrices=True)
+    slope = estimate.slope
+    # the triangle of a tall matrix has its singular values and right vectors, without a square matrix of its rows
+    slope = np.asarray(np.linalg.qr(slope, mode="r")) if len(slope) > 4 * slope.shape[1] else slope
+    _, values, rows = np.linalg.svd(slope, full_matrices=True)
     values = np.pad(values, (0, len(rows) - len(values)))
     back = np.linalg.pinv(estimate.prior.root, rcond=1e-12) * estimate.prior.sigma
     out = []

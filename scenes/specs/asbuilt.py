@@ -343,6 +343,54 @@ class PositionReadingsSpec(ReadingsSpec):
         return self
 
 
+class ImageReadingsSpec(ReadingsSpec):
+    """Images of stars, in focus or defocused, one for each field and all in one position of the focal plane.
+
+    Columns run along the line and rows along the track, toward +Y and +X of the focal plane. Position, flux and
+    background of every star are estimated with the state.
+
+    Attributes
+    ----------
+    fields : tuple[tuple[float, float], ...]
+        Fields of the stars as fractions of the half field, [along the line, along the track].
+    file : str | None
+        FITS or TIFF file with a page of the same size for each field, in their order; values are linear in light.
+    defocus : float
+        Shift of the focal plane downstream during the exposure, in metres. A shift by an actuator is one of the
+        `moves` instead, and its error is estimated.
+    seeing : float | 'free'
+        Full width at half maximum of the Gaussian blur by air and motion, in radians; `free` to estimate it for every
+        star, 0 by default.
+    gain : float
+        Electrons per grey value.
+    read_noise : float
+        Standard deviation of the noise of a pixel without light, in electrons.
+    saturation : float | None
+        Grey value from which a pixel is saturated and is not used; by default the largest that the file can hold.
+    orientation : str
+        Rotation or reflection that brings the images to columns along the line and rows along the track, in the words
+        of `check`.
+    pixels : int
+        Rows and columns of simulated images.
+    flux : float
+        Electrons of a simulated star.
+    background : float
+        Electrons of background in a pixel of simulated images.
+    """
+
+    fields: Annotated[tuple[tuple[FieldShare, FieldShare], ...], Field(min_length=1, max_length=25)]
+    file: spec.Reference | None = None
+    defocus: Annotated[float, Quantity(LENGTH, largest="100 mm")] = 0.0
+    seeing: Literal["free"] | Annotated[float, Quantity(ANGLE, smallest="0 arcsec", largest="1 arcmin")] = 0.0
+    gain: Annotated[spec.Number, Field(gt=0.0, le=1e6)] = 1.0
+    read_noise: Annotated[spec.Number, Field(gt=0.0, le=1e6)]
+    saturation: Annotated[spec.Number, Field(gt=0.0)] | None = None
+    orientation: spec.Text = "as it is"
+    pixels: Annotated[spec.Whole, Field(ge=8, le=256)] = 32
+    flux: Annotated[spec.Number, Field(gt=0.0, le=1e12)] = 1e6
+    background: Annotated[spec.Number, Field(ge=0.0, le=1e9)] = 0.0
+
+
 class MeasurementsSpec(spec.Spec):
     """Measurements by kind; each has a name of your choice.
 
@@ -364,6 +412,8 @@ class MeasurementsSpec(spec.Spec):
         Name -> temperatures of bodies.
     positions : Mapping[str, PositionReadingsSpec]
         Name -> positions of bodies.
+    images : Mapping[str, ImageReadingsSpec]
+        Name -> images of stars in one position of the focal plane.
     """
 
     wavefronts: Annotated[spec.Named[WavefrontReadingsSpec], spec.NothingIsEmpty] = Field(default_factory=FrozenMap)
@@ -374,6 +424,7 @@ class MeasurementsSpec(spec.Spec):
     sight: Annotated[spec.Named[SightReadingsSpec], spec.NothingIsEmpty] = Field(default_factory=FrozenMap)
     temperatures: Annotated[spec.Named[TemperatureReadingsSpec], spec.NothingIsEmpty] = Field(default_factory=FrozenMap)
     positions: Annotated[spec.Named[PositionReadingsSpec], spec.NothingIsEmpty] = Field(default_factory=FrozenMap)
+    images: Annotated[spec.Named[ImageReadingsSpec], spec.NothingIsEmpty] = Field(default_factory=FrozenMap)
 
     @model_validator(mode="after")
     def _names_once(self) -> MeasurementsSpec:

@@ -11,7 +11,7 @@ from functools import cached_property
 import numpy as np
 
 from analysis.arrays import MeasurementError
-from analysis.instrument_state.state_estimate import Actuators, MeasuredGroup, StateEstimate, estimate_state
+from analysis.instrument_state.state_estimate import Actuators, StateEstimate, estimate_state
 from optics.geometry.tree import State
 from optics.numerics.array_math import PhysicalError
 from optics.numerics.backend import Backend
@@ -19,14 +19,45 @@ from optics.numerics.number_tree import FrozenMap
 from scenes.models.disturbances import DisturbancePrior, prior_of_spec
 from scenes.specs.asbuilt import AsBuiltSetup, MeasurementsSpec
 from scenes.specs.tolerance import OF_MONITOR, MeritSpec, ToleranceBudgetSpec, ToleranceSetup
-from scenes.yaml.errors import names_text
-from twin.asbuilt.measured_kinds import KINDS, MeasuredKind, Site, View
+from scenes.yaml.errors import InputError, names_text
+from twin.asbuilt.measured_kinds import (
+    DistortionReadings,
+    FocusReadings,
+    MeasuredKind,
+    MtfReadings,
+    PositionReadings,
+    SightReadings,
+    Site,
+    SpotReadings,
+    TemperatureReadings,
+    View,
+    WavefrontReadings,
+)
 from twin.asbuilt.parameters import Parameters
+from twin.asbuilt.star_images import ImageReadings, StarResidual
 from twin.camera.camera_optics import CameraOptics
 from twin.camera.varied_beams import VariedBeams
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.monitor.truth import line_points
 from twin.tolerance.tolerance_bench import ToleranceBench, judged_camera
+
+KINDS: Mapping[str, type[MeasuredKind]] = FrozenMap(
+    {
+        kind.kind: kind
+        for kind in (
+            WavefrontReadings,
+            FocusReadings,
+            MtfReadings,
+            DistortionReadings,
+            SpotReadings,
+            SightReadings,
+            TemperatureReadings,
+            PositionReadings,
+            ImageReadings,
+        )
+    }
+)
+"""Key under ``measurements`` in the file -> class of that kind of measurement."""
 
 STEP = 0.05
 """Step of the central differences with respect to a parameter, in standard deviations of its prior.
@@ -34,6 +65,15 @@ STEP = 0.05
 The relative error of a derivative is the square of this step times the derivative's relative second derivative, with
 the parameter in standard deviations.
 """
+
+_CLOSE = 10e-9
+"""Accuracy to which the coefficients of mirrored wavefronts are to be reached, metres."""
+_MOST, _STARTS = 3.0, 25
+"""Largest amount of the wavefront's largest uncertainty, in prior standard deviations, and number of states tried."""
+_REACHED = 0.5
+"""Largest part of a mirrored wavefront that a state may miss for an estimate to start there."""
+_ANOTHER = 3.0
+"""Distance of two estimates in posterior standard deviations from which they are different states."""
 
 _SHARE = 1e-2
 """Step of the numerical derivatives with respect to an actuator, as a fraction of the actuator's range."""
@@ -85,7 +125,7 @@ class AsBuiltBench(Site):
             raise self.test.error("the prior has no motions", ("prior",), found=self.test.prior, allowed=allowed)
         self.prior: DisturbancePrior = prior
         self.parameters = Parameters.of(self.test, prior, self.experiment.instrument, self.experiment.thermal)
-        self._beams: dict[tuple[tuple[float, float], ...], VariedBeams] = {}
+        self._beams: dict[tuple[tuple[tuple[float, float], ...], bool], VariedBeams] = {}
         self.kinds = self._kinds(self.test.measurements, "measurements")
         self.afters = tuple(measurement.after for _, _, measurement in self.test.measurements.named())
         for name, merit in self.test.merits.items():
@@ -105,11 +145,14 @@ class AsBuiltBench(Site):
         """Further measurements that could be made, as the file lists them."""
         return self._kinds(self.test.candidates, "candidates")
 
-    def beams(self, fields: tuple[tuple[float, float], ...]) -> VariedBeams:
-        """Return the beams at some field points, traced once for all measurements at these field points."""
-        if fields not in self._beams:
-            self._beams[fields] = VariedBeams(self.optics, np.array(fields))
-        return self._beams[fields]
+    def beams(self, fields: tuple[tuple[float, float], ...], planes: bool = False) -> VariedBeams:
+        """Return the beams at some field points, traced once for all measurements at these field points.
+
+        With ``planes``, their light has optical paths to plane waves.
+        """
+        if (fields, planes) not in self._beams:
+            self._beams[fields, planes] = VariedBeams(self.optics, np.array(fields), planes=planes)
+        return self._beams[fields, planes]
 
     @cached_property
     def optics(self) -> CameraOptics:
@@ -146,23 +189,43 @@ class AsBuiltBench(Site):
         """
         return self._predicted(values, self.kinds, self.afters)
 
-    def _predicted(self, values: np.ndarray, kinds: Sequence[MeasuredKind], afters: Sequence[str | None]) -> np.ndarray:
+    def _predicted(
+        self, values: np.ndarray, kinds: Sequence[MeasuredKind], afters: Sequence[str | None], traced: bool = False
+    ) -> np.ndarray:
+        """Return the readings of some kinds in S states, or only what a trace determines of them, side by side."""
+
         def read(rows: slice) -> np.ndarray:
             views = {after: self.view(values[rows], after) for after in afters}
-            readings = [kind.predict(views[after]) for kind, after in zip(kinds, afters, strict=True)]
-            return np.concatenate(readings, axis=1)
+            pairs = [(kind, views[after]) for kind, after in zip(kinds, afters, strict=True)]
+            return np.concatenate([kind.traced(view) if traced else kind.predict(view) for kind, view in pairs], axis=1)
 
-        return nan_where_lost(read, len(values), (sum(len(kind.labels) for kind in kinds),))
+        count = sum(kind.traced_count if traced else len(kind.labels) for kind in kinds)
+        return nan_where_lost(read, len(values), (count,))
 
     def slope(
         self, values: np.ndarray, kinds: Sequence[MeasuredKind] | None = None, afters: Sequence[str | None] = ()
     ) -> np.ndarray:
         """Return the derivatives of D predicted readings with respect to K parameters at ``values``, (D, K).
 
-        They are central differences, in the SI units of reading and parameter.
+        Those of traced quantities are central differences, in the SI units of reading and parameter.
         """
         kinds, afters = (self.kinds, self.afters) if kinds is None else (kinds, afters)
-        return self._by_parameters(values, lambda moved: self._predicted(moved, kinds, afters))
+        sigma = self.parameters.prior.sigma
+        slope = self._traced_slope(values, kinds, afters) * sigma
+        if not np.all(np.isfinite(slope)):
+            return np.full((sum(len(kind.labels) for kind in kinds), len(sigma)), np.nan)
+        out, ends = [], np.cumsum([0, *(kind.traced_count for kind in kinds)])
+        for kind, after, first, last in zip(kinds, afters, ends[:-1], ends[1:], strict=True):
+            # a kind whose readings are traced themselves needs no trace of the state
+            plain = type(kind).reading_slope is MeasuredKind.reading_slope
+            traced = np.zeros(0) if plain else kind.traced(self.view(values[None], after))[0]
+            out.append(kind.reading_slope(traced, slope[first:last]))
+        return np.asarray(np.concatenate(out) / sigma)
+
+    def _traced_slope(
+        self, values: np.ndarray, kinds: Sequence[MeasuredKind], afters: Sequence[str | None]
+    ) -> np.ndarray:
+        return self._by_parameters(values, lambda moved: self._predicted(moved, kinds, afters, traced=True))
 
     def _by_parameters(self, values: np.ndarray, work: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
         """Return the derivatives (D, K) of a function of the parameters at ``values``, by central differences.
@@ -175,10 +238,6 @@ class AsBuiltBench(Site):
         return np.asarray(((ahead - behind) / (2.0 * steps[:, None])).T)
 
     # the estimate
-
-    def groups(self, data: Sequence[np.ndarray]) -> tuple[MeasuredGroup, ...]:
-        """Return the measurements as the estimate needs them: readings, random errors and systematic errors."""
-        return tuple(kind.group(values) for kind, values in zip(self.kinds, data, strict=True))
 
     def data(self) -> tuple[np.ndarray, ...]:
         """Return the readings in the data files of all measurements, SI units.
@@ -205,8 +264,98 @@ class AsBuiltBench(Site):
         InputError
             The errors of a measurement are impossible, or its light is lost.
         """
+        return self.estimates(data, start)[0]
+
+    def estimates(self, data: Sequence[np.ndarray], start: np.ndarray | None = None) -> tuple[StateEstimate, ...]:
+        """Estimate the parameters as ``estimate`` does, and other states that explain the readings, the best first.
+
+        Images of stars in one focus hardly depend on the sign of even aberrations. A second estimate therefore starts
+        at the state whose even aberrations are reversed; it is returned where it converges to another state.
+        """
+        kinds = tuple(kind.about(values) for kind, values in zip(self.kinds, data, strict=True))
+        if start is None and any(isinstance(kind, ImageReadings) for kind in kinds):
+            start = self._nearby(kinds, data)
+        state = self._estimate(kinds, data, start)
+        expecting = [kind.expecting(self.view(state.mean[None], after)) for kind, after in self._pairs(kinds)]
+        if not any(expecting):
+            return (state,)
+        # the noise of light that is expected, in place of that of the light that was recorded
+        kinds = tuple(other or kind for kind, other in zip(kinds, expecting, strict=True))
+        state = self._estimate(kinds, data, state.mean)
+        mirrored = self._mirrored(kinds, state)
+        if mirrored is None:
+            return (state,)
         try:
-            return estimate_state(self.parameters.prior, self.groups(data), self.predict, self.slope, start)
+            other = self._estimate(kinds, data, mirrored)
+        except InputError:
+            return (state,)
+        if not other.converged or np.linalg.norm(np.linalg.solve(state.root, other.unit - state.unit)) < _ANOTHER:
+            return (state,)
+        return tuple(sorted((state, other), key=lambda mode: -mode.log_evidence))
+
+    def star_images(self, data: Sequence[np.ndarray], state: StateEstimate) -> tuple[StarResidual, ...]:
+        """Return measured and predicted images of all stars in an estimated state."""
+        out: list[StarResidual] = []
+        for kind, after, values in zip(self.kinds, self.afters, data, strict=True):
+            if isinstance(kind, ImageReadings):
+                view = self.view(state.mean[None], after)
+                out += kind.about(values).expecting(view).residuals(view)
+        return tuple(out)
+
+    def _nearby(self, kinds: Sequence[MeasuredKind], data: Sequence[np.ndarray]) -> np.ndarray:
+        """Return a state near which an estimate from images converges, (K,).
+
+        Images depend on defocus, the wavefront's largest uncertainty, far beyond the range of a linear model. States
+        along this direction of the prior are predicted, and the one nearest to the readings is returned.
+        """
+        prior = self.parameters.prior
+        images = np.concatenate([np.full(kind.traced_count, isinstance(kind, ImageReadings)) for kind in kinds])
+        slope = self._traced_slope(prior.mean, kinds, self.afters)[images] @ prior.root
+        direction = prior.root @ np.linalg.svd(slope, full_matrices=False)[2][0]
+        amounts = np.linspace(-_MOST, _MOST, _STARTS)
+        states = prior.mean + amounts[:, None] * direction
+        predicted = self._predicted(states, kinds, self.afters)
+        costs, first = amounts**2, 0
+        for kind, values in zip(kinds, data, strict=True):
+            white = kind.group(values).whitener()
+            rows = slice(first, first := first + len(values))
+            costs = costs + np.sum((white @ (values - predicted[:, rows]).T) ** 2, axis=0)
+        return np.asarray(states[np.nanargmin(costs)]) if np.any(np.isfinite(costs)) else prior.mean
+
+    def _mirrored(self, kinds: Sequence[MeasuredKind], state: StateEstimate) -> np.ndarray | None:
+        """Return the state nearest to the mirror image of an estimate, (K,): even aberrations of stars are reversed.
+
+        It is None if no state of the instrument has most of these aberrations, as with two foci on both sides.
+        """
+        wanted = []
+        for kind, after in self._pairs(kinds):
+            traced = kind.traced(self.view(state.mean[None], after))[0]
+            mirrored = kind.mirrored(traced)
+            wanted.append(np.zeros(len(traced)) if mirrored is None else (mirrored - traced) / _CLOSE)
+        slope = self._traced_slope(state.mean, kinds, self.afters) @ state.prior.root
+        images = np.concatenate([np.full(kind.traced_count, isinstance(kind, ImageReadings)) for kind in kinds])
+        rows, change = slope[images] / _CLOSE, np.concatenate(wanted)[images]
+        step = np.linalg.solve(np.eye(rows.shape[1]) + rows.T @ rows, rows.T @ change - state.unit)
+        if not np.linalg.norm(rows @ step - change) < _REACHED * np.linalg.norm(change):
+            return None
+        return np.asarray(state.mean + state.prior.root @ step)
+
+    def _pairs(self, kinds: Sequence[MeasuredKind]) -> zip[tuple[MeasuredKind, str | None]]:
+        """Return an iterator over kinds and the names of the last moves before them."""
+        return zip(kinds, self.afters, strict=True)
+
+    def _estimate(
+        self, kinds: Sequence[MeasuredKind], data: Sequence[np.ndarray], start: np.ndarray | None
+    ) -> StateEstimate:
+        groups = [kind.group(values) for kind, values in zip(kinds, data, strict=True)]
+        try:
+            return estimate_state(
+                self.parameters.prior,
+                groups,
+                lambda values: self._predicted(values, kinds, self.afters),
+                lambda values: self.slope(values, kinds, self.afters),
+                start,
+            )
         except MeasurementError as error:
             raise self.test.error(str(error), ("measurements",)) from error
 
@@ -255,7 +404,7 @@ class AsBuiltBench(Site):
             The light is lost.
         """
         return tuple(
-            kind.drawn(kind.predict(self.view(true[None], after))[0], rng)
+            kind.measured(self.view(true[None], after), rng)
             for kind, after in zip(self.kinds, self.afters, strict=True)
         )
 

@@ -10,6 +10,7 @@ from matplotlib.figure import Figure
 from optics.numerics.number_tree import FrozenMap
 from twin.asbuilt.asbuilt_run import ALONG, AsBuiltRun, MeritPrediction, motions, moves_plain, responses
 from twin.asbuilt.built_instrument import CORRELATION, POSTERIOR, instrument_text, posterior_files
+from twin.asbuilt.star_readings import FWHM
 from twin.framework.artefact import (
     CameraFile,
     Cell,
@@ -78,6 +79,7 @@ def asbuilt_report(run: AsBuiltRun) -> Report:
             (_measured_table(run),),
             name="measurements",
         ),
+        *_image_sections(run),
         *_move_sections(run),
         Section(
             "Motions",
@@ -268,6 +270,72 @@ def _measured_table(run: AsBuiltRun) -> Table:
     caption = "p: probability of so large a chi-square if prior and errors are as specified."
     decimals = (None, None, None, 1, None, 4, None, None)
     return Table("measurements", "Consistency of the measurements", caption, heads, rows, decimals)
+
+
+_MOST_STARS = 12
+"""Largest number of stars in the figure."""
+
+
+def _image_sections(run: AsBuiltRun) -> tuple[Section, ...]:
+    if not run.images:
+        return ()
+    with look("asbuilt"):
+        figure = to_svg(_image_figure(run))
+    rows: list[list[Cell]] = [
+        [
+            image.measurement,
+            *image.field,
+            image.fit.flux,
+            image.fit.background,
+            FWHM * image.fit.blur / image.star.image.pitch,
+            100.0 * image.outside,
+            image.test.chi_square / max(1, image.test.degrees),
+            image.test.p_value,
+        ]
+        for image in run.images
+    ]
+    heads = (
+        "measurement",
+        "x",
+        "y",
+        "flux [e-]",
+        "background [e-]",
+        "seeing [px]",
+        "outside [%]",
+        "chi-square / degree",
+        "p",
+    )
+    caption = (
+        "Field as shares of the half field; seeing: full width at half maximum; outside: light beyond the cut-out."
+    )
+    table = Table("star_images", "Stars", caption, heads, rows, (None, 2, 2, 0, 1, 2, 2, 3, 4))
+    text = "Images of stars, the prediction in the estimated state, and their difference in standard deviations."
+    return (
+        Section(
+            "Images of stars", (text,), (SvgFigure("stars", "Images and residuals", "", figure), table), name="stars"
+        ),
+    )
+
+
+def _image_figure(run: AsBuiltRun) -> Figure:
+    images = run.images[:_MOST_STARS]
+    figure = new_figure(3.4)
+    axes = figure.subplots(3, len(images), squeeze=False)
+    for column, image in zip(axes.T, images, strict=True):
+        counts = image.star.counts
+        assert counts is not None
+        low, high = float(np.min(image.fit.model)), float(np.max(image.fit.model))
+        for ax, values, limits, colours in (
+            (column[0], counts, (low, high), "viridis"),
+            (column[1], image.fit.model, (low, high), "viridis"),
+            (column[2], image.pulls, (-4.0, 4.0), "RdBu_r"),
+        ):
+            ax.imshow(values, cmap=colours, vmin=limits[0], vmax=limits[1], origin="lower")
+            ax.set(xticks=[], yticks=[])
+        column[0].set_title(f"{image.measurement}\n({image.field[0]:g}, {image.field[1]:g})", fontsize=6)
+    for ax, text in zip(axes[:, 0], ("measured", "predicted", "residual, \u00b14 \u03c3"), strict=True):
+        ax.set_ylabel(text, fontsize=7)
+    return figure
 
 
 def _move_sections(run: AsBuiltRun) -> tuple[Section, ...]:

@@ -21,6 +21,7 @@ from scenes.specs.asbuilt import AsBuiltSetup
 from scenes.specs.tolerance import MeritSpec, amount_text
 from twin.asbuilt.asbuilt_bench import AsBuiltBench, nan_where_lost, selected_moves
 from twin.asbuilt.next_step import Advice, advice
+from twin.asbuilt.star_images import StarResidual
 from twin.framework.memory import Lowered, require_memory
 from twin.framework.procedure import Advance, silent
 from twin.framework.random_streams import stream
@@ -107,6 +108,10 @@ class AsBuiltRun:
         Parameters of a simulated instrument; None for a real one.
     warnings : tuple of str
         Warnings for the user.
+    modes : tuple of StateEstimate
+        States that explain the measurements, the most probable first: one, except with images in a single focus.
+    images : tuple of StarResidual
+        Measured and predicted images of stars.
     """
 
     setup: AsBuiltSetup
@@ -119,6 +124,8 @@ class AsBuiltRun:
     advice: Advice | None
     true: np.ndarray | None
     warnings: tuple[str, ...]
+    modes: tuple[StateEstimate, ...] = ()
+    images: tuple[StarResidual, ...] = ()
 
 
 def run_asbuilt(
@@ -159,10 +166,12 @@ def run_asbuilt(
             allowed = "another seed, or smaller standard deviations"
             text = f"the randomly drawn as-built instrument lets no light through: {error}"
             raise test.error(text, ("simulate",), allowed=allowed) from error
-    state = bench.estimate(data)
+    modes = bench.estimates(data)
+    state = modes[0]
     require_consistency(bench, state)
     advance("state", 1, 4)
-    draws = state.draw(_random(seed, _POSTERIOR), test.draws)
+    draws = drawn_states(modes, _random(seed, _POSTERIOR), test.draws)
+    images = bench.star_images(data, state)
     prior = bench.parameters.prior
     blind = prior.mean + _random(seed, _PRIOR).standard_normal((test.draws, prior.root.shape[1])) @ prior.root.T
     last = bench.last
@@ -190,8 +199,39 @@ def run_asbuilt(
         along,
         step,
         true,
-        tuple(_warnings(state, parts[1])),
+        (*_warnings(state, parts[1]), *_mode_warnings(modes), *(text for image in images for text in image.warnings())),
+        modes,
+        images,
     )
+
+
+def probabilities(modes: Sequence[StateEstimate]) -> np.ndarray:
+    """Return the posterior probability of each of several states that explain the measurements, (modes,).
+
+    The first is the most probable; errors are multiplied by its variance factor.
+    """
+    evidence = np.array([mode.log_evidence for mode in modes])
+    share = np.exp((evidence - evidence[0]) / modes[0].variance_factor)
+    return np.asarray(share / np.sum(share))
+
+
+def drawn_states(modes: Sequence[StateEstimate], rng: np.random.Generator, count: int) -> np.ndarray:
+    """Draw random states from the posterior, (count, K), from each of its modes as often as it is probable."""
+    if len(modes) == 1:
+        return modes[0].draw(rng, count)
+    counts = rng.multinomial(count, probabilities(modes))
+    return np.concatenate([mode.draw(rng, int(number)) for mode, number in zip(modes, counts, strict=True)])
+
+
+def _mode_warnings(modes: Sequence[StateEstimate]) -> list[str]:
+    if len(modes) == 1 or probabilities(modes)[1] < FALSE_ALARM:
+        return []
+    return [
+        "images do not determine the sign of even aberrations: a state with the opposite sign explains them as well "
+        f"(chi-square {modes[1].whole.chi_square:.0f} instead of {modes[0].whole.chi_square:.0f}, p = "
+        f"{probabilities(modes)[1]:.2g}). Merits include both; motions, move and files are those of the more "
+        "probable state. Images in a second focus decide"
+    ]
 
 
 def _random(seed: int, number: int) -> np.random.Generator:
@@ -398,6 +438,17 @@ def responses(run: AsBuiltRun) -> dict[str, Any] | None:
     }
 
 
+def _images_plain(run: AsBuiltRun) -> list[dict[str, Any]] | None:
+    return [image.plain() for image in run.images] or None
+
+
+def _modes_plain(run: AsBuiltRun) -> list[dict[str, Any]] | None:
+    if len(run.modes) < 2:
+        return None
+    pairs = zip(run.modes, probabilities(run.modes), strict=True)
+    return [{"probability": float(share), "chi_square": mode.whole.chi_square} for mode, share in pairs]
+
+
 ASBUILT: Record[AsBuiltRun] = Record(
     "asbuilt.json: as-built state of one instrument.",
     Quantity("instrument", lambda run: run.setup.test.instrument),
@@ -418,6 +469,8 @@ ASBUILT: Record[AsBuiltRun] = Record(
     ),
     Quantity("next_move", _advice_plain, "recommended move of the actuators", where_known=True),
     Quantity("responses", responses, "of the actuators, relative to the traced ones", where_known=True),
+    Quantity("images", _images_plain, "of stars, with what is estimated for each", where_known=True),
+    Quantity("modes", _modes_plain, "states that explain the measurements, the most probable first", where_known=True),
     Quantity("steps", lambda run: run.estimate.steps, "Gauss-Newton steps"),
     Quantity("settled", lambda run: run.estimate.settled, "change of the readings by the last step, in sigmas"),
 )

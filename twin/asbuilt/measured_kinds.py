@@ -1,6 +1,6 @@
 """Kinds of measurements on an instrument: predicted readings for a state, error model and data files.
 
-A reading is one measured number. A new kind is a class here, an entry of ``KINDS`` and its keys in
+A reading is one measured number. A new kind is a class here, an entry of ``asbuilt_bench.KINDS`` and its keys in
 ``scenes.specs.asbuilt.MeasurementsSpec``.
 """
 
@@ -21,7 +21,6 @@ from analysis.arrays import ARCSEC
 from analysis.instrument_state.state_estimate import MeasuredGroup
 from optics.geometry.tree import State
 from optics.numerics.array_math import PhysicalError
-from optics.numerics.number_tree import FrozenMap
 from optics.raytrace.first_order import line_tangents
 from scenes.specs import asbuilt as specs
 from scenes.specs.perturbation import find_node
@@ -76,8 +75,11 @@ class Site(ABC):
     line: np.ndarray
 
     @abstractmethod
-    def beams(self, fields: tuple[tuple[float, float], ...]) -> VariedBeams:
-        """Return the beams at some field points, traced once for all measurements at these field points."""
+    def beams(self, fields: tuple[tuple[float, float], ...], planes: bool = False) -> VariedBeams:
+        """Return the beams at some field points, traced once for all measurements at these field points.
+
+        With ``planes``, their light has optical paths to plane waves.
+        """
 
     @abstractmethod
     def bench(self, merits: Mapping[str, MeritSpec]) -> ToleranceBench:
@@ -131,10 +133,47 @@ class MeasuredKind(ABC):
         PhysicalError is raised if the light of a state is lost.
         """
 
+    def traced(self, view: View) -> np.ndarray:
+        """Return what a trace determines of the readings, (S, Q) for S states: by default the readings themselves.
+
+        PhysicalError is raised if the light of a state is lost.
+        """
+        return self.predict(view)
+
+    @property
+    def traced_count(self) -> int:
+        """Number Q of traced quantities."""
+        return len(self.labels)
+
+    def reading_slope(self, traced: np.ndarray, slope: np.ndarray) -> np.ndarray:
+        """Return the derivatives of D readings with respect to K parameters, (D, K).
+
+        Parameters
+        ----------
+        traced : (Q,) ndarray
+            Traced quantities of the state.
+        slope : (Q, K) ndarray
+            Their derivatives.
+        """
+        return slope
+
+    def about(self, values: np.ndarray) -> MeasuredKind:
+        """Return the measurement with the D readings that were made, (D,), on which its predictions may depend."""
+        return self
+
+    def expecting(self, view: View) -> MeasuredKind | None:
+        """Return the measurement with the noise that is expected in a state; None if its noise is known beforehand."""
+        return None
+
+    def mirrored(self, traced: np.ndarray) -> np.ndarray | None:
+        """Return other traced quantities, (Q,), whose readings are nearly the same; None if there are none."""
+        return None
+
     def covariance(self) -> np.ndarray:
         """Return the covariance of the random errors of the D readings, (D, D), in squared SI units.
 
-        By default all have the same variance, without correlation.
+        By default all have the same variance, without correlation. Independent errors of many readings may be given by
+        their variances, (D,).
         """
         return np.asarray(self.spec.sigma**2 * np.eye(len(self.labels)))
 
@@ -162,6 +201,10 @@ class MeasuredKind(ABC):
         return MeasuredGroup(
             self.name, self.kind, self.labels, values, self.covariance(), columns[:, used], sigmas[used], self.blocks
         )
+
+    def measured(self, view: View, rng: np.random.Generator) -> np.ndarray:
+        """Return simulated readings of an instrument in one state, (D,)."""
+        return self.drawn(self.predict(view)[0], rng)
 
     def drawn(self, true: np.ndarray, rng: np.random.Generator) -> np.ndarray:
         """Return D readings, (D,), with simulated random errors and biases added to the true ones."""
@@ -538,24 +581,6 @@ class PositionReadings(MeasuredKind):
     def read(self) -> np.ndarray:
         """Return the displacements in the test's file, metres."""
         return np.array(self.spec.values).ravel()
-
-
-KINDS: Mapping[str, type[MeasuredKind]] = FrozenMap(
-    {
-        kind.kind: kind
-        for kind in (
-            WavefrontReadings,
-            FocusReadings,
-            MtfReadings,
-            DistortionReadings,
-            SpotReadings,
-            SightReadings,
-            TemperatureReadings,
-            PositionReadings,
-        )
-    }
-)
-"""Key under ``measurements`` in the file -> class of that kind of measurement."""
 
 
 def named_bodies(measurement: MeasuredKind) -> tuple[str, ...]:

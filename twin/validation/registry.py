@@ -35,6 +35,7 @@ _GROUPS = (
     Named("twin.validation.paper_004.distortion:FIGURES"),
     Named("twin.validation.paper_017.bundle:GROUP"),
     Named("twin.validation.real.edges:GROUP"),
+    Named("twin.validation.real.stars:GROUP"),
     Named("twin.validation.real.scenes:GROUP"),
     Named("twin.validation.real.spots:GROUP"),
 )
