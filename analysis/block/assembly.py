@@ -168,12 +168,16 @@ def assembled(block: Block, datum: bool = False) -> Assembly:
                     scopes[kind, k, _scope_of(block, term, block_pass.name)] for k, term in enumerate(terms)
                 )
     changes, units, size = _cameras(block, priors, size)
+    terms: dict[str, list[Indices]] = {}
     for image in block.model_scenes:
         columns = size + np.arange(2 * len(image.sigma)).reshape(2, -1)
         for k, name in enumerate(image.sigma):
-            priors.append(PriorGroup(name, columns[:, k], _unit(2), np.zeros(2)))
+            terms.setdefault(name, []).append(columns[:, k])
         changes[image.name], units[image.name] = columns.ravel(), np.array(list(image.sigma.values())).T.ravel()
         size += columns.size
+    for name, parts in terms.items():
+        columns = np.concatenate(parts)
+        priors.append(PriorGroup(name, columns, _unit(len(columns)), np.zeros(len(columns))))
     common = np.zeros(0, np.intp)
     if block.terrain is not None:
         common = np.array([size])

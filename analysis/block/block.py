@@ -226,12 +226,20 @@ class Points:
         "control", "tie" or "check". Check points are adjusted as tie points and compared afterwards.
     covariance : (m, 3, 3) ndarray
         Covariance of control points, in m^2.
+    approximate : (m, 3) ndarray, optional
+        Coordinates at which the adjustment starts, ITRS, in metres; `start` by default.
     """
 
     ids: NDArray[np.object_]
     start: Array
     role: NDArray[np.object_]
     covariance: Array
+    approximate: Array | None = None
+
+    @property
+    def first(self) -> Array:
+        """Coordinates (m, 3) at which the adjustment starts, ITRS, in metres."""
+        return self.start if self.approximate is None else self.approximate
 
 
 @dataclass(frozen=True, eq=False)

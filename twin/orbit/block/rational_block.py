@@ -87,11 +87,13 @@ def rational_block(setup: RationalAdjustSetup, advance: Advance = silent) -> tup
     )
     block = model.Block((), scenes, FrozenMap(), FrozenMap(), (), (), 1.0, points)
     try:
-        start = intersected(block)
+        # control points, whose coordinates may have gross errors, start from their images where two see them
+        twice = np.bincount(np.concatenate([rays.point for rays in places.values()])).max(initial=0) > 1
+        first = intersected(block.without("control") if twice else block)
     except BlockError as error:
         raise BenchError(str(error), ("image_points",), "points that two images see") from error
-    start = np.where((points.role == "control")[:, None], points.start, start)
-    return replace(block, points=replace(points, start=start)), given
+    start = np.where((points.role == "control")[:, None], points.start, first)
+    return replace(block, points=replace(points, start=start, approximate=first)), given
 
 
 def _image_points(
