@@ -85,7 +85,10 @@ def rational_block(setup: RationalAdjustSetup, advance: Advance = silent) -> tup
         model.ModelScene(name, image, FrozenMap((spec.images[name].errors or spec.errors).sigma), places[name])
         for name, image in images.items()
     )
-    block = model.Block((), scenes, FrozenMap(), FrozenMap(), (), (), 1.0, points)
+    shared = tuple(
+        model.SharedCorrection(tuple(one.images), FrozenMap(one.errors.sigma)) for one in spec.passes.values()
+    )
+    block = model.Block((), scenes, FrozenMap(), FrozenMap(), (), (), 1.0, points, shared=shared)
     try:
         # control points, whose coordinates may have gross errors, start from their images where two see them
         twice = np.bincount(np.concatenate([rays.point for rays in places.values()])).max(initial=0) > 1
@@ -224,7 +227,7 @@ def adjusted_images(adjustment: BlockAdjustment) -> FrozenMap[str, AdjustedImage
             tuple(scene.sigma),
             value,
             sigma,
-            np.array(list(scene.sigma.values())).T,
+            block.correction_sigma(scene),
             len(scene.rays.point),
             *_residuals(adjustment, scene, value, without),
             _corrected(scene, value, covariance),
