@@ -1,7 +1,7 @@
 """Robust start of a block adjustment: weights that gross errors of any size cannot corrupt.
 
-Least squares spreads an error of hundreds of sigmas over all unknowns, so that residuals no longer show which measurement
-has it. Three steps precede the tests of the adjustment:
+Least squares spreads an error of hundreds of sigmas over all unknowns, so that residuals no longer show which
+measurement has it. Three steps precede the tests of the adjustment:
 
 1. Every ground point is intersected alone, for unchanged unknowns, with Huber's weights (`intersection`).
 2. The whole block is adjusted with Huber's weights until these settle. Their scale is the median residual of each group

@@ -46,7 +46,11 @@ def dense(one: Bench, control: int, shared: float = 0.0) -> tuple[np.ndarray, np
         ground = one.ground + x[2 * terms * len(names) :][: 3 * count].reshape(count, 3)
         common = x[2 * terms * len(names) + 3 * count :].reshape(-1, 2, terms)
         own = value - np.concatenate([common, common, np.zeros_like(common)])[: len(names)] if shared else value
-        parts = [(own / prior).ravel(), (common / (shared or 1.0) / prior).ravel(), (ground[:control] - one.ground[:control]).ravel() / 0.05]
+        parts = [
+            (own / prior).ravel(),
+            (common / (shared or 1.0) / prior).ravel(),
+            (ground[:control] - one.ground[:control]).ravel() / 0.05,
+        ]
         for k, name in enumerate(names):
             image, (point, *place) = one.images[name], one.places[name].T
             position = image.seen(ground[point.astype(int)])[0]
@@ -99,9 +103,7 @@ def test_it_is_the_least_squares_solution_of_all_unknowns_together(tmp_path: Pat
 def test_images_of_a_pass_share_errors(tmp_path: Path) -> None:
     one = bench(SIGMA, points=25)
     errors = {term: [4.0 * size, 4.0 * size] for term, size in SIGMA.items()}
-    file = one.write(
-        tmp_path, ERRORS, robust=False, passes={"A": {"images": ["first", "second"], "errors": errors}}
-    )
+    file = one.write(tmp_path, ERRORS, robust=False, passes={"A": {"images": ["first", "second"], "errors": errors}})
     run = adjusted(file)
     x, covariance, residual = dense(one, 0, shared=4.0)
     first = 6 * len(one.images)

@@ -199,6 +199,25 @@ class RationalPointsSpec(Spec):
     false_alarm: Annotated[Number, Field(gt=0.0, lt=0.5)] = 1e-3
 
 
+class SurfaceSpec(Spec):
+    """Grid of heights by dense matching of all pairs of images.
+
+    Attributes
+    ----------
+    spacing : float
+        Side of a cell, in metres.
+    crs : str | None
+        Projected coordinate reference system of the grid in metres, such as EPSG:32631; by default the zone of UTM
+        (WGS84) of the first image. Heights are above the ellipsoid.
+    sigma : float
+        Standard deviation of a matched displacement, in pixels.
+    """
+
+    spacing: Annotated[float, Quantity(DISTANCE, smallest="0.01 m", largest="1 km")]
+    crs: Annotated[str, Field(pattern="^[A-Za-z]+:[0-9]+$")] | None = None
+    sigma: Pixels = 0.25
+
+
 class RationalMatchSpec(RationalTestSpec):
     """Measurement of tie points between images with rational polynomials by matching.
 
@@ -208,10 +227,13 @@ class RationalMatchSpec(RationalTestSpec):
         Lowest and highest ground above the ellipsoid, in metres, between which a point is searched.
     points : RationalPointsSpec
         Number of points and settings of the matching.
+    surface : SurfaceSpec | None
+        Grid of heights, for polynomials that `adjust` has corrected; by default there is none.
     """
 
     heights: HeightRange
     points: RationalPointsSpec = RationalPointsSpec.model_construct()
+    surface: SurfaceSpec | None = None
 
     @model_validator(mode="after")
     def _fits_together(self) -> RationalMatchSpec:

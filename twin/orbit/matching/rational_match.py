@@ -14,11 +14,14 @@ from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from pyproj.exceptions import CRSError
 
 from analysis.matching.correlation import MatchOptions, Reason, distinct_points, search
 from analysis.matching.matches import DisplacementField, Matches, consensus, match_windows
 from analysis.matching.spline import resampled
 from optics.numerics.number_tree import FrozenMap
+from twin.framework import svg
+from twin.framework.artefact import SvgFigure
 from twin.framework.procedure import Advance, BenchError, silent
 from twin.framework.record import Quantity, Record
 from twin.framework.report import Report, Section, answer
@@ -28,9 +31,12 @@ from twin.orbit.flight.earth import Earth
 from twin.orbit.images.image_points import CONSENSUS, MatchedLine, MatchedPoints
 from twin.orbit.images.simulate_run import MATCHED, POINTS
 from twin.orbit.matching.pixels import read_pixels
+from twin.orbit.matching.surface import Surface, surface
 from twin.orbit.measured.measurement_tables import csv_text
 
 if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
     from scenes.specs.orbit.rational import RationalPointsSpec
     from scenes.specs.orbit.setup import RationalMatchSetup
 
@@ -43,6 +49,10 @@ _LEAST_RISE = 1e-6
 """Parallax, in pixels per metre of height, below which two images see the ground from one direction."""
 _NO_FIELD = DisplacementField(np.zeros((1, 2)), np.zeros(2), 1.0, 0, None)
 """Displacement of images with too few matches."""
+_OFF = 0.5
+"""Median displacement across the epipolar lines, in pixels, from which rows of two images no longer fit each other."""
+_DRAWN = 400
+"""Largest number of rows or columns of a drawn grid."""
 _LEAST = 12
 """Smallest number of matches of two images: four times the three terms of a linear displacement."""
 
@@ -73,10 +83,13 @@ class RationalMatch:
         Test file.
     points : Mapping[str, MatchedPoints]
         Image in which points were chosen -> the points with their matches in every other image that shows them.
+    surface : Surface or None
+        Grid of heights, if the file asks for it.
     """
 
     setup: RationalMatchSetup
     points: FrozenMap[str, MatchedPoints]
+    surface: Surface | None = None
 
     @cached_property
     def table(self) -> dict[str, list[Any]]:
@@ -124,7 +137,14 @@ def run_rational_match(setup: RationalMatchSetup, advance: Advance = silent) -> 
             "heights of the ground that they show (this range probably does not contain it), images of the same ground"
         )
         raise BenchError(problem, ("heights",), f"{remedy}, or a larger points.reach")
-    return RationalMatch(setup, FrozenMap(points))
+    grid = None
+    if spec.surface is not None:
+        images = {name: (frame.values, frame.image) for name, frame in frames.items()}
+        try:
+            grid = surface(images, spec.heights, spec.surface, advance)
+        except CRSError as error:
+            raise spec.surface.error("not a coordinate reference system", ("crs",), found=spec.surface.crs) from error
+    return RationalMatch(setup, FrozenMap(points), grid)
 
 
 def _points_of(
@@ -264,11 +284,30 @@ def _both(run: RationalMatch) -> int:
     return len(set(run.table["point"]))
 
 
+SURFACE: Record[Surface] = Record(
+    "Grid of heights above the ellipsoid.",
+    Quantity("crs", lambda grid: grid.crs, "coordinate reference system"),
+    Quantity("spacing_m", lambda grid: grid.spacing, "side of a cell", decimals=3),
+    Quantity("cells", lambda grid: grid.height.size, "cells of the grid"),
+    Quantity("share", lambda grid: grid.share, "fraction of the cells that have a height", decimals=3),
+    Quantity("sigma_m", lambda grid: float(np.nanmedian(grid.sigma)), "sigma of a height, median", "sigma", 3),
+    Quantity(
+        "pairs_sigma_m",
+        lambda grid: {f"{a} {b}": sigma for (a, b), sigma in grid.sigmas.items()},
+        "two images -> sigma of a height by them",
+    ),
+    Quantity(
+        "pairs_scatter",
+        lambda grid: grid.scatter,
+        "scatter of the heights of two pairs over that predicted; null for a single pair",
+    ),
+)
 RATIONAL: Record[RationalMatch] = Record(
     "match.json of images with rational polynomials.",
     Quantity("tie_points", _both, "points that two images or more see"),
     Quantity("image_points", lambda run: len(run.table["point"]), "image points of these"),
     Quantity("points", lambda run: run.points, "image in which points were chosen -> matches", record=POINTS),
+    Quantity("surface", lambda run: run.surface, "grid of heights, where the file asks for it", record=SURFACE),
 )
 
 
@@ -300,11 +339,48 @@ def rational_report(run: RationalMatch) -> Report:
         f"{name}: " + ", ".join(f"{number} {reason}" for reason, number in line.rejections.items())
         for name, line in pairs.items()
     ]
-    return Report(
-        "Tie points", verdict, more, facts, table, (Section("Why points were not accepted", tuple(lost), ()),)
+    sections = (Section("Why points were not accepted", tuple(lost), ()), *_surface_section(run.surface))
+    off = max((float(np.abs(line.median_shift).max()) for line in pairs.values() if line.accepted.any()), default=0.0)
+    warnings = ()
+    if run.surface is not None and off > _OFF:
+        warnings = (
+            f"the polynomials of two images differ by up to {off:.2g} px across the epipolar lines, which costs the"
+            " surface heights and accuracy: correct them by `twin.orbit adjust` first",
+        )
+    return Report("Tie points", verdict, more, facts, table, sections, warnings=warnings)
+
+
+def _surface_section(grid: Surface | None) -> tuple[Section, ...]:
+    """Return the section with the map of the heights and their accuracy, if there is a surface."""
+    if grid is None:
+        return ()
+    text = (
+        f"{grid.share:.0%} of {grid.height.size} cells of {grid.spacing:g} m ({grid.crs}) have a height above the"
+        f" ellipsoid; its sigma is {np.nanmedian(grid.sigma):.2g} m in the median."
     )
+    scatter = grid.scatter
+    if scatter is not None:
+        text += f" Heights of two pairs differ {scatter:.2g} times as much as `surface.sigma` predicts."
+    drawing = svg.drawn("match-surface", _surface_figure, grid)
+    caption = "Height above the ellipsoid; white cells have none."
+    return (Section("Surface", (text,), (SvgFigure("surface", "", caption, drawing),)),)
 
 
-def rational_files(run: RationalMatch) -> dict[str, str]:
-    """Return the table of image points for ``python -m twin.orbit adjust``, path -> text."""
-    return {"image_points.csv": csv_text(run.table)}
+def _surface_figure(grid: Surface) -> Figure:
+    """Draw the heights of a grid on a map."""
+    figure = svg.new_figure(5.0)
+    axes = figure.subplots()
+    step = max(1, int(np.ceil(max(grid.height.shape) / _DRAWN)))
+    rows, columns = (1e-3 * grid.spacing * n for n in grid.height.shape)
+    shown = grid.height[::step, ::step]
+    low, high = np.nanpercentile(shown, [1.0, 99.0])
+    drawn = axes.imshow(shown, extent=(0.0, columns, 0.0, rows), cmap="viridis", vmin=low, vmax=high)
+    axes.set(xlabel="east [km]", ylabel="north [km]")
+    figure.colorbar(drawn, ax=axes, shrink=0.8, label="height [m]")
+    return figure
+
+
+def rational_files(run: RationalMatch) -> dict[str, str | bytes]:
+    """Return the table of image points for ``python -m twin.orbit adjust`` and the grid of heights, path -> content."""
+    files: dict[str, str | bytes] = {"image_points.csv": csv_text(run.table)}
+    return files if run.surface is None else files | {"surface.tif": run.surface.tiff()}
