@@ -168,14 +168,14 @@ def assembled(block: Block, datum: bool = False) -> Assembly:
                     scopes[kind, k, _scope_of(block, term, block_pass.name)] for k, term in enumerate(terms)
                 )
     changes, units, size = _cameras(block, priors, size)
-    terms: dict[str, list[Indices]] = {}
+    coefficients: dict[str, list[Indices]] = {}
     for image in block.model_scenes:
         columns = size + np.arange(2 * len(image.sigma)).reshape(2, -1)
         for k, name in enumerate(image.sigma):
-            terms.setdefault(name, []).append(columns[:, k])
+            coefficients.setdefault(name, []).append(columns[:, k])
         changes[image.name], units[image.name] = columns.ravel(), np.array(list(image.sigma.values())).T.ravel()
         size += columns.size
-    for name, parts in terms.items():
+    for name, parts in coefficients.items():
         columns = np.concatenate(parts)
         precision = _with_shared(block, name, columns, changes)
         priors.append(PriorGroup(name, columns, precision, np.zeros(len(columns))))

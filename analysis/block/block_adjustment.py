@@ -458,8 +458,10 @@ def adjust_block(
     try:
         if robust == "reject" and not variance_components:
             # few measurements change: the covariance of the first solution serves until the last
-            state, solution = problem.solve(state)
-            state, _ = settled(replace(problem, covariance=solution.covariance), state, rule)
+            first, solution = problem.solve(state)
+            state, _ = settled(replace(problem, covariance=solution.covariance), first, rule)
+            if all(np.array_equal(a, b) for a, b in zip(first.weight, state.weight, strict=True)):
+                return _result(assembly, first, solution)
         state, solution = settled(problem, state, rule)
     except UnsettledError as error:
         raise BlockError(f"block: {error}") from error

@@ -71,7 +71,7 @@ def _solved(
             np.add.at(normal, packets.point[which], np.swapaxes(weighted, 1, 2) @ by_point)
             np.add.at(pull, packets.point[which], np.einsum("ndi,nd->ni", weighted, miss))
     inverse = np.linalg.inv(normal + _LOOSE * np.eye(3))
-    return inverse, -np.einsum("nij,nj->ni", inverse, pull)
+    return np.asarray(inverse), np.asarray(-np.einsum("nij,nj->ni", inverse, pull))
 
 
 def _sizes(equations: list[list[Miss]], sets: Sequence[Packets]) -> tuple[Array, ...]:

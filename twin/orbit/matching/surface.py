@@ -222,8 +222,8 @@ def surface(
             )
             found = _tile(views[a], views[b], box, heights, spec)
             if found is not None:
-                grid[rows, columns], sigma = found
-                variance, count = variance + sigma**2, count + 1
+                grid[rows, columns] = found[0]
+                variance, count = variance + found[1] ** 2, count + 1
         if np.any(np.isfinite(grid)):
             grids[a, b], sigmas[a, b] = grid, float(np.sqrt(variance / count))
     advance("surface", len(pairs), len(pairs))
@@ -237,7 +237,7 @@ def surface(
 
 def _utm(image: PolynomialImage, height: float) -> str:
     """Return the zone of Universal Transverse Mercator, WGS84, that contains the middle of an image."""
-    latitude, longitude = image.polynomial.ground(*image.middle, height)
+    latitude, longitude = image.polynomial.ground(image.middle[0], image.middle[1], height)
     return f"EPSG:{(32600 if latitude >= 0.0 else 32700) + int((float(longitude) + 180.0) // 6.0) % 60 + 1}"
 
 
@@ -294,11 +294,11 @@ def _tile(
     columns, rows = np.ceil(size / pixel).astype(int).tolist()
     x, y = (pixel * (np.arange(n) - 0.5 * (n - 1)) for n in (columns, rows))
     place = centre + np.stack(np.meshgrid(x, y), axis=-1) @ axes
-    grey = [view.resampled(place, middle) for view in (first, second)]
-    if not all(np.isfinite(one).any() for one in grey):
+    left, right = (view.resampled(place, middle) for view in (first, second))
+    if not (np.isfinite(left).any() and np.isfinite(right).any()):
         return None
     most = int(np.ceil(ratio * half / pixel)) + 1
-    displacement = _displacements(*grey, most)
+    displacement = _displacements(left, right, most)
     to_height, to_place = _geometry(first, second, centre, axes, x, y, heights)
     where = np.argwhere(np.isfinite(displacement))
     if not len(where):
