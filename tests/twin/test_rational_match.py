@@ -236,3 +236,17 @@ def test_a_grid_of_another_system_is_refused(tmp_path: Path) -> None:
         file.write_text(dump_yaml({"name": "a", "images": images, "heights": ["0 m", "9 m"], "surface": keys}))
         with pytest.raises(InputError, match=words):
             MATCH.resolve(file)
+
+
+@pytest.mark.second
+def test_the_command_exports_and_shows_the_surface(folder: Path) -> None:
+    """These polynomials are wrong by pixels: the run says so, and what to do."""
+    found = run(MATCH, folder, heights=["360 m", "440 m"], points={"tie": 30}, surface={"spacing": "1 m"})
+    numbers = MATCH.numbers(found)["surface"]
+    with MemoryFile(MATCH.export(found)["surface.tif"]) as file, file.open() as source:
+        assert source.descriptions == ("height", "sigma")
+        assert source.crs.to_string() == numbers["crs"] == "EPSG:32631"
+        assert source.width * source.height == numbers["cells"]
+    report = MATCH.report(found)
+    assert "Surface" in [section.title for section in report.sections]
+    assert any("correct them by `twin.orbit adjust` first" in text for text in report.warnings)

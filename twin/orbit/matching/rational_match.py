@@ -20,23 +20,18 @@ from analysis.matching.correlation import MatchOptions, Reason, distinct_points,
 from analysis.matching.matches import DisplacementField, Matches, consensus, match_windows
 from analysis.matching.spline import resampled
 from optics.numerics.number_tree import FrozenMap
-from twin.framework import svg
-from twin.framework.artefact import SvgFigure
 from twin.framework.procedure import Advance, BenchError, silent
 from twin.framework.record import Quantity, Record
-from twin.framework.report import Report, Section, answer
 from twin.orbit.block.rational_block import read_image
 from twin.orbit.export.rational_polynomial import PolynomialImage
 from twin.orbit.flight.earth import Earth
 from twin.orbit.images.image_points import CONSENSUS, MatchedLine, MatchedPoints
-from twin.orbit.images.simulate_run import MATCHED, POINTS
+from twin.orbit.images.simulate_run import POINTS
 from twin.orbit.matching.pixels import read_pixels
 from twin.orbit.matching.surface import Surface, surface
 from twin.orbit.measured.measurement_tables import csv_text
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
     from scenes.specs.orbit.rational import RationalPointsSpec
     from scenes.specs.orbit.setup import RationalMatchSetup
 
@@ -49,10 +44,6 @@ _LEAST_RISE = 1e-6
 """Parallax, in pixels per metre of height, below which two images see the ground from one direction."""
 _NO_FIELD = DisplacementField(np.zeros((1, 2)), np.zeros(2), 1.0, 0, None)
 """Displacement of images with too few matches."""
-_OFF = 0.5
-"""Median displacement across the epipolar lines, in pixels, from which rows of two images no longer fit each other."""
-_DRAWN = 400
-"""Largest number of rows or columns of a drawn grid."""
 _LEAST = 12
 """Smallest number of matches of two images: four times the three terms of a linear displacement."""
 
@@ -280,7 +271,8 @@ def _templates(frame: Frame, other: Frame, place: np.ndarray, height: np.ndarray
     return resampled(frame.values, at[:, 0], at[:, 1])
 
 
-def _both(run: RationalMatch) -> int:
+def tie_points(run: RationalMatch) -> int:
+    """Return the number of points that two images or more see."""
     return len(set(run.table["point"]))
 
 
@@ -304,80 +296,11 @@ SURFACE: Record[Surface] = Record(
 )
 RATIONAL: Record[RationalMatch] = Record(
     "match.json of images with rational polynomials.",
-    Quantity("tie_points", _both, "points that two images or more see"),
+    Quantity("tie_points", tie_points, "points that two images or more see"),
     Quantity("image_points", lambda run: len(run.table["point"]), "image points of these"),
     Quantity("points", lambda run: run.points, "image in which points were chosen -> matches", record=POINTS),
     Quantity("surface", lambda run: run.surface, "grid of heights, where the file asks for it", record=SURFACE),
 )
-
-
-def rational_report(run: RationalMatch) -> Report:
-    """Return the report of tie points between images: verdict, counts and displacements across the epipolar lines."""
-    pairs = {
-        f"{source} in {name}": line
-        for source, points in run.points.items()
-        for name, line in points.searched_lines.items()
-    }
-    rows = {name: MATCHED(line) for name, line in pairs.items() if line.accepted.any()}
-    for row in rows.values():
-        row["consensus_scatter_px"] = row["consensus_scatter_px"] or "\N{EM DASH}"
-    keys = ("found", "matched", "accepted", "displacement_lines_px", "displacement_pixels_px", "consensus_scatter_px")
-    caption = (
-        "Displacement: median of the accepted from the prediction at the height of each point, in lines and samples;"
-        " it is that of the polynomials across the epipolar lines. Scatter: beyond the covariances; a dash where these"
-        " explain it."
-    )
-    table = MATCHED.table("points-found", "Matching", caption, rows, keys, "points", digits=4)
-    heads = sorted(pairs, key=lambda name: float(pairs[name].accepted.mean()))
-    verdict, more = answer(
-        f"{_both(run)} tie points were measured in {len(run.points)} images",
-        f"the share of accepted points is lowest for {heads[0]}, {pairs[heads[0]].accepted.mean():.0%}",
-    )
-    low, high = run.setup.test.heights
-    facts = (("Heights", f"{low:g} to {high:g} m"), ("Description", run.setup.test.description))
-    lost = [
-        f"{name}: " + ", ".join(f"{number} {reason}" for reason, number in line.rejections.items())
-        for name, line in pairs.items()
-    ]
-    sections = (Section("Why points were not accepted", tuple(lost), ()), *_surface_section(run.surface))
-    off = max((float(np.abs(line.median_shift).max()) for line in pairs.values() if line.accepted.any()), default=0.0)
-    warnings = ()
-    if run.surface is not None and off > _OFF:
-        warnings = (
-            f"the polynomials of two images differ by up to {off:.2g} px across the epipolar lines, which costs the"
-            " surface heights and accuracy: correct them by `twin.orbit adjust` first",
-        )
-    return Report("Tie points", verdict, more, facts, table, sections, warnings=warnings)
-
-
-def _surface_section(grid: Surface | None) -> tuple[Section, ...]:
-    """Return the section with the map of the heights and their accuracy, if there is a surface."""
-    if grid is None:
-        return ()
-    text = (
-        f"{grid.share:.0%} of {grid.height.size} cells of {grid.spacing:g} m ({grid.crs}) have a height above the"
-        f" ellipsoid; its sigma is {np.nanmedian(grid.sigma):.2g} m in the median."
-    )
-    scatter = grid.scatter
-    if scatter is not None:
-        text += f" Heights of two pairs differ {scatter:.2g} times as much as `surface.sigma` predicts."
-    drawing = svg.drawn("match-surface", _surface_figure, grid)
-    caption = "Height above the ellipsoid; white cells have none."
-    return (Section("Surface", (text,), (SvgFigure("surface", "", caption, drawing),)),)
-
-
-def _surface_figure(grid: Surface) -> Figure:
-    """Draw the heights of a grid on a map."""
-    figure = svg.new_figure(5.0)
-    axes = figure.subplots()
-    step = max(1, int(np.ceil(max(grid.height.shape) / _DRAWN)))
-    rows, columns = (1e-3 * grid.spacing * n for n in grid.height.shape)
-    shown = grid.height[::step, ::step]
-    low, high = np.nanpercentile(shown, [1.0, 99.0])
-    drawn = axes.imshow(shown, extent=(0.0, columns, 0.0, rows), cmap="viridis", vmin=low, vmax=high)
-    axes.set(xlabel="east [km]", ylabel="north [km]")
-    figure.colorbar(drawn, ax=axes, shrink=0.8, label="height [m]")
-    return figure
 
 
 def rational_files(run: RationalMatch) -> dict[str, str | bytes]:
