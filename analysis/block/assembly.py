@@ -168,12 +168,17 @@ def assembled(block: Block, datum: bool = False) -> Assembly:
                     scopes[kind, k, _scope_of(block, term, block_pass.name)] for k, term in enumerate(terms)
                 )
     changes, units, size = _cameras(block, priors, size)
+    coefficients: dict[str, list[Indices]] = {}
     for image in block.model_scenes:
         columns = size + np.arange(2 * len(image.sigma)).reshape(2, -1)
         for k, name in enumerate(image.sigma):
-            priors.append(PriorGroup(name, columns[:, k], _unit(2), np.zeros(2)))
+            coefficients.setdefault(name, []).append(columns[:, k])
         changes[image.name], units[image.name] = columns.ravel(), np.array(list(image.sigma.values())).T.ravel()
         size += columns.size
+    for name, parts in coefficients.items():
+        columns = np.concatenate(parts)
+        precision = _with_shared(block, name, columns, changes)
+        priors.append(PriorGroup(name, columns, precision, np.zeros(len(columns))))
     common = np.zeros(0, np.intp)
     if block.terrain is not None:
         common = np.array([size])
@@ -372,6 +377,28 @@ def _sets(assembly: Assembly, common: Indices) -> tuple[list[Packets], dict[str,
             )
         )
     return sets, images
+
+
+def _with_shared(block: Block, term: str, columns: Indices, changes: Mapping[str, Indices]) -> sparse.csr_matrix:
+    """Return the precision of the coefficients of a term of all images' corrections, in their own sigmas.
+
+    Images that share an error of standard deviation c beside their own ones u have the covariance I + v v' with v = c /
+    u, whose inverse is I - v v' / (1 + v' v).
+    """
+    scenes = {image.name: image for image in block.model_scenes}
+    place = {int(column): k for k, column in enumerate(columns.tolist())}
+    parts: list[tuple[Indices, Indices, Array]] = [(np.arange(len(columns)),) * 2 + (np.ones(len(columns)),)]
+    for shared in block.shared:
+        for axis, common in enumerate(shared.sigma.get(term, ())):
+            members = [scenes[name] for name in shared.scenes]
+            ratio = np.array([common / image.sigma[term][axis] for image in members])
+            where = np.array(
+                [place[int(changes[i.name].reshape(2, -1)[axis, list(i.sigma).index(term)])] for i in members]
+            )
+            inner = -np.outer(ratio, ratio) / (1.0 + ratio @ ratio)
+            parts.append((np.repeat(where, len(where)), np.tile(where, len(where)), inner.ravel()))
+    row, column, value = (np.concatenate(part) for part in zip(*parts, strict=True))
+    return sparse.csr_matrix((value, (row, column)), shape=(len(columns), len(columns)))
 
 
 def correction_names(image: ModelScene) -> tuple[str, ...]:

@@ -168,6 +168,22 @@ class ModelScene:
 
 
 @dataclass(frozen=True, eq=False)
+class SharedCorrection:
+    """Error that images of one pass have in common, beside each one's own correction.
+
+    Attributes
+    ----------
+    scenes : tuple of str
+        Names of the images, which are functions of the ground.
+    sigma : mapping of str to (float, float)
+        Term of the correction -> standard deviations of the common coefficients for line and sample, in pixels.
+    """
+
+    scenes: tuple[str, ...]
+    sigma: Mapping[str, tuple[float, float]]
+
+
+@dataclass(frozen=True, eq=False)
 class CameraPrior:
     """Prior distribution of the changes of one camera in the T passes of a block.
 
@@ -226,12 +242,20 @@ class Points:
         "control", "tie" or "check". Check points are adjusted as tie points and compared afterwards.
     covariance : (m, 3, 3) ndarray
         Covariance of control points, in m^2.
+    approximate : (m, 3) ndarray, optional
+        Coordinates at which the adjustment starts, ITRS, in metres; `start` by default.
     """
 
     ids: NDArray[np.object_]
     start: Array
     role: NDArray[np.object_]
     covariance: Array
+    approximate: Array | None = None
+
+    @property
+    def first(self) -> Array:
+        """Coordinates (m, 3) at which the adjustment starts, ITRS, in metres."""
+        return self.start if self.approximate is None else self.approximate
 
 
 @dataclass(frozen=True, eq=False)
@@ -353,6 +377,8 @@ class Block:
         Terrain model that gives heights of points; None without one.
     angles : tuple of TrackerAngle
         Measured angles between star trackers.
+    shared : tuple of SharedCorrection
+        Errors that images which are functions of the ground have in common; an image has at most one.
     """
 
     passes: tuple[Pass, ...]
@@ -367,6 +393,7 @@ class Block:
     footprints: tuple[Footprints, ...] = ()
     terrain: Terrain | None = None
     angles: tuple[TrackerAngle, ...] = field(default=())
+    shared: tuple[SharedCorrection, ...] = ()
 
     @property
     def line_scenes(self) -> tuple[Scene, ...]:
@@ -377,6 +404,13 @@ class Block:
     def model_scenes(self) -> tuple[ModelScene, ...]:
         """Images that are functions of the ground."""
         return tuple(scene for scene in self.scenes if isinstance(scene, ModelScene))
+
+    def correction_sigma(self, scene: ModelScene) -> Array:
+        """Return the prior standard deviations (2, K) of an image's correction, with the errors that it shares."""
+        own = np.array(list(scene.sigma.values())).T
+        shared = [one.sigma for one in self.shared if scene.name in one.scenes]
+        common = np.array([shared[0].get(term, (0.0, 0.0)) for term in scene.sigma]).T if shared else 0.0
+        return np.hypot(own, common)
 
     @property
     def sensors(self) -> tuple[str, ...]:
@@ -433,6 +467,12 @@ class Block:
         for image in self.model_scenes:
             if not image.sigma or not all(sigma > 0.0 for pair in image.sigma.values() for sigma in pair):
                 raise BlockError(f"block: scene {image.name!r}: its correction needs sigmas above zero")
+        terms = {image.name: set(image.sigma) for image in self.model_scenes}
+        members = [name for shared in self.shared for name in shared.scenes]
+        if len(set(members)) != len(members) or not all(
+            set(shared.sigma) <= terms.get(name, set()) for shared in self.shared for name in shared.scenes
+        ):
+            raise BlockError("block: images share errors of terms that they have, each with one pass")
         for scene in self.line_scenes:
             if scene.of not in names:
                 raise BlockError(f"block: scene {scene.name!r}: no pass is called {scene.of!r}")

@@ -30,10 +30,11 @@ from scipy.stats import norm
 from analysis import statistics
 from analysis.arrays import Array, Indices
 from analysis.block.assembly import Assembly, Process, assembled, group_ranks
-from analysis.block.block import Block
+from analysis.block.block import Block, ModelScene, Scene
 from analysis.block.error_processes import BlockError
 from analysis.block.point_reduction import Checked, Pool, Reduced, Reduction, SharedReduction, State
 from analysis.block.reweighting import SETTLED, GroupTest, Rule, UnsettledError, settled
+from analysis.block.robust_start import consistent, contradicted, equations_left, intersection, screened
 
 FAR = 0.02
 """Largest angle, in radians, between the coordinates of a point and the direction of its image: 10 km at 500 km. Orbits
@@ -72,7 +73,8 @@ def pruned(block: Block) -> Block:
 def intersected(block: Block) -> Array:
     """Return the coordinates (m, 3), ITRS, in metres, of a block's m points for scenes and readings without errors.
 
-    Each point has the least sum of its squared standardised residuals; points without observations keep their start.
+    Each point has the least sum of its squared standardised residuals, with Huber's weights where these contradict each
+    other; points without observations keep their start.
 
     Raises
     ------
@@ -80,19 +82,19 @@ def intersected(block: Block) -> Array:
         The block cannot be adjusted.
     """
     reduction = assembled(pruned(block)).reduction
-    state = State(
-        np.zeros(reduction.size), block.points.start, tuple(np.ones(len(s.point)) for s in reduction.sets), {}
-    )
-    for _ in range(_STEPS):
-        equations = reduction.eliminated(state)
-        state = replace(state, ground=state.ground + equations.start)
-        if not _largest(equations.start, equations.spread) > _CONVERGED:
-            break
-    return state.ground
+    weight = tuple(np.ones(len(s.point)) for s in reduction.sets)
+    return intersection(reduction.sets, State(np.zeros(reduction.size), block.points.first, weight, {})).ground
 
 
-def check_places(block: Block) -> None:
+def check_places(block: Block, robust: bool = False) -> None:
     """Raise BlockError, listing the points, if the direction to a point differs from that of its image.
+
+    Parameters
+    ----------
+    block : Block
+        Block that is adjusted.
+    robust : bool
+        True to tolerate gross errors: up to half of a scene's control points, and of its other points.
 
     Raises
     ------
@@ -102,6 +104,15 @@ def check_places(block: Block) -> None:
     """
     wrong: list[str] = []
     control: list[bool] = []
+
+    def collect(scene: Scene | ModelScene, bad: NDArray[np.bool_]) -> None:
+        known = block.points.role[scene.rays.point] == "control"
+        for same in (known, ~known):
+            where = np.flatnonzero(bad & same)
+            if len(where) > (0.5 * np.sum(same) if robust else 0):
+                wrong.extend(f"{name} in {scene.name}" for name in block.points.ids[scene.rays.point[where]].tolist())
+                control.extend(known[where].tolist())
+
     for scene in block.line_scenes:
         rays = scene.rays
         if not len(rays.point):
@@ -110,15 +121,10 @@ def check_places(block: Block) -> None:
         distance = np.linalg.norm(line_of_sight, axis=1, keepdims=True)
         look = np.einsum("nij,nj->ni", rays.attitude, block.cameras[scene.camera].directions(rays.image))
         angle = np.linalg.norm(np.cross(look, line_of_sight / np.maximum(distance, 1.0)), axis=1)
-        bad = (angle > FAR) | (np.sum(look * line_of_sight, axis=1) <= 0)
-        names = block.points.ids[rays.point[bad]].tolist()
-        wrong += [f"{name} in {scene.name}" for name in names]
-        control += (block.points.role[rays.point[bad]] == "control").tolist()
+        collect(scene, (angle > FAR) | (np.sum(look * line_of_sight, axis=1) <= 0))
     for image in block.model_scenes:
         position, _ = image.model.seen(block.points.start[image.rays.point])
-        bad = ~np.all(np.abs(position - image.rays.image) < image.model.size, axis=1)
-        wrong += [f"{name} in {image.name}" for name in block.points.ids[image.rays.point[bad]].tolist()]
-        control += (block.points.role[image.rays.point[bad]] == "control").tolist()
+        collect(image, ~np.all(np.abs(position - image.rays.image) < image.model.size, axis=1))
     if not wrong:
         return
     listed = ", ".join(wrong[:_NAMED]) + (f" and {len(wrong) - _NAMED} more" if len(wrong) > _NAMED else "")
@@ -135,6 +141,10 @@ _STEPS = 20
 """Largest number of Gauss-Newton steps of one round."""
 _CONVERGED = 1e-6
 """Norm of the last step of a converged iteration, in sigmas of all unknowns together."""
+_ROUGH = 1e-2
+"""Norm of the last step of an iteration whose weights will change."""
+_FREE_ROUNDS = 4
+"""Number of rounds after the robust start in which rejected measurements may be accepted again."""
 _DENSE = 2500
 """Number of unknowns up to which a dense factorisation is faster than a sparse one."""
 _MOST = 20_000
@@ -142,8 +152,6 @@ _MOST = 20_000
 _COLUMNS = 256
 """Number of columns of a symmetric inverse that are copied from its lower to its upper triangle at a time."""
 _SINGULAR = "block: the equations are singular; a sigma is too large for what observes it"
-_HUBER_ROUNDS = 4
-"""Number of rounds of reweighting with Huber's weights before rejecting weights are used."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -287,7 +295,7 @@ class BlockAdjustment:
 
 
 def accepted_block(adjustment: BlockAdjustment) -> Block:
-    """Return the block without rejected measurements; rejected control points become tie points."""
+    """Return the block without rejected measurements, from the adjusted points; rejected control points become ties."""
     block, sets = adjustment.assembly.block, adjustment.assembly.reduction.sets
     keep = {packets.name: weight > SETTLED for packets, weight in zip(sets, adjustment.weight, strict=True)}
     scenes = tuple(
@@ -303,7 +311,11 @@ def accepted_block(adjustment: BlockAdjustment) -> Block:
     if terrain is not None:
         terrain = terrain.taken(keep["terrain"])
     footprints = tuple(f for f in footprints if len(f.point))
-    return replace(block, scenes=scenes, footprints=footprints, points=replace(points, role=role), terrain=terrain)
+    # the first position of a point with a gross error may be far from its images
+    ground = adjustment._filled
+    start = np.where((role == "control")[:, None], points.start, ground)
+    points = replace(points, role=role, start=start, approximate=ground)
+    return replace(block, scenes=scenes, footprints=footprints, points=points, terrain=terrain)
 
 
 class _Factor:
@@ -356,6 +368,7 @@ def adjust_block(
     variance_components: bool | Collection[str] = False,
     datum: bool = False,
     pool: Pool | None = None,
+    start: BlockAdjustment | None = None,
 ) -> BlockAdjustment:
     """Adjust points, attitude, station and cameras of a block of line-camera images by least squares.
 
@@ -372,6 +385,8 @@ def adjust_block(
         True to estimate a shift that all control points share.
     pool : Pool, optional
         Worker processes that eliminate the points; None for this process alone.
+    start : BlockAdjustment, optional
+        Adjustment of the same block, with or without `datum`, where this one starts.
 
     Returns
     -------
@@ -418,7 +433,7 @@ def adjust_block(
     """
     block.check()
     block = pruned(block)
-    check_places(block)
+    check_places(block, robust is not None)
     assembly = assembled(block, datum)
     reduction = assembly.reduction
     if reduction.size > _MOST:
@@ -426,15 +441,28 @@ def adjust_block(
     points: Reduction | SharedReduction = reduction if pool is None else SharedReduction.of(reduction, pool)
     groups = [*(member.group for member in reduction.sets), *(member.group for member in reduction.priors)]
     weight = tuple(np.ones(len(member.point)) for member in reduction.sets)
-    state = _AdjustmentState(np.zeros(reduction.size), block.points.start.copy(), weight, dict.fromkeys(groups, 1.0))
+    state = _AdjustmentState(np.zeros(reduction.size), block.points.first.copy(), weight, dict.fromkeys(groups, 1.0))
+    if start is not None:
+        state = replace(state, x=start.x[: reduction.size], ground=start._filled, weight=start.weight)
+    elif robust:
+        state = screened(reduction.sets, intersection(reduction.sets, state), lambda at: _step(reduction, points, at))
+    if robust == "reject" and start is None:
+        state = replace(state, weight=consistent(reduction.sets, state))
+    problem = _Problem(assembly, points)
     rule = Rule(
-        "accept" if robust == "reject" else robust,
+        problem.accepted if robust == "reject" else robust,
         "components" if variance_components else None,
         None if isinstance(variance_components, bool) else variance_components,
-        _HUBER_ROUNDS if robust else 0,
+        free=_FREE_ROUNDS,
     )
     try:
-        state, solution = settled(_Problem(assembly, points), state, rule)
+        if robust == "reject" and not variance_components:
+            # few measurements change: the covariance of the first solution serves until the last
+            first, solution = problem.solve(state)
+            state, _ = settled(replace(problem, covariance=solution.covariance), first, rule)
+            if all(np.array_equal(a, b) for a, b in zip(first.weight, state.weight, strict=True)):
+                return _result(assembly, first, solution)
+        state, solution = settled(problem, state, rule)
     except UnsettledError as error:
         raise BlockError(f"block: {error}") from error
     return _result(assembly, state, solution)
@@ -459,18 +487,21 @@ class _Solution:
 
 @dataclass(frozen=True, eq=False)
 class _Problem:
-    """Constant input of an adjustment during reweighting, with the methods that `reweighting.settled` calls."""
+    """Constant input of an adjustment during reweighting, with the methods that `reweighting.settled` calls.
+
+    A `covariance` (P, P) of the unknowns replaces that of each solution.
+    """
 
     assembly: Assembly
     points: Reduction | SharedReduction
+    covariance: Array | None = None
 
-    def solve(self, state: _AdjustmentState, screening: bool) -> tuple[_AdjustmentState, _Solution]:
+    def solve(self, state: _AdjustmentState, screening: bool = False) -> tuple[_AdjustmentState, _Solution]:
         """Iterate the adjustment at fixed weights and return the converged state and its solution."""
         reduction = self.assembly.reduction
-        # weights that will change do not justify more than a step or two
-        tolerance = 1e-2 if screening else _CONVERGED
+        tolerance = _CONVERGED if self.covariance is None else _ROUGH
         state, reduced, factor = _solved(reduction, self.points, state, tolerance)
-        covariance = factor.inverse()
+        covariance = factor.inverse() if self.covariance is None else self.covariance
         checked = self.points.checked(state, reduced.spread, _part_of(covariance))
         tests = _tests(reduction, state, covariance, reduced, checked.taken)
         return state, _Solution(reduced, covariance, checked, tests)
@@ -483,12 +514,18 @@ class _Problem:
         """Return the chi-square test of the residuals of each variance group, by the name of the group."""
         return solution.tests
 
+    def accepted(self, standard: tuple[Array, ...], weight: tuple[Array, ...]) -> tuple[Array, ...]:
+        """Return weights 0 of the measurements that the others of their point contradict, and 1 of all others."""
+        square = [np.sum(rows**2, axis=1) for rows in standard]
+        return tuple(np.where(bad, 0.0, 1.0) for bad in contradicted(self.assembly.reduction.sets, square, weight))
+
     def weighed(
         self, state: _AdjustmentState, weight: tuple[Array, ...], factor: Mapping[str, float]
     ) -> _AdjustmentState:
         """Return the state with new weights, zero at points that fewer than three equations would determine."""
-        lost = _rows_left(self.assembly, weight) < 3
         sets = self.assembly.reduction.sets
+        # the residuals of a point without weights show nothing
+        lost = (_rows_left(self.assembly, weight) < 3) | (_rows_left(self.assembly, state.weight) < 3)
         weights = tuple(np.where(lost[packets.point], 0.0, w) for packets, w in zip(sets, weight, strict=True))
         return replace(state, weight=weights, factor=factor)
 
@@ -520,6 +557,14 @@ def _solved(
     raise BlockError(f"block: no convergence in {_STEPS} steps, the last of {last:.3g} sigmas")
 
 
+def _step(reduction: Reduction, points: Reduction | SharedReduction, state: _AdjustmentState) -> _AdjustmentState:
+    """Return the state after one Gauss-Newton step at fixed weights."""
+    reduced = reduction.with_priors(points.eliminated(state), state)
+    step = -_Factor(reduced.data + reduced.prior).solve(reduced.right)
+    ground = state.ground + points.point_steps(state, reduced, step)
+    return replace(state, x=state.x + step, ground=ground, steps=state.steps + 1)
+
+
 def _part_of(covariance: Array) -> Callable[[Indices], Array]:
     """Return a function that takes the indices of k unknowns and returns their covariance (k, k)."""
     return lambda columns: np.asarray(covariance[np.ix_(columns, columns)])
@@ -537,10 +582,7 @@ def _largest(steps: Array, spread: Array) -> float:
 
 def _rows_left(assembly: Assembly, weight: Sequence[Array]) -> NDArray[np.intp]:
     """Return the number of observation equations with nonzero weight at each of the m points."""
-    rows = np.zeros(assembly.reduction.count, np.intp)
-    for packets, w in zip(assembly.reduction.sets, weight, strict=True):
-        np.add.at(rows, packets.point, packets.rows * (w > SETTLED))
-    return rows
+    return equations_left(assembly.reduction.sets, weight, assembly.reduction.count, SETTLED)
 
 
 def _tests(

@@ -7,6 +7,7 @@ undetermined, a slow variation of it is so, too, and listing it would tell the u
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -95,14 +96,16 @@ def simplified(block: Block) -> Block:
         a, b, c = np.maximum(sigma, 1e-12).tolist()
         return (Term(Law("", "constant", (a, b, c))),)
 
+    def shift(sigma: Mapping[str, tuple[float, float]]) -> dict[str, tuple[float, float]]:
+        line, sample = np.sqrt(np.sum(np.square(list(sigma.values())), axis=0)).tolist()
+        return {"shift": (line, sample)}
+
     scenes = tuple(
-        replace(scene, sigma={"shift": tuple(np.sqrt(np.sum(np.square(list(scene.sigma.values())), axis=0)).tolist())})
-        if isinstance(scene, ModelScene)
-        else scene
-        for scene in block.scenes
+        replace(scene, sigma=shift(scene.sigma)) if isinstance(scene, ModelScene) else scene for scene in block.scenes
     )
+    shared = tuple(replace(one, sigma=shift(one.sigma)) for one in block.shared)
     attitude, station = whole(block.attitude), whole(block.station)
-    return replace(block, scenes=scenes, attitude=attitude, station=station, angles=())
+    return replace(block, scenes=scenes, attitude=attitude, station=station, angles=(), shared=shared)
 
 
 @dataclass(frozen=True)

@@ -7,8 +7,9 @@ The module serves adjustments of any kind: a calibration campaign's (`analysis.c
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache
 from typing import Literal, Protocol, TypeVar
 
 import numpy as np
@@ -23,11 +24,8 @@ SETTLED = 1e-3
 """Largest change of robust weights at convergence, and largest weight of a rejected measurement."""
 _ROUNDS = 50
 """Largest number of rounds of reweighting."""
-_FREE_ROUNDS = 12
-"""Round from which on rejecting weights can only decrease: two measurements of a point that are rejected alternately
-would otherwise never converge.
-"""
 Robust = Literal["huber", "igg"]
+_Weigh = Callable[[tuple[Array, ...], tuple[Array, ...]], tuple[Array, ...]]
 # Limits of the standardised residual of an image point, which is Rayleigh-distributed for good points. Of these,
 # 5 in 100 exceed HUBER and lose weight; 1 in 10 000 exceed REJECT and are excluded (IGG III: Yang, Song and Xu,
 # J. Geodesy 76 (2002) 353).
@@ -147,6 +145,7 @@ def robust_weights(standard: Array, kind: Robust | Literal["accept"]) -> Array:
     return np.asarray(np.where(size <= huber, 1.0, weight * fall**2))
 
 
+@cache
 def limits(rows: int) -> tuple[float, float]:
     """Return the norms of a measurement's standardised residuals above which it is down-weighted and rejected.
 
@@ -180,9 +179,10 @@ class Rule:
 
     Attributes
     ----------
-    packets : {'huber', 'igg', 'accept'} or None
+    packets : {'huber', 'igg', 'accept'}, callable or None
         Weights of the measurements (packets of equations): Huber's weights, IGG III, or "accept": 1 up to the end of
-        IGG III and 0 beyond; None for unchanged weights.
+        IGG III and 0 beyond; or a function from the standardised residuals and the weights of each set to weights 1
+        and 0; None for unchanged weights.
     factor : {'median', 'components'} or None
         Factor of the image points from the median of their residuals, or of groups by variance components; None for
         unchanged factors.
@@ -192,13 +192,17 @@ class Rule:
         Number of first rounds with Huber's weights, in which no factor is estimated.
     tolerance : float
         Largest change of a weight, or relative change of a factor, at convergence.
+    free : int
+        Number of rounds after which rejecting weights can only decrease: two measurements of a point that are rejected
+        alternately would otherwise never converge.
     """
 
-    packets: Robust | Literal["accept"] | None = None
+    packets: Robust | Literal["accept"] | _Weigh | None = None
     factor: Literal["median", "components"] | None = None
     groups: Collection[str] | None = None
     screening: int = 0
     tolerance: float = SETTLED
+    free: int = 12
 
 
 class Weighted(Protocol):
@@ -263,8 +267,11 @@ def settled(problem: Reweighted[S, T], state: S, rule: Rule) -> tuple[S, T]:
             factors.append(factor)
         if rule.packets is not None:
             kind = "huber" if screening else rule.packets
-            weight = tuple(robust_weights(test, kind) for test in standard)
-            if kind != "huber" and round_number >= _FREE_ROUNDS:
+            if callable(kind):
+                weight = kind(standard, state.weight)
+            else:
+                weight = tuple(robust_weights(test, kind) for test in standard)
+            if kind != "huber" and round_number >= rule.free:
                 weight = tuple(
                     np.minimum(new_state, old_weight)
                     for new_state, old_weight in zip(weight, state.weight, strict=True)

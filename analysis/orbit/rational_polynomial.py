@@ -140,15 +140,14 @@ class RationalPolynomial:
             (pixels per degree) and height (pixels per metre).
         """
         unit = self._scaled(latitude, longitude, height)
-        basis, slopes = _monomials(unit), _monomial_slopes(unit)
-        parts = (self.line_numerator, self.line_denominator), (self.sample_numerator, self.sample_denominator)
-        values, derivatives = [], []
-        for above, below in parts:
-            ratio = basis @ above / (basis @ below)
-            values.append(ratio)
-            derivatives.append((slopes @ above - ratio[..., None] * (slopes @ below)) / (basis @ below)[..., None])
-        by_ground = np.stack(derivatives, axis=-2) * self.scale[:2, None] / self.scale[2:]
-        return self.offset[:2] + self.scale[:2] * np.stack(values, axis=-1), by_ground
+        parts = (self.line_numerator, self.sample_numerator, self.line_denominator, self.sample_denominator)
+        coefficients = np.stack(parts, axis=1)
+        # (..., 4) and (..., 3, 4): numerators of line and sample, and their denominators
+        values, slopes = _monomials(unit) @ coefficients, _monomial_slopes(unit) @ coefficients
+        ratio, below = values[..., :2] / values[..., 2:], values[..., None, 2:]
+        by_unit = (slopes[..., :2] - ratio[..., None, :] * slopes[..., 2:]) / below
+        by_ground = np.swapaxes(by_unit, -1, -2) * self.scale[:2, None] / self.scale[2:]
+        return self.offset[:2] + self.scale[:2] * ratio, by_ground
 
     def _scaled(self, latitude: ArrayLike, longitude: ArrayLike, height: ArrayLike) -> Array:
         """Return scaled latitude, longitude and height (..., 3); longitudes may differ by a whole circle."""
@@ -294,22 +293,23 @@ def _monomials(unit: Array) -> Array:
 
 def _monomial_slopes(unit: Array) -> Array:
     """Return the derivatives (..., 3, 20) of the monomials with respect to scaled latitude, longitude and height."""
-    powers = [_powers(unit[..., k]) for k in _AXES]
-    slopes = [power[..., [0, 0, 1, 2]] * [0.0, 1.0, 2.0, 3.0] for power in powers]
-    return np.stack(
-        [
-            _products(powers[0], slopes[1], powers[2]),
-            _products(slopes[0], powers[1], powers[2]),
-            _products(powers[0], powers[1], slopes[2]),
-        ],
-        axis=-2,
+    longitude, latitude, height = (_powers(unit[..., k]) for k in _AXES)
+    by_longitude, by_latitude, by_height = (
+        power[..., [0, 0, 1, 2]] * [0.0, 1.0, 2.0, 3.0] for power in (longitude, latitude, height)
     )
+    slopes = np.empty((*unit.shape[:-1], 3, TERMS))
+    slopes[..., 0, :] = _products(longitude, by_latitude, height)
+    slopes[..., 1, :] = _products(by_longitude, latitude, height)
+    slopes[..., 2, :] = _products(longitude, latitude, by_height)
+    return slopes
 
 
 def _powers(value: Array) -> Array:
     """Return the powers 0 to 3 of values (...), (..., 4)."""
-    square = value * value
-    return np.stack([np.ones_like(value), value, square, square * value], axis=-1)
+    powers = np.ones((*np.shape(value), 4))
+    for k in range(3):
+        np.multiply(powers[..., k], value, out=powers[..., k + 1])
+    return powers
 
 
 def _products(longitude: Array, latitude: Array, height: Array) -> Array:

@@ -31,8 +31,10 @@ def adjusted(file: Path) -> Any:
     return ADJUST.run(ADJUST.resolve(file), None, 0, lambda *_: None)
 
 
-def dense(one: Bench, control: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def dense(one: Bench, control: int, shared: float = 0.0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Corrections (images, 2, K), points and covariance of all unknowns by plain least squares of all of them together.
+
+    An error that the first two images share is a further unknown of each term, of `shared` times its sigma.
 
     Derivatives are differences of the equations themselves, and the points are latitude, longitude and height.
     """
@@ -41,8 +43,14 @@ def dense(one: Bench, control: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]
 
     def rows(x: np.ndarray) -> np.ndarray:
         value = x[: 2 * terms * len(names)].reshape(len(names), 2, terms)
-        ground = one.ground + x[2 * terms * len(names) :].reshape(count, 3)
-        parts = [(value / prior).ravel(), (ground[:control] - one.ground[:control]).ravel() / 0.05]
+        ground = one.ground + x[2 * terms * len(names) :][: 3 * count].reshape(count, 3)
+        common = x[2 * terms * len(names) + 3 * count :].reshape(-1, 2, terms)
+        own = value - np.concatenate([common, common, np.zeros_like(common)])[: len(names)] if shared else value
+        parts = [
+            (own / prior).ravel(),
+            (common / (shared or 1.0) / prior).ravel(),
+            (ground[:control] - one.ground[:control]).ravel() / 0.05,
+        ]
         for k, name in enumerate(names):
             image, (point, *place) = one.images[name], one.places[name].T
             position = image.seen(ground[point.astype(int)])[0]
@@ -51,7 +59,7 @@ def dense(one: Bench, control: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]
             parts.append(((position + basis @ value[k].T - np.column_stack(place)) / one.sigma).ravel())
         return np.concatenate(parts)
 
-    x = np.zeros(2 * terms * len(names) + 3 * count)
+    x = np.zeros(2 * terms * (len(names) + (shared > 0.0)) + 3 * count)
     step = 0.5
     for _ in range(6):
         columns = [(rows(x + step * unit) - rows(x - step * unit)) / (2.0 * step) for unit in np.eye(len(x))]
@@ -92,6 +100,29 @@ def test_it_is_the_least_squares_solution_of_all_unknowns_together(tmp_path: Pat
         assert np.all(10.0 * relative < np.sqrt(np.diag(joint)))
 
 
+def test_images_of_a_pass_share_errors(tmp_path: Path) -> None:
+    one = bench(SIGMA, points=25)
+    errors = {term: [4.0 * size, 4.0 * size] for term, size in SIGMA.items()}
+    file = one.write(tmp_path, ERRORS, robust=False, passes={"A": {"images": ["first", "second"], "errors": errors}})
+    run = adjusted(file)
+    x, covariance, residual = dense(one, 0, shared=4.0)
+    first = 6 * len(one.images)
+    sigma = np.sqrt(np.diag(covariance))
+    value = np.concatenate([image.value.ravel() for image in run.images.values()])
+    assert np.abs(value - x[:first]).max() < 1e-5 * sigma[:first].min()
+    _, joint = run.adjustment.change(*one.images)
+    limits = sigma[:first, None] * sigma[:first]
+    # derivatives by differences of the equations, as in the test of independent errors
+    assert np.abs((joint - covariance[:first, :first]) / limits).max() < 1e-5
+    assert run.adjustment.chi_square == pytest.approx(float(residual @ residual), rel=1e-6)
+    assert run.images["first"].before[0, 0] == pytest.approx(5.0 * np.hypot(1.0, 4.0))
+    assert run.images["third"].before[0, 0] == 5.0
+    # the two look along the track; what they share does not tilt their intersection
+    independent = adjusted(one.write(tmp_path, {t: [s * 17**0.5] * 2 for t, s in SIGMA.items()}, robust=False))
+    heights = [r.adjustment.point_covariance(np.arange(25)) for r in (run, independent)]
+    assert np.median(np.trace(heights[0], axis1=1, axis2=2) / np.trace(heights[1], axis1=1, axis2=2)) < 0.7
+
+
 @pytest.mark.second
 def test_corrections_and_points_scatter_as_their_sigmas_say(tmp_path: Path) -> None:
     squares, chances = [], []
@@ -114,8 +145,10 @@ def test_corrections_and_points_scatter_as_their_sigmas_say(tmp_path: Path) -> N
     ("column", "size", "rejected"),
     [
         (2, 3.0, (("p7", "second"),)),
-        # along the common direction of the looks, three images do not say which one is wrong: the point is lost
-        (1, 10.0, (("p7", "first"), ("p7", "second"), ("p7", "third"))),
+        # nearly along the common direction of the looks, three images say which one is wrong if it is far off
+        (1, 10.0, (("p7", "second"),)),
+        # and do not if it is not: the point is lost
+        (1, 2.0, (("p7", "first"), ("p7", "second"), ("p7", "third"))),
     ],
 )
 def test_gross_errors_are_rejected_and_named(
@@ -265,6 +298,12 @@ def test_tables_that_are_refused(tmp_path: Path, old: str, new: str, words: str)
 @pytest.mark.parametrize(
     ("keys", "words"),
     [
+        ({"passes": {"A": {"images": ["first", "fourth"], "errors": {"shift": [1.0, 1.0]}}}}, "no such image"),
+        ({"passes": {"A": {"images": ["first", "first"], "errors": {"shift": [1.0, 1.0]}}}}, "an image of two passes"),
+        (
+            {"passes": {"A": {"images": ["first"], "errors": {"shift": [1.0, 1.0], "drift": [1.0, 1.0]}}}},
+            "first has no drift of its own",
+        ),
         ({"errors": {"drift": [1.0, 1.0]}}, "shift"),
         ({"errors": {"shift": [0.0, 1.0]}}, "greater than 0"),
         ({"components": ["drift"]}, "no such group of variances"),

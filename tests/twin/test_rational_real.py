@@ -17,10 +17,12 @@ import rasterio
 
 from analysis.block import block as model
 from analysis.block.block_adjustment import intersected
+from scenes.specs.orbit.rational import SurfaceSpec
 from scenes.specs.procedures import PROCEDURES
 from scenes.yaml.yaml_file import dump_yaml
 from twin.orbit.export.rational_polynomial import PolynomialImage, read_rpc
 from twin.orbit.flight.earth import Earth
+from twin.orbit.matching.surface import surface
 
 REAL = Path(os.environ.get("TWIN_REAL") or Path(__file__).parents[3] / "shared/real") / "s2p_triplet"
 NAMES = ("img_01", "img_02", "img_03")
@@ -108,6 +110,30 @@ def test_residuals_and_heights_of_three_images(folder: Path) -> None:
     assert len(difference) > 100
     # the model's grid is 0.5 m; the pairs' heights scatter by some decimetres on roofs and trees
     assert nmad(difference) < 1.0
+
+
+def test_the_surface_beside_the_other_program(folder: Path) -> None:
+    """Corrected polynomials, and heights 30 m beyond those of the tie points."""
+    block_run = adjusted(folder)
+    known = np.array(list(heights(block_run).values()))[:, 2]
+    frames = {}
+    for name, image in block_run.images.items():
+        with rasterio.open(REAL / f"{name}.tif") as source:
+            frames[name] = source.read(1).astype(np.float32), PolynomialImage.of(image.polynomial, (1024, 1024))
+    spec = SurfaceSpec.model_validate({"spacing": "0.5 m", "crs": "EPSG:32631"})
+    grid = surface(frames, (float(known.min()) - 30.0, float(known.max()) + 30.0), spec)
+    with rasterio.open(REAL / "expected_dsm.tif") as source:
+        other = source.read(1)
+        west, north = source.transform.c, source.transform.f
+    row, column = round((grid.north - north) / 0.5), round((west - grid.west) / 0.5)
+    here = grid.height[row : row + other.shape[0], column : column + other.shape[1]]
+    difference = (here - other)[np.isfinite(here - other)]
+    assert len(difference) > 0.98 * np.isfinite(other).sum()
+    # errors of both programs, at edges, too; without correction it is 1.0 m
+    assert nmad(difference) < 0.7
+    assert abs(np.median(difference)) < 3.0  # the images leave a common height of 25 m open
+    assert grid.scatter is not None
+    assert 0.4 < grid.scatter < 1.2
 
 
 def test_without_each_image(folder: Path) -> None:

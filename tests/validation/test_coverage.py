@@ -16,7 +16,7 @@ IDS = {
     "scheme1 scheme2 scheme3 scheme4 scheme5 scale50000",
     "004": "eq1 eq2 eq3 eq4 table1 table2 turntable alignment",
     "017": "bundle",
-    "real": "edges.colour edges.mono pleiades spot6 oem spots",
+    "real": "edges.colour edges.mono rpcm pleiades spot6 oem spots",
 }
 """What the papers number, and what they claim without a number."""
 CHECKS = {check.id: check for group in registry.GROUPS for check in group.checks}

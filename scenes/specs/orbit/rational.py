@@ -43,6 +43,21 @@ class CorrectionSpec(Spec):
         return {name: value for name, value in terms.items() if value is not None}
 
 
+class SharedCorrectionSpec(Spec):
+    """Pass whose images have errors in common, such as a stereo triplet.
+
+    Attributes
+    ----------
+    images : tuple[str, ...]
+        Names of the images.
+    errors : CorrectionSpec
+        Errors that all of these images share, beside the errors of each one.
+    """
+
+    images: tuple[Name, ...]
+    errors: CorrectionSpec
+
+
 class RationalImageSpec(Spec):
     """Image with rational polynomials.
 
@@ -102,6 +117,8 @@ class RationalAdjustSpec(RationalTestSpec):
         Control and check points, also footprints of a laser altimeter; by default there are none.
     errors : CorrectionSpec
         Correction of every image without one of its own.
+    passes : Mapping[str, SharedCorrectionSpec]
+        Name -> images of one pass and the errors that these share; by default all errors are independent.
     without : tuple[{'ties', 'control'}, ...]
         Sensors that the files have but the adjustment does not use.
     robust : bool
@@ -113,6 +130,7 @@ class RationalAdjustSpec(RationalTestSpec):
     image_points: Reference | None = None
     ground: GroundFileSpec | None = None
     errors: CorrectionSpec
+    passes: Named[SharedCorrectionSpec] = Field(default_factory=dict, validate_default=True)
     without: tuple[Literal["ties", "control"], ...] = ()
     robust: Flag = True
     components: tuple[Name, ...] = ()
@@ -121,11 +139,28 @@ class RationalAdjustSpec(RationalTestSpec):
     def _fits_together(self) -> RationalAdjustSpec:
         if self.image_points is None and (self.ground is None or not self.ground.file.lower().endswith(".gcp")):
             raise Problem("no image points", None, "`image_points:`, or a .gcp file in `ground`")
+        self._passes_fit()
         groups = ("image", "control", *self.errors.sigma)
         for k, name in enumerate(self.components):
             if name not in groups:
                 raise unknown("no such group of variances", name, groups, ("components", k))
         return self
+
+    def _passes_fit(self) -> None:
+        """Raise Problem for images of a pass that are not there, that another pass has, or that lack a shared term."""
+        taken: set[str] = set()
+        for name, one in self.passes.items():
+            for k, image in enumerate(one.images):
+                where = ("passes", name, "images", k)
+                if image not in self.images:
+                    raise unknown("no such image in the block", image, tuple(self.images), where)
+                if image in taken:
+                    raise Problem("an image of two passes", image, "each image in one pass, once", within=where)
+                lacking = one.errors.sigma.keys() - (self.images[image].errors or self.errors).sigma.keys()
+                if lacking:
+                    term = sorted(lacking)[0]
+                    raise Problem(f"{image} has no {term} of its own", None, f"`{term}` in its errors", within=where)
+                taken.add(image)
 
     @property
     def sensors(self) -> tuple[str, ...]:
@@ -164,6 +199,25 @@ class RationalPointsSpec(Spec):
     false_alarm: Annotated[Number, Field(gt=0.0, lt=0.5)] = 1e-3
 
 
+class SurfaceSpec(Spec):
+    """Grid of heights by dense matching of all pairs of images.
+
+    Attributes
+    ----------
+    spacing : float
+        Side of a cell, in metres.
+    crs : str | None
+        Projected coordinate reference system of the grid in metres, such as EPSG:32631; by default the zone of UTM
+        (WGS84) of the first image. Heights are above the ellipsoid.
+    sigma : float
+        Standard deviation of a matched displacement, in pixels.
+    """
+
+    spacing: Annotated[float, Quantity(DISTANCE, smallest="0.01 m", largest="1 km")]
+    crs: Annotated[str, Field(pattern="^[A-Za-z]+:[0-9]+$")] | None = None
+    sigma: Pixels = 0.25
+
+
 class RationalMatchSpec(RationalTestSpec):
     """Measurement of tie points between images with rational polynomials by matching.
 
@@ -173,10 +227,13 @@ class RationalMatchSpec(RationalTestSpec):
         Lowest and highest ground above the ellipsoid, in metres, between which a point is searched.
     points : RationalPointsSpec
         Number of points and settings of the matching.
+    surface : SurfaceSpec | None
+        Grid of heights, for polynomials that `adjust` has corrected; by default there is none.
     """
 
     heights: HeightRange
     points: RationalPointsSpec = RationalPointsSpec.model_construct()
+    surface: SurfaceSpec | None = None
 
     @model_validator(mode="after")
     def _fits_together(self) -> RationalMatchSpec:

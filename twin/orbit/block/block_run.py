@@ -246,10 +246,14 @@ def run_adjustment(
     advance("block", 1, 2)
     try:
         network = network_of(block)
-        datum, block, rejected = _datum(block, spec.robust, pool)
+        datum, block, rejected, start = _datum(block, spec.robust, pool)
         robust = spec.robust and rejected is None
         adjustment = adjust_block(
-            block, robust="reject" if robust else None, variance_components=spec.components or False, pool=pool
+            block,
+            robust="reject" if robust else None,
+            variance_components=spec.components or False,
+            pool=pool,
+            start=start,
         )
         advance("block", 2, 2)
         contributions = _contributions(accepted_block(adjustment), adjustment, reference, advance, pool)
@@ -288,21 +292,23 @@ def _require_memory(spec: OrbitAdjustSpec) -> None:
     )
 
 
-def _datum(block: Block, robust: bool, pool: Pool | None) -> tuple[DatumTest | None, Block, Rejected | None]:
-    """Test a common shift of the control points; return the test, the block to adjust, and rejected points.
+def _datum(
+    block: Block, robust: bool, pool: Pool | None
+) -> tuple[DatumTest | None, Block, Rejected | None, BlockAdjustment | None]:
+    """Test a common shift of the control points; return the test, the block to adjust, rejected points and the start.
 
     The shift is tested first because control points of another datum would otherwise all be rejected as gross errors.
     Where the shift is significant, gross errors are those in excess of it, and the control points keep the coordinates
     that the file gives.
     """
     if not np.any(block.points.role == "control"):
-        return None, block, None
+        return None, block, None, None
     shifted = adjust_block(block, robust="reject" if robust else None, datum=True, pool=pool)
     test = datum_test(shifted)
     assert test is not None
     if robust and chi2.sf(test.chi_square, 3) < DATUM_ALARM:
-        return test, accepted_block(shifted), shifted.rejected()
-    return test, block, None
+        return test, accepted_block(shifted), shifted.rejected(), None
+    return test, block, None, shifted if robust else None
 
 
 def _check(adjustment: BlockAdjustment, reference: _Reference) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

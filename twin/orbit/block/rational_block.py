@@ -84,13 +84,18 @@ def rational_block(setup: RationalAdjustSetup, advance: Advance = silent) -> tup
         model.ModelScene(name, image, FrozenMap((spec.images[name].errors or spec.errors).sigma), places[name])
         for name, image in images.items()
     )
-    block = model.Block((), scenes, FrozenMap(), FrozenMap(), (), (), 1.0, points)
+    shared = tuple(
+        model.SharedCorrection(tuple(one.images), FrozenMap(one.errors.sigma)) for one in spec.passes.values()
+    )
+    block = model.Block((), scenes, FrozenMap(), FrozenMap(), (), (), 1.0, points, shared=shared)
     try:
-        start = intersected(block)
+        # control points, whose coordinates may have gross errors, start from their images where two see them
+        twice = np.bincount(np.concatenate([rays.point for rays in places.values()])).max(initial=0) > 1
+        first = intersected(block.without("control") if twice else block)
     except BlockError as error:
         raise BenchError(str(error), ("image_points",), "points that two images see") from error
-    start = np.where((points.role == "control")[:, None], points.start, start)
-    return replace(block, points=replace(points, start=start)), given
+    start = np.where((points.role == "control")[:, None], points.start, first)
+    return replace(block, points=replace(points, start=start, approximate=first)), given
 
 
 def _image_points(
@@ -221,7 +226,7 @@ def adjusted_images(adjustment: BlockAdjustment) -> FrozenMap[str, AdjustedImage
             tuple(scene.sigma),
             value,
             sigma,
-            np.array(list(scene.sigma.values())).T,
+            block.correction_sigma(scene),
             len(scene.rays.point),
             *_residuals(adjustment, scene, value, without),
             _corrected(scene, value, covariance),

@@ -3,14 +3,24 @@
 from __future__ import annotations
 
 import numpy as np
+from matplotlib.figure import Figure
 
+from twin.framework import svg
+from twin.framework.artefact import SvgFigure
 from twin.framework.report import Report, Section, answer
 from twin.orbit.images.simulate_report import found_table, how_measured, point_artefacts
+from twin.orbit.images.simulate_run import MATCHED
 from twin.orbit.matching.match_run import IMAGE, Match
-from twin.orbit.matching.rational_match import RationalMatch, rational_report
+from twin.orbit.matching.rational_match import RationalMatch, tie_points
+from twin.orbit.matching.surface import Surface
 
 _FAR = 0.5
 """Share of the search range above which a median displacement is reported as too near the limit of the search."""
+
+_OFF = 0.5
+"""Median displacement across the epipolar lines, in pixels, from which rows of two images no longer fit each other."""
+_DRAWN = 400
+"""Largest number of rows or columns of a drawn grid."""
 
 
 def match_report(run: Match | RationalMatch) -> Report:
@@ -90,3 +100,72 @@ def _warnings(run: Match) -> tuple[str, ...]:
     elif run.accuracy > 0.1:
         texts.append(f"the datum transformation of the maps to WGS 84 is accurate to {run.accuracy:g} m only")
     return tuple(texts)
+
+
+def rational_report(run: RationalMatch) -> Report:
+    """Return the report of tie points between images: verdict, counts and displacements across the epipolar lines."""
+    pairs = {
+        f"{source} in {name}": line
+        for source, points in run.points.items()
+        for name, line in points.searched_lines.items()
+    }
+    rows = {name: MATCHED(line) for name, line in pairs.items() if line.accepted.any()}
+    for row in rows.values():
+        row["consensus_scatter_px"] = row["consensus_scatter_px"] or "\N{EM DASH}"
+    keys = ("found", "matched", "accepted", "displacement_lines_px", "displacement_pixels_px", "consensus_scatter_px")
+    caption = (
+        "Displacement: median of the accepted from the prediction at the height of each point, in lines and samples;"
+        " it is that of the polynomials across the epipolar lines. Scatter: beyond the covariances; a dash where these"
+        " explain it."
+    )
+    table = MATCHED.table("points-found", "Matching", caption, rows, keys, "points", digits=4)
+    heads = sorted(pairs, key=lambda name: float(pairs[name].accepted.mean()))
+    verdict, more = answer(
+        f"{tie_points(run)} tie points were measured in {len(run.points)} images",
+        f"the share of accepted points is lowest for {heads[0]}, {pairs[heads[0]].accepted.mean():.0%}",
+    )
+    low, high = run.setup.test.heights
+    facts = (("Heights", f"{low:g} to {high:g} m"), ("Description", run.setup.test.description))
+    lost = [
+        f"{name}: " + ", ".join(f"{number} {reason}" for reason, number in line.rejections.items())
+        for name, line in pairs.items()
+    ]
+    sections = (Section("Why points were not accepted", tuple(lost), ()), *_surface_section(run.surface))
+    off = max((float(np.abs(line.median_shift).max()) for line in pairs.values() if line.accepted.any()), default=0.0)
+    warnings: tuple[str, ...] = ()
+    if run.surface is not None and off > _OFF:
+        warnings = (
+            f"the polynomials of two images differ by up to {off:.2g} px across the epipolar lines, which costs the"
+            " surface heights and accuracy: correct them by `twin.orbit adjust` first",
+        )
+    return Report("Tie points", verdict, more, facts, table, sections, warnings=warnings)
+
+
+def _surface_section(grid: Surface | None) -> tuple[Section, ...]:
+    """Return the section with the map of the heights and their accuracy, if there is a surface."""
+    if grid is None:
+        return ()
+    text = (
+        f"{grid.share:.0%} of {grid.height.size} cells of {grid.spacing:g} m ({grid.crs}) have a height above the"
+        f" ellipsoid; its sigma is {np.nanmedian(grid.sigma):.2g} m in the median."
+    )
+    scatter = grid.scatter
+    if scatter is not None:
+        text += f" Heights of two pairs differ {scatter:.2g} times as much as `surface.sigma` predicts."
+    drawing = svg.drawn("match-surface", _surface_figure, grid)
+    caption = "Height above the ellipsoid; white cells have none."
+    return (Section("Surface", (text,), (SvgFigure("surface", "", caption, drawing),)),)
+
+
+def _surface_figure(grid: Surface) -> Figure:
+    """Draw the heights of a grid on a map."""
+    figure = svg.new_figure(5.0)
+    axes = figure.subplots()
+    step = max(1, int(np.ceil(max(grid.height.shape) / _DRAWN)))
+    rows, columns = (1e-3 * grid.spacing * n for n in grid.height.shape)
+    shown = grid.height[::step, ::step]
+    low, high = np.nanpercentile(shown, [1.0, 99.0])
+    drawn = axes.imshow(shown, extent=(0.0, columns, 0.0, rows), cmap="viridis", vmin=low, vmax=high)
+    axes.set(xlabel="east [km]", ylabel="north [km]")
+    figure.colorbar(drawn, ax=axes, shrink=0.8, label="height [m]")
+    return figure

@@ -311,8 +311,8 @@ def match_numbers(run: Match | RationalMatch) -> dict[str, Any]:
     return RATIONAL(run) if isinstance(run, RationalMatch) else MATCH(run)
 
 
-def exported(run: Match | RationalMatch) -> dict[str, str]:
-    """Return the files of a folder with the measurements of the pass, or of the tie points, path -> text."""
+def exported(run: Match | RationalMatch) -> Mapping[str, str | bytes]:
+    """Return the files of a folder with the measurements of the pass, or of the tie points, path -> content."""
     if isinstance(run, RationalMatch):
         return rational_files(run)
     return campaign_files([run.measurements], run.setup.camera.plain())

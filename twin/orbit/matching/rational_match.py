@@ -14,19 +14,20 @@ from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from pyproj.exceptions import CRSError
 
 from analysis.matching.correlation import MatchOptions, Reason, distinct_points, resampled, search
 from analysis.matching.matches import DisplacementField, Matches, consensus, match_windows
 from optics.numerics.number_tree import FrozenMap
 from twin.framework.procedure import Advance, BenchError, silent
 from twin.framework.record import Quantity, Record
-from twin.framework.report import Report, Section, answer
 from twin.orbit.block.rational_block import read_image
 from twin.orbit.export.rational_polynomial import PolynomialImage
 from twin.orbit.flight.earth import Earth
 from twin.orbit.images.image_points import CONSENSUS, MatchedLine, MatchedPoints
-from twin.orbit.images.simulate_run import MATCHED, POINTS
+from twin.orbit.images.simulate_run import POINTS
 from twin.orbit.matching.pixels import read_pixels
+from twin.orbit.matching.surface import Surface, surface
 from twin.orbit.measured.measurement_tables import csv_text
 
 if TYPE_CHECKING:
@@ -72,10 +73,13 @@ class RationalMatch:
         Test file.
     points : Mapping[str, MatchedPoints]
         Image in which points were chosen -> the points with their matches in every other image that shows them.
+    surface : Surface or None
+        Grid of heights, if the file asks for it.
     """
 
     setup: RationalMatchSetup
     points: FrozenMap[str, MatchedPoints]
+    surface: Surface | None = None
 
     @cached_property
     def table(self) -> dict[str, list[Any]]:
@@ -123,7 +127,14 @@ def run_rational_match(setup: RationalMatchSetup, advance: Advance = silent) -> 
             "heights of the ground that they show (this range probably does not contain it), images of the same ground"
         )
         raise BenchError(problem, ("heights",), f"{remedy}, or a larger points.reach")
-    return RationalMatch(setup, FrozenMap(points))
+    grid = None
+    if spec.surface is not None:
+        images = {name: (frame.values, frame.image) for name, frame in frames.items()}
+        try:
+            grid = surface(images, spec.heights, spec.surface, advance)
+        except CRSError as error:
+            raise spec.surface.error("not a coordinate reference system", ("crs",), found=spec.surface.crs) from error
+    return RationalMatch(setup, FrozenMap(points), grid)
 
 
 def _points_of(
@@ -259,51 +270,39 @@ def _templates(frame: Frame, other: Frame, place: np.ndarray, height: np.ndarray
     return resampled(frame.values, at[:, 0], at[:, 1])
 
 
-def _both(run: RationalMatch) -> int:
+def tie_points(run: RationalMatch) -> int:
+    """Return the number of points that two images or more see."""
     return len(set(run.table["point"]))
 
 
+SURFACE: Record[Surface] = Record(
+    "Grid of heights above the ellipsoid.",
+    Quantity("crs", lambda grid: grid.crs, "coordinate reference system"),
+    Quantity("spacing_m", lambda grid: grid.spacing, "side of a cell", decimals=3),
+    Quantity("cells", lambda grid: grid.height.size, "cells of the grid"),
+    Quantity("share", lambda grid: grid.share, "fraction of the cells that have a height", decimals=3),
+    Quantity("sigma_m", lambda grid: float(np.nanmedian(grid.sigma)), "sigma of a height, median", "sigma", 3),
+    Quantity(
+        "pairs_sigma_m",
+        lambda grid: {f"{a} {b}": sigma for (a, b), sigma in grid.sigmas.items()},
+        "two images -> sigma of a height by them",
+    ),
+    Quantity(
+        "pairs_scatter",
+        lambda grid: grid.scatter,
+        "scatter of the heights of two pairs over that predicted; null for a single pair",
+    ),
+)
 RATIONAL: Record[RationalMatch] = Record(
     "match.json of images with rational polynomials.",
-    Quantity("tie_points", _both, "points that two images or more see"),
+    Quantity("tie_points", tie_points, "points that two images or more see"),
     Quantity("image_points", lambda run: len(run.table["point"]), "image points of these"),
     Quantity("points", lambda run: run.points, "image in which points were chosen -> matches", record=POINTS),
+    Quantity("surface", lambda run: run.surface, "grid of heights, where the file asks for it", record=SURFACE),
 )
 
 
-def rational_report(run: RationalMatch) -> Report:
-    """Return the report of tie points between images: verdict, counts and displacements across the epipolar lines."""
-    pairs = {
-        f"{source} in {name}": line
-        for source, points in run.points.items()
-        for name, line in points.searched_lines.items()
-    }
-    rows = {name: MATCHED(line) for name, line in pairs.items() if line.accepted.any()}
-    for row in rows.values():
-        row["consensus_scatter_px"] = row["consensus_scatter_px"] or "\N{EM DASH}"
-    keys = ("found", "matched", "accepted", "displacement_lines_px", "displacement_pixels_px", "consensus_scatter_px")
-    caption = (
-        "Displacement: median of the accepted from the prediction at the height of each point, in lines and samples;"
-        " it is that of the polynomials across the epipolar lines. Scatter: beyond the covariances; a dash where these"
-        " explain it."
-    )
-    table = MATCHED.table("points-found", "Matching", caption, rows, keys, "points", digits=4)
-    heads = sorted(pairs, key=lambda name: float(pairs[name].accepted.mean()))
-    verdict, more = answer(
-        f"{_both(run)} tie points were measured in {len(run.points)} images",
-        f"the share of accepted points is lowest for {heads[0]}, {pairs[heads[0]].accepted.mean():.0%}",
-    )
-    low, high = run.setup.test.heights
-    facts = (("Heights", f"{low:g} to {high:g} m"), ("Description", run.setup.test.description))
-    lost = [
-        f"{name}: " + ", ".join(f"{number} {reason}" for reason, number in line.rejections.items())
-        for name, line in pairs.items()
-    ]
-    return Report(
-        "Tie points", verdict, more, facts, table, (Section("Why points were not accepted", tuple(lost), ()),)
-    )
-
-
-def rational_files(run: RationalMatch) -> dict[str, str]:
-    """Return the table of image points for ``python -m twin.orbit adjust``, path -> text."""
-    return {"image_points.csv": csv_text(run.table)}
+def rational_files(run: RationalMatch) -> dict[str, str | bytes]:
+    """Return the table of image points for ``python -m twin.orbit adjust`` and the grid of heights, path -> content."""
+    files: dict[str, str | bytes] = {"image_points.csv": csv_text(run.table)}
+    return files if run.surface is None else files | {"surface.tif": run.surface.tiff()}

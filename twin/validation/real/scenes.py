@@ -16,7 +16,7 @@ from analysis.orbit.rational_polynomial import RationalPolynomial
 from analysis.statistics import rms
 from twin.framework.svg import AFTER, BEFORE, INK
 from twin.orbit.export.quality_run import compare_product
-from twin.orbit.export.rational_polynomial import sensor_polynomial
+from twin.orbit.export.rational_polynomial import read_rpc, sensor_polynomial
 from twin.orbit.flight.platform_table import PlatformTable, TabulatedTrajectory
 from twin.orbit.flight.sensor import NO_EFFECTS, LightEffects
 from twin.orbit.measured.orbit_files import read_oem
@@ -98,6 +98,18 @@ def _pleiades(context: Context, paths: list[Path]) -> Iterator[CheckResult]:
             yield context.row(f"real.pleiades.{name}", difference.largest, None, implied, **facts)
 
 
+def _rpcm(context: Context, paths: list[Path]) -> Iterator[CheckResult]:
+    printed = load_printed(REAL).content.data["rpcm"]
+    keys = ("latitude", "longitude", "height")
+    latitude, longitude, height = (np.array(printed[key], np.float64) for key in keys)
+    largest = 0.0
+    for path in paths:
+        there = np.array(printed[path.stem], np.float64).reshape(-1, 2)
+        here = np.stack(read_rpc(path).image(latitude, longitude, height), axis=-1)
+        largest = max(largest, float(np.abs(here - there).max()))
+    yield context.row("real.rpcm.projection", largest, None, 0.0, images=len(paths))
+
+
 def _spot_6(context: Context, paths: list[Path]) -> Iterator[CheckResult]:
     scene = read_scene(paths[0])
     height = load_printed(REAL).number("spot6.height_m")
@@ -152,6 +164,7 @@ def _orbit(context: Context, paths: list[Path]) -> Iterator[CheckResult]:
 def run(context: Context) -> Iterator[CheckResult]:
     """Yield the results of the rows on rigorous models and orbits."""
     yield from on_files(context, "real.pleiades", "pleiades/PHRDIMAP*.XML", _pleiades)
+    yield from on_files(context, "real.rpcm", "s2p_triplet/img_0[1-3].tif", _rpcm)
     yield from on_files(context, "real.spot6", "spot6/SPOT6.XML", _spot_6)
     yield from on_files(context, "real.oem", "oem/*.oem", _orbit)
 
