@@ -408,7 +408,7 @@ class MirrorSpec(Spec):
     rotate: Rotation | None = None
     radius: Radius
     conic: Number = 0.0
-    aspheric: AsphereTerms = Field(default_factory=FrozenMap)
+    aspheric: AsphereTerms = Field(default_factory=FrozenMap, exclude_if=lambda terms: not terms)
     sag: Annotated[FrozenMap[str, SagTerm], SagTerms()] | None = None
     light: Light | None = None
     index: Annotated[Number, Field(ge=1.0, le=10.0)] | None = None
@@ -495,7 +495,7 @@ class LineSpec(Spec):
 
     pixels: Annotated[Whole, Field(ge=2, le=_MOST_PIXELS)]
     pitch: PixelPitch
-    rows: Annotated[Whole, Field(ge=1, le=_MOST_PIXELS)] = 1
+    rows: Annotated[Whole, Field(ge=1, le=_MOST_PIXELS, exclude_if=lambda rows: rows == 1)] = 1
 
 
 def line_over_field(camera: Mapping[str, Any]) -> LineSpec:
