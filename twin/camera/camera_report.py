@@ -275,7 +275,7 @@ def _energy(run: CameraRun) -> Section:
     ]
     heads = ("field", "50 % within [µm]", "80 % within [µm]", "light in a pixel")
     about = (
-        "Optics alone at the design wavelength, peak 1, about the chief ray, half as wide again as the circle with 90 % "
+        "Optics alone at the design wavelength, peak 1, about the chief ray, half as wide again as the circle of 90 % "
         "of the light; the grid shows pixels of the line."
     )
     caption = "Light within circles and squares about the centroid; half widths of squares."

@@ -95,7 +95,9 @@ def _extent(model: CameraModel, backend: Backend, axis: int) -> tuple[float, flo
     length = float(np.ptp(z))
     room = 0.05 * length
     first = float(z.min()) - BEFORE * length
-    across = np.concatenate([np.ravel(points[..., axis]), np.ravel(begun(rays, first)[0, ..., axis]), _sizes(model)[axis]])
+    across = np.concatenate(
+        [np.ravel(points[..., axis]), np.ravel(begun(rays, first)[0, ..., axis]), _sizes(model)[axis]]
+    )
     return (first, float(z.max()) + 2.0 * room, float(across.min()) - room, float(across.max()) + room)
 
 

@@ -21,7 +21,7 @@ from analysis.monitor.parameters import ANGLE_GROUP, GROUND_GROUP
 from analysis.statistics import proportion_interval
 from optics.numerics.number_tree import FrozenMap
 from twin.framework.artefact import SAME
-from twin.operate.estimate.reported_estimate import name_of, percent, with_sigma
+from twin.operate.estimate.reported_estimate import name_of, percent, with_current_interval, with_sigma
 from twin.operate.record.entries import MICRO, utc_text
 from twin.operate.record.history import History, content_of
 from twin.operate.record.schema import ENTRY, SOURCE
@@ -260,7 +260,9 @@ class Overview:
         known = operation.plan.operation.events
         dated = ((int(entry["time_us"]), str(entry["subject"])) for entry in history.entries("event"))
         events = tuple((time, name, tuple(known.get(name, ()))) for time, name in dated)
-        return cls(operation, operation.filter_readings(), tuple(history.alarms()), events, monitor_span(history)[0])
+        result = operation.filter_readings()
+        alarms = tuple(with_current_interval(alarm, result.jumps) for alarm in history.alarms())
+        return cls(operation, result, alarms, events, monitor_span(history)[0])
 
     @property
     def time(self) -> int:
