@@ -9,6 +9,8 @@ from typing import Any
 
 import numpy as np
 
+from optics.numerics.arguments import finite
+
 MAX_NOLL = 66
 """Highest supported Noll index (all terms to radial order 10); beyond it monomials lose digits."""
 RANK_TOLERANCE = 1e-6
@@ -211,6 +213,11 @@ def fit(last: int, x: Any, y: Any, values: Any, weights: Any | None = None) -> n
     (..., last) ndarray
         Coefficients in the unit of ``values`` (each is an rms).
 
+    Raises
+    ------
+    ValueError
+        A value is NaN or infinite.
+
     Examples
     --------
     A surface that is 20 nm rms out of focus with 5 nm rms of astigmatism:
@@ -220,8 +227,9 @@ def fit(last: int, x: Any, y: Any, values: Any, weights: Any | None = None) -> n
     >>> (1e9 * fit_zernikes(6, nodes.x, nodes.y, surface, nodes.weight)).round(6) + 0.0
     array([ 0.,  0.,  0., 20.,  0.,  5.])
     """
+    known = finite("values", values, "so leave out points without data")
     root = np.sqrt(np.ones_like(x) if weights is None else weights)
-    solution, *_ = np.linalg.lstsq(basis(last, x, y) * root[:, None], (np.asarray(values) * root).T, rcond=None)
+    solution, *_ = np.linalg.lstsq(basis(last, x, y) * root[:, None], (known * root).T, rcond=None)
     return np.asarray(solution.T)
 
 

@@ -1,9 +1,11 @@
 """The option --out of every command: a folder or a file that does not exist yet; what exists stays as it is."""
 
+import importlib
 from collections.abc import Iterator
 from typing import Any
 
 import pytest
+import typer
 from typer.testing import CliRunner
 
 from docs.site.command_pages import ROOT, commands, programs
@@ -39,7 +41,7 @@ FIRST = {
     **{f"twin.operate {name}": RUN for name in ("export", "products", "report", "judge")},
     "twin.tolerance": "scenes/examples/tolerance_cassegrain.yaml",
     "twin.uncertainty": "gf7_pair",
-    "twin.validate": "--only 000.nothing",
+    "twin.validate": "--only 000",
 }
 """Command -> its arguments before ``--out``, or the reason why it is not called here."""
 
@@ -52,6 +54,17 @@ def commands_with_out() -> Iterator[tuple[str, Any]]:
         for words, command in commands(program).items():
             if any("--out" in parameter.opts for parameter in command.params):
                 yield words, command
+
+
+def app_of(program: str) -> typer.Typer:
+    """Return the application of a program, as `twin.framework.console.parser` finds it."""
+    module = importlib.import_module(program)
+    module = importlib.import_module(f"{program}.__main__") if hasattr(module, "__path__") else module
+    if hasattr(module, "app"):
+        return module.app
+    app = typer.Typer(add_completion=False)
+    app.command()(module.main)
+    return app
 
 
 @pytest.mark.second
@@ -72,12 +85,13 @@ def test_out_is_one_option() -> None:
 def test_what_exists_stays(words: str, tmp_path, monkeypatch) -> None:
     monkeypatch.chdir(ROOT)
     command = dict(commands_with_out())[words]
+    program, _, below = words.partition(" ")
     metavar = next(parameter.metavar for parameter in command.params if "--out" in parameter.opts)
     target = tmp_path / {"DIR": "run", "FILE": "camera.zmx"}.get(metavar, "file.yaml")
     kept = target / "mine.txt" if metavar == "DIR" else target
     kept.parent.mkdir(exist_ok=True)
     kept.write_text("mine", "utf-8")
-    done = CliRunner().invoke(command, [*FIRST[words].split(), "--out", str(target)])
+    done = CliRunner().invoke(app_of(program), [*below.split(), *FIRST[words].split(), "--out", str(target)])
     assert done.exit_code == 2, done.output
     assert "exists" in done.output
     assert kept.read_text("utf-8") == "mine"

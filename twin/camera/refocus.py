@@ -12,7 +12,7 @@ from optics.geometry.tree import Motion, State, compose
 from scenes.models.camera_model import focal_plane_body
 from scenes.models.camera_sharpness import FIELDS, FocalPlane
 from scenes.models.job_state import motions_of
-from scenes.specs.job import JobSpec
+from scenes.specs.job import JobSpec, checked_nodes
 from twin.camera.camera_optics import CameraOptics
 from twin.monitor.monitor_experiment import MonitorExperiment
 
@@ -76,8 +76,6 @@ def refocused_state(
 def job_state_in_focus(experiment: MonitorExperiment, job: JobSpec) -> State:
     """Return the state that a job describes, with the best focal plane of every camera if the job has ``refocus``.
 
-    The bodies of ``job`` have their full paths.
-
     Raises
     ------
     InputError
@@ -88,7 +86,8 @@ def job_state_in_focus(experiment: MonitorExperiment, job: JobSpec) -> State:
     if experiment.monitored:
         problem = "an instrument with a monitor is not refocused: its readings refer to the focal planes as they are"
         raise job.error(problem, ("refocus",), allowed="false, or a camera without a monitor")
-    state = experiment.state(job.model_copy(update={"refocus": False}))
+    job = checked_nodes(job.model_copy(update={"refocus": False}), experiment.instrument.nodes)
+    state = experiment.state(job)
     for name in experiment.instrument.cameras:
         optics = CameraOptics.within(experiment.instrument, name, experiment.backend, state)
         _, state = refocused_state(optics, motions_of(job), mounted=name)

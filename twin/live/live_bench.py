@@ -77,10 +77,6 @@ class LiveBench:
     def __init__(self, twin: InstrumentTwin) -> None:
         if not twin.experiment.monitored:
             require_one_state(twin.resolved)
-        if twin.resolved.job.refocus:
-            raise twin.resolved.job.error(
-                "the live page does not refocus", ("refocus",), allowed="a job without this key"
-            )
         job = checked_nodes(twin.resolved.job, twin.experiment.instrument.nodes)
         named = job if job is not twin.resolved.job else None
         self.twin = twin if named is None else InstrumentTwin.of(twin.resolved.with_job(named), like=twin)

@@ -437,8 +437,8 @@ def _verdict_sentences(life: JudgedLife, numbers: dict[str, Any], shown: Sequenc
     ]
     if made["components"]:
         out.append(
-            f"{100 * made['within_one']:.1f} % of the {made['components']} components of the readings are within 1 σ of "
-            f"their predictions and {100 * made['within_two']:.1f} % within 2 σ; chance allows {100 * low:.1f} to "
+            f"{100 * made['within_one']:.1f} % of the {made['components']} components of the readings are within 1 σ "
+            f"of their predictions and {100 * made['within_two']:.1f} % within 2 σ; chance allows {100 * low:.1f} to "
             f"{100 * high:.1f} % within 1 σ"
         )
     group, key = shown[-1]

@@ -161,12 +161,14 @@ MOST_FRONT = 50
 
 def sections(analysis: StudyAnalysis) -> list[Section]:
     """Return all sections of the report that have contents, in the order of the page."""
+    one = sum(len(factor.levels) > 1 for factor in analysis.runs.factors) == 1
     candidates = (
         _requirements(analysis),
+        *((_curves(analysis),) if one else ()),
         _distributions(analysis),
         _influences(analysis),
         _indices(analysis),
-        _curves(analysis),
+        *(() if one else (_curves(analysis),)),
         _pairs(analysis),
         _fronts(analysis),
         _convergence(analysis),
@@ -365,7 +367,8 @@ def _curves(analysis: StudyAnalysis) -> Section | None:
     figures = []
     if analysis.runs.sampled:
         caption = (
-            "Points: runs. Line: means of neighbouring runs with 95% intervals. Band: the middle 68% of these runs."
+            "Points: runs. Line: mean, by local parabolas; for few values, by value with 95% intervals. "
+            "Band: one standard deviation of the runs about it."
         )
     else:
         caption = "Means over all other factors; for a text with one standard deviation of the runs as whisker."
