@@ -408,7 +408,7 @@ class MirrorSpec(Spec):
     rotate: Rotation | None = None
     radius: Radius
     conic: Number = 0.0
-    aspheric: AsphereTerms = Field(default_factory=FrozenMap, exclude_if=lambda terms: not terms)
+    aspheric: AsphereTerms = Field(default_factory=FrozenMap)
     sag: Annotated[FrozenMap[str, SagTerm], SagTerms()] | None = None
     light: Light | None = None
     index: Annotated[Number, Field(ge=1.0, le=10.0)] | None = None
@@ -495,7 +495,7 @@ class LineSpec(Spec):
 
     pixels: Annotated[Whole, Field(ge=2, le=_MOST_PIXELS)]
     pitch: PixelPitch
-    rows: Annotated[Whole, Field(ge=1, le=_MOST_PIXELS, exclude_if=lambda rows: rows == 1)] = 1
+    rows: Annotated[Whole, Field(ge=1, le=_MOST_PIXELS)] = 1
 
 
 def line_over_field(camera: Mapping[str, Any]) -> LineSpec:
@@ -673,6 +673,16 @@ class CameraSpec(TitledSpec):
         if self.spectrum is not None or not self.bands:
             return self.spectrum
         return self.bands[PANCHROMATIC if PANCHROMATIC in self.bands else next(iter(self.bands))].spectrum
+
+    def file_text(self, remark: str, **others: Any) -> str:
+        """Return the text of a file with this camera, without empty terms and one row; see `TitledSpec.file_text`."""
+        plain = {**self.plain(), **others}
+        if plain["line"].get("rows") == 1:
+            del plain["line"]["rows"]
+        plain["mirrors"] = {
+            name: {key: value for key, value in face.items() if value != {}} for name, face in plain["mirrors"].items()
+        }
+        return super().file_text(remark, **plain)
 
     def with_curves(self) -> CameraSpec:
         """Return the camera with the tables of its spectra read.
