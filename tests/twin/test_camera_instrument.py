@@ -140,8 +140,8 @@ def test_a_job_that_refocuses_is_the_refocused_camera(backend, tmp_path) -> None
     assert found == pytest.approx(1e6 * done.quality.cameras[RC].defocus[1, middle], abs=1e-6)
     with pytest.raises(InputError, match=r"only twin.render, twin.study and twin.camera refocus"):
         job_state(asked.job, ThermalModel(done.experiment.instrument))
+    pair = validate(JobSpec, YamlFile("", {"instrument": "monitor_pair", "refocus": True}, {}))
     with pytest.raises(InputError, match="an instrument with a monitor is not refocused"):
-        pair = validate(JobSpec, YamlFile("", {"instrument": "monitor_pair", "refocus": True}, {}))
         render_job.render_job(resolve_job(pair), backend)
     with pytest.raises(InputError, match="a state is refocused, not a course"):
         job(refocus=True, course={"times": ["0 s", "1 s"], "motion": {"M2": {"shift": ["0 0 0 um", "0 0 1 um"]}}})

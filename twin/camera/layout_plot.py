@@ -98,7 +98,7 @@ def _extent(model: CameraModel, backend: Backend, axis: int) -> tuple[float, flo
     across = np.concatenate(
         [np.ravel(points[..., axis]), np.ravel(begun(rays, first)[0, ..., axis]), _sizes(model)[axis]]
     )
-    return (first, float(z.max()) + 2.0 * room, float(across.min()) - room, float(across.max()) + room)
+    return (first, float(z.max()) + 2.0 * room, float(across.min()) - 1.5 * room, float(across.max()) + room)
 
 
 def begun(points: np.ndarray, first: float) -> np.ndarray:
