@@ -108,7 +108,7 @@ def test_point_images_are_as_wide_as_their_light(backend) -> None:
         boxes = [text.get_window_extent() for text in axes.texts if isinstance(text, Annotation) and text.get_text()]
         assert len(boxes) == 7
         assert not any(a.overlaps(b) for a, b in itertools.combinations(boxes, 2))
-    rows = dict(first_order_table(run).rows)
+    rows = {str(row[0]): str(row[1]) for row in first_order_table(run).rows}
     assert rows["entrance pupil"].endswith("behind L1_front")
 
 

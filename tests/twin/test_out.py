@@ -60,10 +60,9 @@ def app_of(program: str) -> typer.Typer:
     """Return the application of a program, as `twin.framework.console.parser` finds it."""
     module = importlib.import_module(program)
     module = importlib.import_module(f"{program}.__main__") if hasattr(module, "__path__") else module
-    if hasattr(module, "app"):
-        return module.app
-    app = typer.Typer(add_completion=False)
-    app.command()(module.main)
+    app: typer.Typer = getattr(module, "app", None) or typer.Typer(add_completion=False)
+    if not hasattr(module, "app"):
+        app.command()(module.main)
     return app
 
 

@@ -234,7 +234,7 @@ def _fitted(axes: Axes, factor: Factor, response: Response) -> None:
         axes.plot(x, mean, color=BLUE, lw=1.4, label="mean")
     else:
         parts = [response.values[group] for group in groups]
-        mean, spread = (np.array([statistic(part) for part in parts]) for statistic in (np.mean, np.std))
+        mean, spread = np.array([(part.mean(), part.std()) for part in parts]).T
         style: dict[str, Any] = {"fmt": "o-", "color": BLUE, "ms": 3, "lw": 1.2, "capsize": 2, "label": "mean, 95%"}
         svg.interval_bars(axes, x, mean, [mean_interval(part) for part in parts], **style)
     axes.fill_between(x, mean - spread, mean + spread, color=SKY, alpha=0.35, lw=0, label="± 1 standard deviation")
