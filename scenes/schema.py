@@ -185,7 +185,8 @@ def write_schemas(folder: Path, instruments: Mapping[str, Mapping[str, NodeInfo]
 
 
 def main(
-    out: Annotated[Path, typer.Option(help="Folder to write into; it is made if need be.")] = Path("schemas"),
+    out: Annotated[Path, typer.Option(metavar="DIR", help="Folder for them.")] = Path("schemas"),
+    force: Annotated[bool, typer.Option("--force", help="Write into the folder if it exists.")] = False,
 ) -> None:
     """Write the JSON Schemas of the twin's YAML files, for editors.
 
@@ -199,6 +200,9 @@ def main(
     from optics.numerics.backend import BackendUnavailable
     from optics.numerics.llvm import LibraryMissing
 
+    if out.exists() and not force:
+        sys.stderr.write(f"{out} exists; choose another --out, or write into it with --force\n")
+        raise typer.Exit(2)
     instruments: dict[str, Mapping[str, NodeInfo]] = {}
     try:
         instruments = shipped_nodes()

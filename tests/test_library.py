@@ -154,6 +154,10 @@ def test_an_argument_of_a_wrong_kind_is_explained(call: Callable[[], object], wo
     [
         (lambda: optics.airy([0.0, np.nan], 500e-9, 8.0), r"radius must be finite, in metres, got nan \(1 of 2 "),
         (lambda: optics.annular_mtf(np.nan, 500e-9, 8.0), "frequency must be finite, in cycles per metre, got nan"),
+        (
+            lambda: optics.fit_zernikes(1, [0.0], [0.0], [np.nan]),
+            r"values must be finite, .* got nan \(1 of 1 values\)",
+        ),
         (lambda: optics.launch_rays(CAMERA, pupil=[(0.0, 2.0)]), "within the stop, at most 1 from its middle"),
         (lambda: optics.OpticalSurface(vanes=[(-1e-3, 0.0)]), "pairs of a positive width"),
         (lambda: analysis.robust_sigma([1.0, np.nan]), "residuals must be finite"),

@@ -62,7 +62,8 @@ def main(
         bool, typer.Option("--list", help="Print the ids with their statements and approximate times; run nothing.")
     ] = False,
     out: Annotated[
-        Path | None, typer.Option(readable=False, help="Run folder to make. Default: nothing is written.")
+        Path | None,
+        typer.Option(metavar="DIR", readable=False, help="Run folder to make. Default: nothing is written."),
     ] = None,
     seed: Annotated[int, typer.Option(min=0, max=cli.LARGEST_SEED, help="Seed of all noise.")] = 1,
     backend: cli.BackendName = "llvm",

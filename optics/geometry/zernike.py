@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from optics.numerics.arguments import finite
 from optics.numerics.quadrature import disk
 
 MAX_NOLL = 66
@@ -215,6 +216,11 @@ def fit(last: int, x: Any, y: Any, values: Any, weights: Any | None = None) -> n
     (..., last) ndarray
         Coefficients in the unit of ``values`` (each is an rms).
 
+    Raises
+    ------
+    ValueError
+        A value is NaN or infinite.
+
     Examples
     --------
     A surface that is 20 nm rms out of focus with 5 nm rms of astigmatism:
@@ -224,8 +230,9 @@ def fit(last: int, x: Any, y: Any, values: Any, weights: Any | None = None) -> n
     >>> (1e9 * fit_zernikes(6, nodes.x, nodes.y, surface, nodes.weight)).round(6) + 0.0
     array([ 0.,  0.,  0., 20.,  0.,  5.])
     """
+    known = finite("values", values, "so leave out points without data")
     root = np.sqrt(np.ones_like(x) if weights is None else weights)
-    solution, *_ = np.linalg.lstsq(basis(last, x, y) * root[:, None], (np.asarray(values) * root).T, rcond=None)
+    solution, *_ = np.linalg.lstsq(basis(last, x, y) * root[:, None], (known * root).T, rcond=None)
     return np.asarray(solution.T)
 
 

@@ -128,8 +128,8 @@ class Paraxial:
     exit_magnification : float
         Diameter of the exit pupil divided by that of the entrance pupil.
     angular_magnification : float
-        Angle between two collimated beams after the system divided by that before it; it characterises an afocal
-        system, which has no focal length.
+        Angle between two chief rays after the system divided by that before it, at the pupils; in an afocal system,
+        which has no focal length, that of any two collimated beams.
     """
 
     focal_length: float
@@ -173,7 +173,7 @@ def paraxial(matrix: RayMatrix, before: float, behind: float) -> Paraxial:
         entrance_pupil=float(before + 0.5 * np.trace(to_stop)),
         exit_pupil=float(exit_pupil),
         exit_magnification=float(np.sqrt(np.abs(determinant(position - exit_pupil * power)))) if square else np.inf,
-        angular_magnification=float(np.sqrt(np.abs(determinant(angle)))),
+        angular_magnification=float(np.sqrt(np.abs(determinant(chief_angle)))),
     )
 
 

@@ -142,7 +142,7 @@ def read(
     file: Annotated[
         Path, typer.Argument(readable=False, help="Zemax .zmx, CODE V .seq, or a telescope of batoid, .yaml.")
     ],
-    out: Annotated[Path, typer.Option(readable=False, help="The camera's file to write, .yaml.")],
+    out: Annotated[Path, typer.Option(metavar="FILE.yaml", readable=False, help="The camera's file to write.")],
     glasses: Annotated[
         list[Path] | None, typer.Option(readable=False, help="AGF catalogue of glasses; may be given several times.")
     ] = None,
@@ -203,7 +203,8 @@ def new(
         typer.Argument(help=f"{'; '.join(f'{name}: {telescope.title}' for name, telescope in TELESCOPES.items())}."),
     ],
     out: Annotated[
-        Path | None, typer.Option(readable=False, help="The camera's file to write, .yaml. Default: standard output.")
+        Path | None,
+        typer.Option(metavar="FILE.yaml", readable=False, help="The camera's file to write. Default: standard output."),
     ] = None,
     aperture: Annotated[str, typer.Option(help="Diameter of the entrance pupil.")] = "0.5 m",
     f_number: Annotated[float, typer.Option(min=0.5, max=1000.0, help="Focal length over the aperture.")] = 10.0,
@@ -262,7 +263,7 @@ def new(
 @app.command()
 def write(
     camera: Annotated[Path, typer.Argument(readable=False, help="A camera of the library (gf7), or a camera's file.")],
-    out: Annotated[Path, typer.Option(readable=False, help="Zemax .zmx, or .yaml for batoid.")],
+    out: Annotated[Path, typer.Option(metavar="FILE", readable=False, help="Zemax .zmx, or .yaml for batoid.")],
     perturbed: Annotated[
         Path | None, typer.Option(readable=False, help="A job, in whose perturbed state the camera is written.")
     ] = None,

@@ -496,7 +496,11 @@ HALF_FIELDS = {"dall-kirkham": 0.02, "korsch": 0.5, "off-axis": 1.0, "triplet": 
 """Half fields along the line, degrees, over which a kind is sharp at F/10; 0.05 for the others."""
 
 MARGIN = 1.1
-"""Radius of the shadow of a mirror before the primary over that of its clear aperture: its mount."""
+"""Radius of the shadow of a mirror before the primary over that of its clear aperture: its mount. That of the hole in
+the primary over that of the beams through it."""
+
+FIELD_RATIO = 0.1
+"""Half field across the line over that along it."""
 
 
 def first_camera(
@@ -553,7 +557,7 @@ def first_camera(
         f"focal_length: {focal:.12g} m",
         f"entrance_pupil: {1e3 * aperture:.12g} mm",
         f"field_bias: {np.degrees(bias):.10g} deg          # angle of the middle of the field from the axis",
-        f"field: {{x: {np.degrees(half):.6g} deg, y: {np.degrees(0.1 * half):.6g} deg}}    # half angles",
+        f"field: {{x: {np.degrees(half):.6g} deg, y: {np.degrees(FIELD_RATIO * half):.6g} deg}}    # half angles",
         f"wavelength: {1e9 * wavelength:.10g} nm",
         f"stop: {_surface(camera, what.stop)}",
         f"mirrors:                           # {'faces of lenses, ' * what.lenses}in the order of the light",
@@ -594,10 +598,23 @@ def _mirrors(camera: Camera, half: float, bias: float, aperture: float) -> list[
             f"  shadow: {{z: {1e3 * (z[1] - 0.02 * aperture):.10g} mm, radius: flat, light: passes, "
             f"edges: [{{blocks: circle, radius: {1e3 * MARGIN * radius:.5g} mm}}]}}   # of M2 and its mount"
         )
+    hole = _hole(camera, half, aperture) if len(camera.surfaces) == 2 else 0.0
     for k, surface in enumerate(camera.surfaces):
         behind = f"light: refracts, {'glass' if isinstance(surface.material, str) else 'index'}: {surface.material}"
         last = f"conic: {surface.conic:.12g}" if surface.material == MIRROR else behind
         out.append(
-            f"  {_surface(camera, k)}: {{z: {1e3 * z[k]:.15g} mm, radius: {1e3 * surface.radius:.15g} mm, {last}}}"
+            f"  {_surface(camera, k)}: {{z: {1e3 * z[k]:.15g} mm, radius: {1e3 * surface.radius:.15g} mm, {last}"
+            + (f", edges: [{{blocks: circle, radius: {1e3 * hole:.5g} mm}}]}}   # its hole" if hole and not k else "}")
         )
     return out
+
+
+def _hole(camera: Camera, half: float, aperture: float) -> float:
+    """Return the radius of the hole in the first of two mirrors that passes the beams of the field, metres.
+
+    The chief ray of the field's corner meets the second mirror at the distance times the angle from the axis.
+    """
+    focal, (_, second, image) = camera.focal_length, camera.vertices
+    share = -second / (image - second)
+    corner = np.hypot(1.0, FIELD_RATIO) * np.tan(half)
+    return float(MARGIN * (corner * ((1.0 - share) * -second + share * focal) + 0.5 * aperture * image / focal))

@@ -432,14 +432,15 @@ def axis_data(
     hits = np.stack([traced.hit(k)[0, 0] for k in range(count)])
     world = np.einsum("kij,kj->ki", imaging.world.rotation[0], hits) + imaging.world.translation[0]
     steps = np.linalg.norm(np.diff(np.concatenate([launch, world]), axis=0), axis=-1)
-    used = [k for k, mirror in enumerate(spec.mirrors.values()) if mirror.light != "passes"]
-    behind = float(np.sum(steps[used[-1] + 1 :])) if used else 0.0
-    before = float(np.sum(steps[: used[0] + 1])) if used else 0.0
+    used = [k for k, mirror in enumerate(spec.mirrors.values()) if mirror.light != "passes"] or [0]
+    # along the ray, since a plane that light passes may lie before the launch point
+    behind = float(np.linalg.norm(world[-1] - world[used[-1]]))
+    before = float((world[used[0]] - launch[0]) @ direction[0])
     stop = list(spec.mirrors).index(spec.stop)
     matrix = ray_matrix(backend, imaging, stop, launch, direction, transverse_axes(direction, first[None]))
     data = paraxial(matrix, before, behind)
     # A focal length that is not a number is afocal as well.
-    if not data.focal_length < AFOCAL * (np.sum(steps) - before):
+    if not data.focal_length < AFOCAL * np.sum(steps[used[0] + 1 :]):
         raise AfocalError(
             f"the system is afocal, with an angular magnification of {data.angular_magnification:.5g}: it has no focal "
             "length and makes no image"

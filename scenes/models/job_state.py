@@ -440,6 +440,9 @@ def job_state(
         A temperature is at or below 0 K, or outside the data of a glass's index; or a table of nodes does not describe
         its body.
     """
+    if job.refocus:
+        problem = "only twin.render, twin.study and twin.camera refocus a job's cameras"
+        raise job.error(problem, ("refocus",), allowed="a job without this key")
     heated = heated_bodies(job, thermal) if heated is None else heated
     fields = with_heat(job.fields(), heated)
     if moved is None:

@@ -827,6 +827,16 @@ class CameraSpec(TitledSpec):
             return self.spectrum
         return self.bands[PANCHROMATIC if PANCHROMATIC in self.bands else next(iter(self.bands))].spectrum
 
+    def file_text(self, remark: str, **others: Any) -> str:
+        """Return the text of a file with this camera, without empty terms and one row; see `TitledSpec.file_text`."""
+        plain = {**self.plain(), **others}
+        if plain["line"].get("rows") == 1:
+            del plain["line"]["rows"]
+        plain["mirrors"] = {
+            name: {key: value for key, value in face.items() if value != {}} for name, face in plain["mirrors"].items()
+        }
+        return super().file_text(remark, **plain)
+
     def with_curves(self) -> CameraSpec:
         """Return the camera with the tables of its spectra read.
 

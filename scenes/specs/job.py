@@ -224,6 +224,9 @@ class JobSpec(Spec):
         Images and analyses of the job.
     analysis : AnalysisSpec
         Analysis of the monitor's images.
+    refocus : bool
+        Whether the focal plane of a camera without a monitor is moved to its best position in this state, as the option
+        `--refocus` of `twin.camera` does; all results are those after refocusing.
     """
 
     instrument: Ref
@@ -232,6 +235,7 @@ class JobSpec(Spec):
     disturbances: JobDisturbances | None = None
     render: Annotated[RenderSpec, NothingIsEmpty] = RenderSpec.model_construct()
     analysis: Annotated[AnalysisSpec, NothingIsEmpty] = AnalysisSpec.model_construct()
+    refocus: Annotated[Flag, Field(exclude_if=lambda refocus: not refocus)] = False
 
     @model_validator(mode="after")
     def _stray_of_one_state(self) -> "JobSpec":
@@ -242,6 +246,8 @@ class JobSpec(Spec):
                 "one of them; put the temperatures of one time under perturb",
                 within=("render", "stray"),
             )
+        if self.course is not None and self.refocus:
+            raise Problem("a state is refocused, not a course", "both course and refocus", within=("refocus",))
         return self
 
     @model_validator(mode="after")

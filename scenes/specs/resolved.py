@@ -27,7 +27,7 @@ from scenes.specs.job import JobSpec, PerturbationSpec, TargetsSpec, with_tables
 from scenes.specs.perturbation import IN_WORDS
 from scenes.yaml.errors import InputError, Issue, unknown
 from scenes.yaml.input_file import is_file
-from scenes.yaml.spec import Name, Paths, Spec, validate
+from scenes.yaml.spec import Flag, Name, Paths, Spec, validate
 from scenes.yaml.yaml_file import YamlFile, dump_yaml, read_yaml
 
 TestType = TypeVar("TestType", bound=Spec)
@@ -490,6 +490,8 @@ class CameraSetup(Spec):
         Reference in the instrument -> prescription.
     perturb : Mapping[str, PerturbationSpec]
         Perturbations of bodies of the instrument, as in a job; for a camera alone of its parts.
+    refocus : bool
+        Whether the camera is refocused in that state, as in a job.
     """
 
     camera: CameraSpec
@@ -497,6 +499,7 @@ class CameraSetup(Spec):
     instrument: InstrumentSpec | None = None
     cameras: Paths[CameraSpec] = Field(default_factory=FrozenMap)
     perturb: Annotated[Paths[PerturbationSpec], IN_WORDS] = Field(default_factory=FrozenMap)
+    refocus: Annotated[Flag, Field(exclude_if=lambda refocus: not refocus)] = False
     seed: ClassVar[int] = 0
 
     def with_seed(self, seed: int) -> CameraSetup:
@@ -596,7 +599,12 @@ def _of_job(resolved: ResolvedJob, file: str, name: str | None) -> CameraSetup:
     chosen = _chosen(tuple(resolved.instrument.cameras), file, name)
     camera = resolved.cameras[resolved.instrument.cameras[chosen].camera]
     return CameraSetup.model_construct(
-        camera=camera, mounted=chosen, instrument=resolved.instrument, cameras=resolved.cameras, perturb=job.perturb
+        camera=camera,
+        mounted=chosen,
+        instrument=resolved.instrument,
+        cameras=resolved.cameras,
+        perturb=job.perturb,
+        refocus=job.refocus,
     ).with_source(job.source)
 
 

@@ -133,6 +133,14 @@ def test_afocal_systems_are_no_cameras(backend, name: str, stated: bool) -> None
     assert told == pytest.approx(magnification, rel=1e-4)
 
 
+def test_the_pupils_of_a_camera_behind_a_plane_that_light_passes(backend) -> None:
+    """The plane is before the launch point of the axial ray; by Lagrange's invariant magnifications are reciprocal."""
+    plane = "\n  SHADOW: {z: -6 m, radius: flat, light: passes}"
+    paraxial = camera(backend, plane + CASSEGRAIN, "M1", 1.5 * 0.5 / 0.1, "0.3 m", 0.9, stated=False).paraxial
+    assert paraxial.entrance_pupil == pytest.approx(0.0, abs=1e-12)
+    assert paraxial.exit_magnification * paraxial.angular_magnification == pytest.approx(1.0, rel=1e-9)
+
+
 @pytest.mark.second
 def test_the_data_are_those_of_one_state(backend) -> None:
     """Two mirrors by hand, M2 a millimetre nearer to M1 and the image plane 5 mm farther out."""

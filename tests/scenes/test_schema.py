@@ -61,9 +61,10 @@ def test_a_folder_that_cannot_be_written(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     with pytest.raises(OSError, match="file"):
         write_schemas(tmp_path / "file", {})
-    done = invoke(app, "--out", tmp_path / "file")
-    assert done.exit_code == 2
-    assert "cannot be written" in done.stderr
+    for words, problem in (((), "exists"), (("--force",), "cannot be written")):
+        done = invoke(app, "--out", tmp_path / "file", *words)
+        assert done.exit_code == 2
+        assert problem in done.stderr
 
 
 @pytest.fixture(scope="module")

@@ -2,23 +2,31 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from matplotlib.text import Annotation
 from scipy.integrate import quad
 from scipy.special import j1
 
 import optics
 from optics import Camera, OpticalSurface
+from scenes.lens.prescription import first_camera
 from scenes.specs.camera import CameraSpec
 from scenes.specs.load import load_camera
+from scenes.specs.resolved import CameraSetup
 from scenes.yaml.errors import InputError
 from scenes.yaml.spec import validate
 from scenes.yaml.yaml_file import parse_yaml
-from twin.camera.aberrations import IMAGE_FIELDS, camera_ghosts, point_images, ray_fans, third_order
+from twin.camera.aberrations import IMAGE_FIELDS, RayFans, camera_ghosts, point_images, ray_fans, third_order
 from twin.camera.camera_optics import CameraOptics
-from twin.camera.camera_run import FAN_FIELDS
+from twin.camera.camera_plots import images_figure
+from twin.camera.camera_report import first_order_table
+from twin.camera.camera_run import FAN_FIELDS, run_camera
+from twin.camera.camera_view import layout_figure
+from twin.camera.first_order_data import FIRST_ORDER
 
 
 @pytest.fixture(scope="module")
@@ -60,6 +68,48 @@ def test_rays_of_a_fan_are_the_slopes_of_its_path(gf7: CameraOptics) -> None:
         slope = np.gradient(gf7.wavelength * fans.path[f, 0], cosine)[2:-2]
         transverse = fans.transverse[f, 0, 0, 2:-2]
         assert np.max(np.abs(np.abs(slope) - np.abs(transverse))) < 0.03 * np.max(np.abs(transverse)) + 2e-8
+
+
+def test_fans_along_the_vanes_of_a_spider_are_drawn(backend) -> None:
+    """As those of the same camera without edges; a fan beside the vanes keeps its gaps."""
+    spec = load_camera("ritchey_chretien")
+    whole = spec.mirrors["spider"].edges
+    assert whole is not None
+    bare = spec.model_copy(
+        update={"mirrors": {name: face.model_copy(update={"edges": None}) for name, face in spec.mirrors.items()}}
+    )
+
+    def fans(camera: CameraSpec, turns: tuple[float, ...]) -> RayFans:
+        edges = (whole[0], *(whole[1].model_copy(update={"turn": np.radians(turn)}) for turn in turns))
+        spider = camera.mirrors["spider"].model_copy(update={"edges": edges})
+        mirrors = {**camera.mirrors, "spider": spider} if camera is spec else camera.mirrors
+        return ray_fans(CameraOptics.alone(camera.model_copy(update={"mirrors": mirrors}), backend), [(0.0, 0.0)])
+
+    free = fans(bare, ())
+    for turns, drawn in (((0.0, 90.0, 180.0, 270.0), (True, True)), ((0.0, 180.0), (True, False))):
+        found = fans(spec, turns)
+        assert tuple(np.all(np.isfinite(found.path[0]), axis=-1)) == drawn
+        seen = np.isfinite(found.path)
+        np.testing.assert_allclose(found.path[seen], free.path[seen], atol=1e-9)
+
+
+def test_point_images_are_as_wide_as_their_light(backend) -> None:
+    """Images of a fast triplet fill a quarter of the picture and more, not a twentieth."""
+    camera = validate(CameraSpec, parse_yaml(first_camera("triplet", "cooke", 0.05, 5.0, 650e-9)))
+    run = run_camera(CameraSetup.model_construct(camera=camera), backend)
+    assert run.images is not None
+    radii = [radius or 0.0 for radius in run.images.radius_of(0.9)]
+    panels = images_figure(run).axes[:4]
+    assert {round(panel.get_xlim()[1], 6) for panel in panels} == {round(1.5e6 * max(radii), 6)}
+    assert FIRST_ORDER(run.first_order)["airy_radius_um"] > 0.25e6 * 1.5 * max(radii)
+    # the labels of its six faces stand clear of each other
+    figure = layout_figure(run.optics.model, backend)
+    for axes in figure.axes:
+        boxes = [text.get_window_extent() for text in axes.texts if isinstance(text, Annotation) and text.get_text()]
+        assert len(boxes) == 7
+        assert not any(a.overlaps(b) for a, b in itertools.combinations(boxes, 2))
+    rows = {str(row[0]): str(row[1]) for row in first_order_table(run).rows}
+    assert rows["entrance pupil"].endswith("behind L1_front")
 
 
 def test_energy_of_a_ring_is_the_analytic_one(backend) -> None:

@@ -34,8 +34,9 @@ from twin.camera.__main__ import app
 from twin.camera.aberrations import distortion
 from twin.camera.camera_optics import CameraOptics
 from twin.camera.camera_report import camera_report
-from twin.camera.camera_run import aberration_name, find_focus, perturbed_text, refocus_text, run_camera, verdict
+from twin.camera.camera_run import aberration_name, perturbed_text, refocus_text, run_camera, verdict
 from twin.camera.first_order_data import FIRST_ORDER, detector_beyond_field, first_order_data, obstacles
+from twin.camera.refocus import find_focus
 from twin.design.__main__ import app as design_app
 from twin.design.design_run import HELD_BY, _held_text, run_design
 from twin.design.layout_bench import BeamFacts

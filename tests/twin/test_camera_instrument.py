@@ -13,7 +13,10 @@ import twin
 from optics.geometry.tree import Motion
 from optics.numerics.array_math import UnphysicalError
 from optics.raytrace.trace import BeamMissedError
+from scenes.models.camera_model import focal_plane_body
 from scenes.models.instrument_builder import build_instrument
+from scenes.models.job_state import job_state
+from scenes.models.thermal_model import ThermalModel
 from scenes.specs.instrument import InstrumentSpec
 from scenes.specs.job import JobSpec, checked_nodes
 from scenes.specs.load import load_camera, load_instrument
@@ -35,6 +38,8 @@ from twin.monitor.image_quality import image_quality
 from twin.monitor.truth import LineSight, trace_truth
 from twin.path_tracing.stray_light import NominalPathLost
 from twin.study.gradient.study_gradient import AD, TRACED, Gradient, study_gradient
+from twin.study.runs.base_job import Run
+from twin.study.runs.render_base import RenderBase
 from twin.study.runs.setup import resolve_study
 
 RC = "ritchey_chretien"
@@ -114,6 +119,32 @@ def test_despace_as_paraxial_rays_have_it(run: JobRun) -> None:
     assert camera["d_f_um"] == pytest.approx(-20.0 * by_separation, rel=1e-3)
     assert camera["principal_distance_mm"] == pytest.approx(1e3 * height, rel=1e-4)
     assert [abs(camera[key]) < 1e-9 for key in ("d_alpha_arcsec", "d_beta_arcsec", "d_gamma_arcsec")] == [True] * 3
+
+
+@pytest.mark.second
+def test_a_job_that_refocuses_is_the_refocused_camera(backend, tmp_path) -> None:
+    """By the job, in a study's run, in a script and for ``twin.camera`` alike; other commands refuse the key."""
+    asked = resolve_job(job(perturb=[DESPACE], refocus=True))
+    file = tmp_path / "job.yaml"
+    file.write_text(asked.to_yaml(), "utf-8")
+    assert resolve_camera(file).refocus
+    done = render_job.render_job(asked, backend)
+    scripted, plane = twin.load_camera(RC).perturbed(DESPACE).refocused().state, focal_plane_body(f"base/{RC}")
+    assert done.state[plane].shift == pytest.approx(scripted[plane].shift, rel=1e-4)  # of five digits
+    assert done.state[plane] == twin.load(str(file)).state[plane]
+    assert done.quality is not None
+    (outcome,) = RenderBase().evaluate(asked.plain(), [Run(0, (), None)], backend)
+    middle = done.quality.fields.index(0.0)
+    found = outcome["quality"]["cameras"][RC]["defocus_um"]["centre"]
+    assert found == pytest.approx(1e6 * done.quality.cameras[RC].defocus[1, middle], abs=1e-6)
+    with pytest.raises(InputError, match=r"only twin.render, twin.study and twin.camera refocus"):
+        job_state(asked.job, ThermalModel(done.experiment.instrument))
+    pair = validate(JobSpec, YamlFile("", {"instrument": "monitor_pair", "refocus": True}, {}))
+    with pytest.raises(InputError, match="an instrument with a monitor is not refocused"):
+        render_job.render_job(resolve_job(pair), backend)
+    with pytest.raises(InputError, match="a state is refocused, not a course"):
+        job(refocus=True, course={"times": ["0 s", "1 s"], "motion": {"M2": {"shift": ["0 0 0 um", "0 0 1 um"]}}})
+    assert "refocus" not in resolve_job(job(perturb=[DESPACE])).to_yaml()
 
 
 @pytest.mark.second

@@ -8,10 +8,12 @@ from pathlib import Path
 import pytest
 
 from optics.camera.telescope_types import TELESCOPES
-from scenes.lens.prescription import first_camera
+from scenes.lens.prescription import MARGIN, first_camera
+from scenes.models.camera_model import derive_camera
 from scenes.models.camera_sharpness import blur_warnings
 from scenes.models.instrument_builder import build_instrument
 from scenes.specs.asbuilt import AsBuiltSetup
+from scenes.specs.load import load_camera
 from scenes.specs.operation import read_operation
 from scenes.specs.resolved import resolve, resolve_with
 from scenes.specs.tolerance import ToleranceSetup
@@ -21,6 +23,7 @@ from tests.tiers import quick
 from tests.twin.commands import invoke
 from tests.twin.study_bench import ROOT
 from twin.asbuilt.__main__ import app as asbuilt_app
+from twin.camera.first_order_data import obscuration
 from twin.framework.console import parser
 from twin.new import __main__ as program
 from twin.new.camera_numbers import CameraNumbers
@@ -45,6 +48,27 @@ def cameras(tmp_path_factory: pytest.TempPathFactory) -> Path:
         text = first_camera(kind, kind, *SIZES.get(kind, (0.4, 8.0)), 650e-9)
         (folder / f"{kind}.yaml").write_text(text, "utf-8")
     return folder
+
+
+@pytest.mark.parametrize("kind", ["ritchey-chretien", "cassegrain"])
+def test_the_primary_of_a_first_design_has_the_hole_that_its_beams_need(kind: str, backend, cameras: Path) -> None:
+    spec = load_camera(cameras / f"{kind}.yaml")
+    (hole,) = spec.mirrors["M1"].edges or ()
+    closed = spec.model_copy(
+        update={"mirrors": {**spec.mirrors, "M1": spec.mirrors["M1"].model_copy(update={"edges": None})}}
+    )
+    needed = obscuration(derive_camera(closed, backend), backend).holes["M1"]
+    assert MARGIN * needed == pytest.approx(hole.radius, rel=0.01)  # the beams are traced, the hole is first order
+    assert "M1" not in obscuration(derive_camera(spec, backend), backend).holes
+
+
+def test_files_do_not_repeat_defaults() -> None:
+    text = load_camera("ritchey_chretien").file_text("A camera.")
+    assert "rows" not in text
+    assert "aspheric" not in text
+    area = load_camera("ritchey_chretien")
+    line = area.line.model_copy(update={"rows": 8})
+    assert "rows: 8" in area.model_copy(update={"line": line}).file_text("A camera.")
 
 
 def new(kind: str, camera: Path | str, out: Path, *more: str):

@@ -307,7 +307,7 @@ def test_the_command_writes_the_report_of_the_newest_day(life, tmp_path):
 def test_the_report_of_a_past_day_is_what_was_known_then(life, tmp_path):
     record, _ = life
     for day, jumps in (("2026-04-20", False), ("2026-04-25", True)):
-        assert run(record, "--day", day, "--out", tmp_path / "r.html", "--quiet").exit_code == 0
+        assert run(record, "--day", day, "--out", tmp_path / "r.html", "--force", "--quiet").exit_code == 0
         page = (tmp_path / "r.html").read_text("utf-8")
         assert shown(page, "Detected jumps") == jumps
         assert f"--day {day}" in page

@@ -264,6 +264,7 @@ def test_shares_that_chance_allows() -> None:
     low, high = likely_shares(1000, 1.0)
     assert low < 0.6827 < high
     assert high - low == pytest.approx(2.0 * 3.29 * math.sqrt(0.6827 * 0.3173 / 1000), rel=0.05)  # normal limit
+    assert likely_shares(0, 1.0) == (0.0, 1.0)
     assert covered(np.array([0.5, -1.5, 3.0, np.nan]), np.ones(4), 2.0) == (2, 3)
 
 

@@ -17,7 +17,7 @@ from tests.twin.study_bench import ROOT
 from twin.framework.durable import exit_on_terminate
 
 FULL = "/dev/full"
-SCHEMA = ("scenes.schema", "--out", "{tmp}")
+SCHEMA = ("scenes.schema", "--out", "{tmp}/schemas")
 LAB = ("twin.lab", "distortion", "scenes/lab/distortion.yaml", "--out", "{tmp}/run")
 COMMANDS = [(*LAB, "--json"), SCHEMA]
 

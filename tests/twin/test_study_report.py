@@ -10,7 +10,9 @@ import pytest
 from tests.tiers import quick
 from tests.twin.policed_page import breaches
 from tests.twin.study_data import columns, dataset, study_of
-from twin.study.report import study_plots
+from twin.study.report import study_plots, study_report
+from twin.study.report.study_analysis import StudyAnalysis
+from twin.study.report.study_plots import local_fit
 from twin.study.report.study_report import report_files
 from twin.study.report.study_statistics import StudyRuns
 
@@ -53,6 +55,33 @@ CASES = {
     "tiny": ("{kind: monte_carlo, runs: 40, seed: 1}", lambda x: 1e-30 * x, 0, "e−3"),
     "large": ("{kind: monte_carlo, runs: 40, seed: 1}", lambda x: 1e9 + x, 0, "1.00e9"),
 }
+
+
+def test_a_study_of_one_factor_begins_with_its_curve(monkeypatch) -> None:
+    monkeypatch.setattr(study_report, "_figure", lambda *drawn: drawn)
+    first, second = (f"{name}: {{key: [job, {name}], uniform: [0 mm, 1 mm]}}" for name in "ab")
+    for factors, place in ((first, 0), (f"{first}, {second}", 2)):
+        study = study_of(f"{{{factors}}}", "{kind: monte_carlo, runs: 40, seed: 1}")
+        analysis = StudyAnalysis.of(StudyRuns.of(dataset(study, {"y": columns(study)["a"] ** 2}), study))
+        titles = [section.title for section in study_report.sections(analysis)]
+        assert titles.index("Response curves") == place
+
+
+def test_a_local_fit_has_no_ends() -> None:
+    """A parabola is its own fit up to both ends; means of neighbours end before them."""
+    x = np.sort(np.random.default_rng(1).uniform(-1.0, 2.0, 60))
+    at = np.linspace(x[0], x[-1], 9)
+    mean, spread = local_fit(x, 3.0 + x - 2.0 * x**2, at)
+    np.testing.assert_allclose(mean, 3.0 + at - 2.0 * at**2, atol=1e-9)
+    np.testing.assert_allclose(spread, 0.0, atol=1e-7)
+    noise = 0.1 * np.random.default_rng(2).standard_normal(4000)
+    x = np.random.default_rng(3).uniform(-1.0, 2.0, 4000)
+    mean, spread = local_fit(x, noise, at)
+    assert np.all(
+        np.abs(mean) < 5.0 * 3.0 * 0.1 / np.sqrt(1200.0)
+    )  # at an end a parabola has three times sigma / root n
+    np.testing.assert_allclose(spread, 0.1, rtol=0.1)
+    assert local_fit(np.zeros(9), np.arange(9.0), np.zeros(1))[0] == pytest.approx(4.0)
 
 
 @pytest.mark.parametrize("case", quick(2, CASES))

@@ -13,6 +13,7 @@ from optics.camera.ghosts import DETECTOR, PUPIL, Ghost, trace_ghosts
 from optics.camera.prescription import SeidelSums, seidel_sums
 from optics.numerics.backend import Backend
 from optics.raytrace.first_order import enclosed_area
+from optics.raytrace.trace import BeamMissedError
 from optics.waves.imaging import encircled_energy, ensquared_energy
 from optics.waves.optical_transfer import polychromatic_transfer
 from scenes.models.camera_model import IMAGE, CameraModel, field_direction
@@ -118,7 +119,8 @@ class RayFans:
         Stop coordinate of the N rays of a fan, in units of its radius.
     transverse : (F, 2, 2, N) ndarray
         Intersection with the focal plane minus that of the chief ray, metres: field, fan (along the line, along the
-        track), direction (along the line, along the track), ray. nan where no light passes.
+        track), direction (along the line, along the track), ray. nan where no light passes; a fan that edges block
+        entirely, such as one along a vane, is traced without edges.
     path : (F, 2, N) ndarray
         Wavefront error against the chief ray, waves, positive where the wavefront is ahead; nan without light.
     """
@@ -138,15 +140,18 @@ def ray_fans(optics: CameraOptics, fields: Sequence[Field]) -> RayFans:
         In this state the light misses the stop or the plane of the line CCD.
     """
     pupil = np.linspace(-1.0, 1.0, FAN_POINTS)
-    zero = np.zeros(FAN_POINTS)
-    stop = np.concatenate([np.zeros((1, 2)), np.stack([pupil, zero], axis=-1), np.stack([zero, pupil], axis=-1)])
-    rays = optics.rays(fields, stop * (1.0 - 1e-9))
-    position = (rays.position[..., 1::-1] / rays.size)[:, 1:]
-    chief = (rays.position[..., 1::-1] / rays.size)[:, :1]
-    lost = ~rays.valid[:, 1:]
-    transverse = np.where(lost[..., None], np.nan, position - chief).reshape(len(fields), 2, FAN_POINTS, 2)
-    path = np.where(lost, np.nan, -optics.path_error(rays)[:, 1:] / optics.wavelength)
-    return RayFans(tuple(fields), pupil, np.moveaxis(transverse, -1, 2), path.reshape(len(fields), 2, FAN_POINTS))
+    transverse, path = np.empty((len(fields), 2, 2, FAN_POINTS)), np.empty((len(fields), 2, FAN_POINTS))
+    for fan, axis in enumerate(np.eye(2)):
+        stop = np.concatenate([[0.0], pupil * (1.0 - 1e-9)])[:, None] * axis
+        try:
+            rays = optics.rays(fields, stop)
+        except BeamMissedError:
+            rays = optics.rays(fields, stop, edges=False)
+        place, lost = rays.position[..., 1::-1] / rays.size, ~rays.valid[:, 1:]
+        step = np.where(lost[..., None], np.nan, place[:, 1:] - place[:, :1])
+        transverse[:, fan] = np.moveaxis(step, -1, 1)
+        path[:, fan] = np.where(lost, np.nan, -optics.path_error(rays)[:, 1:] / optics.wavelength)
+    return RayFans(tuple(fields), pupil, transverse, path)
 
 
 @shows("psfs", "radius [um]")

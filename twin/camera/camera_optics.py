@@ -228,17 +228,19 @@ class CameraOptics:
         root = self.assembly.place([self.state]).pose(self.path.root)
         return np.asarray(light @ self.model.camera_frame.rotation @ root.rotation.T)
 
-    def rays(self, fields: Sequence[Field | FieldText] | np.ndarray, points: np.ndarray) -> LineRays:
+    def rays(
+        self, fields: Sequence[Field | FieldText] | np.ndarray, points: np.ndarray, edges: bool = True
+    ) -> LineRays:
         """Trace rays of F fields, (F, 2), through N points of the stop, (N, 2), to the line CCD.
 
-        Points are in units of the stop's radius.
+        Points are in units of the stop's radius. Without ``edges``, those of the file stop no ray.
 
         Raises
         ------
         AimError, BeamMissedError
             In this state the light misses the stop or the plane of the line CCD.
         """
-        return self.path.rays(self.path.coloured(self.state, self.wavelength), self.directions(fields), points)
+        return self.path.rays(self.path.coloured(self.state, self.wavelength), self.directions(fields), points, edges)
 
     @one_blas_thread()  # small matrices: threads would only wait for each other
     def wavefronts(

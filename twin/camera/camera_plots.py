@@ -93,9 +93,10 @@ def images_figure(run: CameraRun) -> Figure:
     figure = svg.new_figure(2.9)
     axes = figure.subplots(1, 2 * len(images.psfs), sharey=True)
     pitch = 1e6 * run.camera.line.pitch
+    half = 1e6 * min(float(images.radius[-1]), 1.5 * max(r or np.inf for r in images.radius_of(0.9)))
+    edges = pitch * (np.arange(-np.ceil(half / pitch), np.ceil(half / pitch)) + 0.5)
     for psf, pair in zip(images.psfs, axes.reshape(-1, 2), strict=True):
         um, shown = 1e6 * psf.position, psf.values / np.max(psf.values)
-        half = min(float(um[-1]), 4.5 * pitch)
         for panel, values, ends, name in (
             (pair[0], shown, (0.0, 1.0), "linear"),
             (pair[1], np.log10(np.maximum(shown, 1e-6)), (-5.0, 0.0), "decades"),
@@ -104,7 +105,6 @@ def images_figure(run: CameraRun) -> Figure:
                 um, um, values, cmap="viridis", vmin=ends[0], vmax=ends[1], shading="gouraud", rasterized=True
             )
             figure.colorbar(mesh, ax=panel, location="bottom", shrink=0.9, ticks=ends)
-            edges = pitch * (np.arange(-5, 5) + 0.5)
             for edge in edges[np.abs(edges) < half]:
                 panel.axhline(edge, color=svg.LIGHT, lw=0.35, alpha=0.6)
                 panel.axvline(edge, color=svg.LIGHT, lw=0.35, alpha=0.6)
@@ -327,7 +327,7 @@ def focus_figure(run: CameraRun) -> Figure:
     axes[0].set_ylim(0.0, None)
     svg.shared_legend(figure, axes[0], title="field")
     for panel, name in zip(axes[1:], _directions(run), strict=False):
-        panel.set_title(f"MTF of the optics at Nyquist {name}")
+        panel.set_title(f"MTF of the optics at Nyquist\n{name}")
         panel.set_ylim(0.0, None)
     for panel in axes:
         panel.axvline(0.0, color=svg.LIGHT, lw=0.8, zorder=0)

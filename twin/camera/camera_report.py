@@ -113,6 +113,7 @@ def first_order_table(run: CameraRun) -> Table:
     def far(value: float | None) -> str:
         return f"{value:.4g} m" if value is not None and abs(value) < 1e4 else "infinite"
 
+    first = next(name for name, surface in run.camera.mirrors.items() if surface.light != "passes")
     rows: list[tuple[str, str]] = [
         ("worst wavefront error", f"{run.worst[0]:.4g} waves rms at {field_text(run.camera, run.worst[1])}"),
         ("focal length", f"{n['focal_length_m']:.7g} m"),
@@ -124,7 +125,7 @@ def first_order_table(run: CameraRun) -> Table:
         ("working F-number", f"{n['working_f_number']:.3f} (line {n['working_f_number_along_line']:.3f}, "
          f"track {n['working_f_number_along_track']:.3f})"),
         ("entrance pupil", f"{1e3 * n['entrance_pupil_m']:.5g} mm, "
-         f"{_before(n['entrance_pupil_before_first_mirror_m'])} the first mirror"),
+         f"{_before(n['entrance_pupil_before_first_mirror_m'])} {first}"),
         ("exit pupil", f"{far(n['exit_pupil_m'])}, {_before(n['exit_pupil_before_image_m'])} the image"),
         ("chief rays at the image", "{:.3f} deg from its normal in the middle, at most {:.3f} deg".format(
             *n["chief_ray_angle_deg"])),
@@ -156,13 +157,19 @@ def first_order_table(run: CameraRun) -> Table:
     return Table("first-order", "First-order data", caption, ("quantity", "value"), rows)
 
 
+_NO_DISTANCE = 1e-9
+"""Largest distance of a pupil that is at a surface but for rounding, metres."""
+
+
 def _before(distance: float | None) -> str:
-    """Format a signed distance, metres, as "0.5 m before", "0.5 m behind" or "infinitely far from".
+    """Format a signed distance, metres, as "0.5 m before", "0.5 m behind", "at" or "infinitely far from".
 
     A positive distance is before; None and distances beyond 10 km are infinite.
     """
     if distance is None or abs(distance) > 1e4:
         return "infinitely far from"
+    if abs(distance) < _NO_DISTANCE:
+        return "at"
     return f"{abs(distance):.4g} m {'before' if distance > 0.0 else 'behind'}"
 
 
@@ -266,7 +273,10 @@ def _energy(run: CameraRun) -> Section:
         )
     ]
     heads = ("field", "50 % within [µm]", "80 % within [µm]", "light in a pixel")
-    about = "Optics alone at the design wavelength, peak 1, about the chief ray; the grid shows pixels of the line."
+    about = (
+        "Optics alone at the design wavelength, peak 1, about the chief ray, half as wide again as the circle of 90 % "
+        "of the light; the grid shows pixels of the line."
+    )
     caption = "Light within circles and squares about the centroid; half widths of squares."
     artefacts = (
         _figure("point-images", "Point images", about, plots.images_figure, run),

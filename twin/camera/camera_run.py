@@ -15,14 +15,12 @@ from analysis.arrays import shows
 from analysis.monitor import parameters
 from optics.camera.ghosts import Ghost
 from optics.geometry import zernike
-from optics.geometry.pose import rotation_matrix, triple
-from optics.geometry.tree import Motion, State, compose
+from optics.geometry.tree import State
 from optics.numerics.array_math import UnphysicalError
 from optics.numerics.backend import Backend
 from optics.raytrace.first_order import LineChange
 from scenes.models.camera_design import with_plane
-from scenes.models.camera_model import focal_plane_body
-from scenes.models.camera_sharpness import BLURRED, FIELDS, FocalPlane, field_text
+from scenes.models.camera_sharpness import BLURRED, field_text
 from scenes.models.instrument_builder import build_instrument
 from scenes.models.instrument_model import Instrument
 from scenes.models.job_state import job_state, motions_of
@@ -36,6 +34,7 @@ from twin.camera.camera_optics import RINGS, CameraOptics
 from twin.camera.camera_results import Field, Mtf, Spot, Wavefront
 from twin.camera.colour import COLOURS, Colours, colour_data, evaluate_colours
 from twin.camera.first_order_data import FIRST_ORDER, FirstOrderData, first_order_data
+from twin.camera.refocus import Refocus, find_focus, refocused_state
 from twin.framework.procedure import Advance, silent
 from twin.framework.record import Quantity, Record
 from twin.framework.reference_frames import frames_text
@@ -68,41 +67,6 @@ MAP_POINTS = 129
 
 QUALITY_FIELDS = (-1.0, 0.0, 1.0)
 """Fields along the line, in fractions of half the line, at which obscuration by bodies of an instrument is computed."""
-
-
-@shows("errors_before [waves]", "errors_after [waves]", "tilt")
-@dataclass(frozen=True, eq=False)
-class Refocus:
-    """Focal plane before and after refocusing.
-
-    Attributes
-    ----------
-    before, after : FocalPlane
-        Plane of the file and the best one. In a perturbed state both are seen from the moved focal plane, which is
-        drawn where it was designed to be.
-    errors_before, errors_after : ndarray
-        Rms wavefront error at the F fields over which the focus is optimised (``FIELDS``), (F,), waves.
-    tilt : bool
-        True if the plane was tilted as well.
-    motion : Motion
-        Motion of the focal plane that refocuses, in the axes of its body, which the state may have moved.
-    words : tuple of str
-        Perturbation of the focal plane that gives the refocused camera, such as ``focal_plane shift z +0.226 mm``.
-    moved : bool
-        True if ``words`` replace a perturbation that the focal plane has.
-    downstream : bool
-        True if the +Z of the focal plane, which points toward the scene, is along the light.
-    """
-
-    before: FocalPlane
-    after: FocalPlane
-    errors_before: np.ndarray
-    errors_after: np.ndarray
-    tilt: bool
-    motion: Motion
-    words: tuple[str, ...]
-    moved: bool
-    downstream: bool
 
 
 @dataclass(frozen=True, eq=False)
@@ -285,6 +249,7 @@ def run_camera(
         Light of the field does not pass, or has no focus after the last mirror.
     """
     advance("focus", 0, 1)
+    refocus = refocus or setup.refocus
     camera, refocused = setup.camera, None
     built = setup.instrument is not None and bool(setup.instrument.as_built)
     if refocus and not (setup.perturb or built):
@@ -302,10 +267,8 @@ def run_camera(
             job = checked_nodes(setup.job, instrument.nodes)
             state = job_state(job, ThermalModel(instrument))
         if refocus and refocused is None:
-            plane = focal_plane_body(optics.path.root)
-            existing = motions_of(job).get(plane) if setup.perturb else None
-            refocused = find_focus(optics.in_state(state), tilt, setup.mounted, existing)
-            state = compose(state, {plane: refocused.motion}, {plane: instrument.assembly.tree[plane]})
+            existing = motions_of(job) if setup.perturb else {}
+            refocused, state = refocused_state(optics.in_state(state), existing, tilt, setup.mounted)
         if setup.instrument is not None:
             quality = image_quality(instrument, backend, [state], QUALITY_FIELDS).cameras[mounted]
     advance("focus", 1, 1)
@@ -369,58 +332,6 @@ def _nyquist(optics: CameraOptics, errors: np.ndarray) -> np.ndarray:
         if errors.max() < MAX_WAVES_FOR_MTF:
             return np.array([mtf.at(optics.nyquist) for mtf in optics.mtfs(MTF_FIELDS)])
     return np.empty((0, 2))
-
-
-def find_focus(optics: CameraOptics, tilt: bool, mounted: str | None = None, existing: Motion | None = None) -> Refocus:
-    """Find the focal plane with the smallest mean square wavefront error over ``FIELDS``.
-
-    Parameters
-    ----------
-    optics : CameraOptics
-        Camera in its state.
-    tilt : bool
-        Allow a tilt about the line as well.
-    mounted : str or None
-        Name of the camera in its instrument; None for a camera alone.
-    existing : Motion or None
-        Motion that the state gives the focal plane itself; None for none.
-
-    Raises
-    ------
-    InputError
-        Light does not pass, or has no focus after the last mirror.
-    """
-    camera, model = optics.model.spec, optics.model
-    beams = optics.beams(FIELDS, 6)
-    best, nominal = beams.best_plane(tilt), FocalPlane.of(camera)
-    if not beams.reaches(best):
-        problem = f"refocusing is not possible: the light has no focus after {list(camera.mirrors)[-1]}"
-        raise camera.error(problem, ("mirrors",), allowed="mirrors that make a real image")
-    frame = model.focal_plane
-    rotation = np.array([0.0, best.tilt - nominal.tilt, 0.0])  # Y of the focal plane is x of the prescription
-    normal = frame.rotation @ rotation_matrix(rotation)[:, 2]
-    distance = (np.array([0.0, 0.0, best.z]) - frame.translation) @ normal / (frame.rotation[:, 2] @ normal)
-    motion = Motion(triple(rotation), (0.0, 0.0, float(distance)))
-    body, total = focal_plane_body(optics.path.root), motion
-    if existing is not None:
-        total = compose({body: existing}, {body: motion}, {body: optics.assembly.tree[body]})[body]
-    errors = beams.errors(nominal), beams.errors(best)
-    words = _motion_words(focal_plane_body(mounted or "").lstrip("/"), total)
-    downstream = bool(model.image_direction @ frame.rotation[:, 2] > 0.0)
-    return Refocus(nominal, best, *errors, tilt, motion, words, existing is not None, downstream)
-
-
-def _motion_words(node: str, motion: Motion) -> tuple[str, ...]:
-    """Return the motion of a body as texts that ``--perturb`` takes, without rotations below 0.01 arcsec and 10 nm."""
-    out = []
-    for axis, angle in zip("xyz", np.degrees(motion.rotate) * 3600.0, strict=True):
-        if abs(angle) >= 0.01:
-            out.append(f"{node} rotate {axis} {angle:+.4g} arcsec")
-    for axis, length in zip("xyz", motion.shift, strict=True):
-        size, unit = (1e3, "mm") if abs(length) >= 1e-5 else (1e6, "um")
-        if abs(length) >= 1e-8 or axis == "z":
-            out.append(f"{node} shift {axis} {size * round(length, 12):+.5g} {unit}")
-    return tuple(out)
 
 
 def verdict(run: CameraRun) -> tuple[str, ...]:

@@ -11,7 +11,8 @@ For the perturbed instrument of a job use
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import itertools
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, fields
 from html import escape
@@ -417,6 +418,9 @@ _END_COLOURS = (BLUE, GREEN, VERMILION)
 INCOMING = 0.16
 """Length of the incoming rays in the drawing, as a fraction of the layout's length."""
 
+_CHARACTER, _LEVEL, _LEVELS = 0.07, 0.155, 3
+"""Width of a character and height of a line of labels, inches, and the number of lines of labels above each other."""
+
 _VIEWS = ((1, "y", "Side view, in the plane of symmetry"), (0, "x", "Top view, along the line"))
 
 
@@ -430,7 +434,7 @@ def layout_figure(model: CameraModel, backend: Backend) -> Figure:
     sizes = _sizes(model)
     axes = figure.subplots(2, 1, sharex=True, gridspec_kw={"height_ratios": heights})
     for panel, (axis, name, title), box in zip(axes, _VIEWS, boxes, strict=True):
-        _view(panel, model, backend, axis, low)
+        _view(panel, model, backend, axis, low, scale)
         panel.set_xlim(low, high)
         panel.set_ylim(box[2], box[3])
         panel.set_aspect("equal")
@@ -486,8 +490,9 @@ def _extent(model: CameraModel, backend: Backend, axis: int) -> tuple[float, flo
     length = float(np.ptp(z))
     room = 0.05 * length
     first = float(z.min()) - INCOMING * length
-    across = np.concatenate([points[..., axis], begun(rays, first)[:1, ..., axis]])
-    return (first, float(z.max()) + 2.0 * room, float(across.min()) - room, float(across.max()) + room)
+    beams = np.ravel(points[..., axis]), np.ravel(begun(rays, first)[0, ..., axis])
+    across = np.concatenate([*beams, _sizes(model)[axis]])
+    return (first, float(z.max()) + 2.0 * room, float(across.min()) - 1.5 * room, float(across.max()) + room)
 
 
 def begun(points: np.ndarray, first: float) -> np.ndarray:
@@ -497,8 +502,8 @@ def begun(points: np.ndarray, first: float) -> np.ndarray:
     return np.concatenate([(start + share * (then - start))[None], points[1:]])
 
 
-def _view(axes: Axes, model: CameraModel, backend: Backend, axis: int, first: float) -> None:
-    """Draw the side view or the top view of the layout with its rays."""
+def _view(axes: Axes, model: CameraModel, backend: Backend, axis: int, first: float, scale: float) -> None:
+    """Draw the side view or the top view of the layout with its rays, from z = ``first``, inches per metre."""
     points = begun(section_rays(model, backend, axis), first)
     half = np.degrees((model.spec.field.x, model.spec.field.y)[axis])
     for share, colour in zip((-1.0, 0.0, 1.0), _END_COLOURS, strict=True):
@@ -512,12 +517,13 @@ def _view(axes: Axes, model: CameraModel, backend: Backend, axis: int, first: fl
             style = (0, (5, 2)) if ray == 0 else "-"
             axes.plot(line[:, 2], line[:, axis], color=colour, lw=width, ls=style, alpha=0.9)
     edges = obstacles(model)
-    for name, drawn in section_lines(model, axis).items():
+    lines = section_lines(model, axis)
+    _label(axes, model, lines, axis, scale)
+    for name, drawn in lines.items():
         if name not in edges and name != IMAGE and model.spec.mirrors[name].light == "passes":  # no body is there
             axes.plot(drawn[:, 2], drawn[:, axis], color=GREY, lw=0.8, ls=(0, (1, 2)), zorder=3)
         else:
             axes.plot(drawn[:, 2], drawn[:, axis], color=INK, lw=2.6, solid_capstyle="butt", zorder=3)
-        _label(axes, model, name, drawn[:, [2, axis]], axis)
     axes.axhline(0.0, color=LIGHT, lw=0.7, ls=(0, (8, 3, 2, 3)), zorder=0)
 
 
@@ -563,22 +569,34 @@ def section_lines(model: CameraModel, axis: int, points: int = 80) -> dict[str, 
     return lines
 
 
-def _label(axes: Axes, model: CameraModel, name: str, drawn: np.ndarray, axis: int) -> None:
-    """Write the name of a surface beside its drawing."""
-    text = f"{name}, stop" if name == model.spec.stop else _title(name)
-    # beyond the end that is farther from the axis; in the top view all ends are alike, and neighbours alternate
-    turn = name == IMAGE or model.mirrors.index(name) == 0
-    end = drawn[int(np.argmax(np.abs(drawn[:, 1])))] if axis == 1 else drawn[-1 if turn else 0]
-    up = 1 if end[1] >= np.mean(drawn[:, 1]) else -1
-    right = isinstance(model.apertures.get(name), Circle) or name == IMAGE
-    axes.annotate(
-        text,
-        (float(end[0]), float(end[1])),
-        (-4 if right else 4, 4 * up),
-        textcoords="offset points",
-        ha="right" if right else "left",
-        va="bottom" if up > 0 else "top",
-        color=INK,
-        fontsize=8.5,
-        bbox={"facecolor": "white", "edgecolor": "none", "pad": 0.6, "alpha": 0.8},
-    )
+def _label(axes: Axes, model: CameraModel, lines: Mapping[str, np.ndarray], axis: int, scale: float) -> None:
+    """Write the names of the surfaces beside their drawings, clear of each other.
+
+    ``lines`` are the sections along ``axis``, and ``scale`` is the size of the drawing, inches per metre.
+    """
+    taken: list[np.ndarray] = []
+    for name, section in lines.items():
+        drawn = section[:, [2, axis]]
+        text = f"{name}, stop" if name == model.spec.stop else _title(name)
+        # beyond the end that is farther from the axis; in the top view all ends are alike, and neighbours alternate
+        turn = name == IMAGE or model.mirrors.index(name) == 0
+        first = int(np.argmax(np.abs(drawn[[0, -1], 1]))) if axis == 1 else int(turn)
+        right = isinstance(model.apertures.get(name), Circle) or name == IMAGE
+        for level, end in itertools.product(range(_LEVELS), (drawn[-first], drawn[first - 1])):
+            up = 1 if end[1] >= np.mean(drawn[:, 1]) else -1
+            size = np.array([_CHARACTER * len(text), _LEVEL]) / scale
+            middle = end + np.array([-0.5 if right else 0.5, up * (0.5 + level)]) * size
+            if not any(np.all(np.abs(middle - other[0]) < 0.5 * (size + other[1])) for other in taken):
+                break
+        taken.append(np.stack([middle, size]))
+        axes.annotate(
+            text,
+            (float(end[0]), float(end[1])),
+            (-4 if right else 4, up * (4 + 72 * _LEVEL * level)),
+            textcoords="offset points",
+            ha="right" if right else "left",
+            va="bottom" if up > 0 else "top",
+            color=INK,
+            fontsize=8.5,
+            bbox={"facecolor": "white", "edgecolor": "none", "pad": 0.6, "alpha": 0.8},
+        )

@@ -32,7 +32,7 @@ BACKEND_HELP = f"Backend of the ray trace: {' or '.join(NAMES)}."
 OUT_HELP = "Run folder to make. Default: runs/NAME-001, -002, ... (the first free one), with the NAME of the file."
 
 File = Annotated[Path, typer.Argument(readable=False, help="YAML file of the test, or the config.yaml of a run.")]
-Out = Annotated[Path | None, typer.Option(readable=False, help=OUT_HELP)]
+Out = Annotated[Path | None, typer.Option(metavar="DIR", readable=False, help=OUT_HELP)]
 Seed = Annotated[
     int | None, typer.Option(min=0, max=LARGEST_SEED, help="Seed of all random numbers; overrides that of the file.")
 ]

@@ -25,6 +25,7 @@ from scenes.specs.perturbation import perturbation_text
 from scenes.specs.resolved import ResolvedJob
 from scenes.yaml.errors import InputError
 from twin.camera.first_order_data import obscuration, unmodelled_obscuration
+from twin.camera.refocus import job_state_in_focus
 from twin.framework.frame_store import mean_of
 from twin.framework.procedure import Advance, silent
 from twin.main_job.render_files import deformation_warnings
@@ -131,7 +132,9 @@ def render_job(
     experiment.stated  # noqa: B018 - what is wrong with it is said before the long parts
     stage.begin(1)
     course = resolved.job.course
-    states = [experiment.state(resolved.job)] if course is None else series_states(experiment, resolved.job)
+    states = (
+        [job_state_in_focus(experiment, resolved.job)] if course is None else series_states(experiment, resolved.job)
+    )
     shown = 0 if course is None else course.shown
     state = states[shown]
     if placed is not None:
@@ -257,7 +260,7 @@ def _without_monitor(
     job = checked_nodes(job, experiment.instrument.nodes)
     resolved = resolved.with_job(job)
     stage.begin(1)
-    state = experiment.state(job)
+    state = job_state_in_focus(experiment, job)
     stage.begin(2)
     with _lost_by_motions(resolved, *LOST):
         truth = experiment.sight.truth([state])

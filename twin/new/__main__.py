@@ -119,7 +119,9 @@ _FILE = "File to write, .yaml; - prints it"
 """Last question, if no option names the file."""
 Out = Annotated[
     Path | None,
-    typer.Option(readable=False, help="The file to write, .yaml. Default: standard output.", show_default=False),
+    typer.Option(
+        metavar="FILE.yaml", readable=False, help="The file to write. Default: standard output.", show_default=False
+    ),
 ]
 Force = Annotated[bool, typer.Option("--force", help="Replace the file if it exists.")]
 

@@ -13,7 +13,6 @@ from optics.numerics.number_tree import FrozenMap
 from scenes.specs.camera import CameraSpec, MirrorSpec
 from scenes.yaml.errors import InputError, Issue
 from scenes.yaml.units import LENGTH, format_quantity, parse_quantity
-from scenes.yaml.yaml_file import dump_yaml
 
 _NONE: Mapping[str, float] = FrozenMap()
 DIFFRACTION_LIMIT = 0.0714
@@ -293,8 +292,7 @@ class CameraNumbers:
         new = {name: f"M{k + 1}" for k, name in enumerate(self._powered)}
         mirrors = {new[name]: face.model_copy(update={"edges": None}) for name, face in self._powered.items()}
         update = {"mirrors": FrozenMap(mirrors), "stop": new[self.camera.stop]}
-        plain = self.camera.model_copy(update=update).plain()
-        return dump_yaml({key: value for key, value in plain.items() if value not in ("", {})}).rstrip()
+        return self.camera.model_copy(update=update).file_text("").rstrip()
 
 
 def _rounded(length: float) -> str:

@@ -202,10 +202,10 @@ def report(
         str | None,
         typer.Option(metavar="UTC", help="Day of the report, 2028-03-05. Default: that of the newest reading."),
     ] = None,
-    out: Annotated[
-        Path,
-        typer.Option(metavar="FILE.html", readable=False, help="File of the report, which is replaced if it exists."),
-    ] = Path("report.html"),
+    out: Annotated[Path, typer.Option(metavar="FILE.html", readable=False, help="File of the report.")] = Path(
+        "report.html"
+    ),
+    force: Annotated[bool, typer.Option("--force", help="Replace the file if it exists.")] = False,
 ) -> None:
     """Write the daily report: one self-contained page, to be stored or sent by mail.
 
@@ -222,6 +222,7 @@ def report(
     from twin.operate.overview import reading_span
     from twin.operate.record.history import History
 
+    require_new(out, force)
     first, newest = reading_span(call.history, call.reading_kind)
     if not newest:
         raise InputErrorText(f"the record has no reading of the {call.reading_kind}; ingest some first")

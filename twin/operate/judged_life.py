@@ -335,9 +335,9 @@ def judged_numbers(life: JudgedLife) -> dict[str, Any]:
         "quantities": out_by_group,
         "predictions": {
             "components": scores.components,
-            "within_one": scores.within_one / scores.components,
+            "within_one": scores.within_one / scores.components if scores.components else None,
             "within_one_limits": list(likely_shares(scores.components, 1.0)),
-            "within_two": scores.within_two / scores.components,
+            "within_two": scores.within_two / scores.components if scores.components else None,
             "within_two_limits": list(likely_shares(scores.components, 2.0)),
             "limits_exceedance_probability": EXCEEDANCE,
         },
@@ -367,7 +367,7 @@ def _rounded(values: Any) -> list[float | None]:
 def likely_shares(count: int, times: float) -> tuple[float, float]:
     """Return limits for the share of `count` independent normal errors that lie within a multiple of sigma.
 
-    The share lies outside them with the probability ``EXCEEDANCE``.
+    The share lies outside them with the probability ``EXCEEDANCE``. Without errors they are 0 and 1.
 
     Parameters
     ----------
@@ -377,7 +377,7 @@ def likely_shares(count: int, times: float) -> tuple[float, float]:
         Multiple of sigma.
     """
     low, high = binom.ppf([0.5 * EXCEEDANCE, 1.0 - 0.5 * EXCEEDANCE], count, SHARES[times])
-    return float(low) / count, float(high) / count
+    return (float(low) / count, float(high) / count) if count else (0.0, 1.0)
 
 
 def judged_report(life: JudgedLife, name: str) -> Report:
@@ -433,11 +433,14 @@ def _verdict_sentences(life: JudgedLife, numbers: dict[str, Any], shown: Sequenc
     made = numbers["predictions"]
     low, high = made["within_one_limits"]
     out = [
-        f"RMS errors of ground calibration / single readings / filtered / smoothed estimate: {', '.join(out_by_group)}",
-        f"{100 * made['within_one']:.1f} % of the {made['components']} components of the readings are within 1 σ of "
-        f"their predictions and {100 * made['within_two']:.1f} % within 2 σ; chance allows {100 * low:.1f} to "
-        f"{100 * high:.1f} % within 1 σ",
+        f"RMS errors of ground calibration / single readings / filtered / smoothed estimate: {', '.join(out_by_group)}"
     ]
+    if made["components"]:
+        out.append(
+            f"{100 * made['within_one']:.1f} % of the {made['components']} components of the readings are within 1 σ "
+            f"of their predictions and {100 * made['within_two']:.1f} % within 2 σ; chance allows {100 * low:.1f} to "
+            f"{100 * high:.1f} % within 1 σ"
+        )
     group, key = shown[-1]
     explained = numbers["explained_by_temperatures"].get(f"{group} {key}")
     if explained is not None:

@@ -58,7 +58,9 @@ def simulate(
     out: Annotated[
         Path | None,
         typer.Option(
-            readable=False, help="Folder for the files. Default: `simulated` in the record's folder, or runs/life-001."
+            metavar="DIR",
+            readable=False,
+            help="Folder for the files. Default: `simulated` in the record's folder, or runs/life-001.",
         ),
     ] = None,
     truth: Annotated[

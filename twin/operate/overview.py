@@ -21,7 +21,7 @@ from analysis.monitor.parameters import ANGLE_GROUP, GROUND_GROUP
 from analysis.statistics import proportion_interval
 from optics.numerics.number_tree import FrozenMap
 from twin.framework.artefact import SAME
-from twin.operate.estimate.reported_estimate import name_of, percent, with_sigma
+from twin.operate.estimate.reported_estimate import name_of, percent, with_current_interval, with_sigma
 from twin.operate.record.entries import MICRO, utc_text
 from twin.operate.record.history import History, content_of
 from twin.operate.record.schema import ENTRY, SOURCE
@@ -266,7 +266,9 @@ class Overview:
         dated += [(int(entry["time_us"]), "commanded_move") for entry in history.entries("move")]
         events = tuple((time, name, tuple(known.get(name, ()))) for time, name in sorted(dated))
         begin = reading_span(history, operation.reading_kind)[0]
-        return cls(operation, operation.filter_readings(), tuple(history.alarms()), events, begin)
+        result = operation.filter_readings()
+        alarms = tuple(with_current_interval(alarm, result.jumps) for alarm in history.alarms())
+        return cls(operation, result, alarms, events, begin)
 
     @property
     def time(self) -> int:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -38,7 +39,7 @@ PlanFile = Annotated[
 ]
 json_and_quiet = cli.with_options("out", "seed", "export", "backend", "force", "strict")
 """Decorator that gives a command the options ``--json`` and ``--quiet``."""
-NewFolder = Annotated[Path, typer.Option(readable=False, help="Folder for them; it must not be there yet.")]
+NewFolder = Annotated[Path, typer.Option(metavar="DIR", readable=False, help="Folder for them.")]
 
 
 @contextmanager
@@ -240,10 +241,11 @@ class Call:
             raise typer.Exit(FAILURE) from None
 
 
-def require_new(out: Path) -> None:
-    """Raise InputErrorText if a folder exists."""
-    if out.exists():
-        raise InputErrorText(f"--out: {out} exists already; name a new folder")
+def require_new(out: Path, force: bool | None = None) -> None:
+    """Raise InputErrorText if a file or folder exists, unless the option ``force``, where there is one, is used."""
+    if os.path.lexists(out) and not force:
+        remedy = "" if force is None else ", or replace it with --force"
+        raise InputErrorText(f"--out: {out} exists; choose another{remedy}")
 
 
 def on_record(work: Callable[..., None]) -> Callable[..., None]:

@@ -47,9 +47,9 @@ from scenes.yaml.errors import InputError, Issue, Problem, names_text, nearest, 
 from scenes.yaml.spec import validate
 from scenes.yaml.yaml_file import YamlFile, read_yaml
 from twin.camera.camera_optics import CameraOptics
-from twin.camera.camera_run import find_focus
 from twin.camera.camera_view import CameraView
 from twin.camera.first_order_data import FIRST_ORDER, first_order_data
+from twin.camera.refocus import find_focus, job_state_in_focus
 from twin.framework.reference_frames import frames_text
 from twin.main_job.monitor_reading import MonitorReading
 from twin.main_job.render_job import render_job
@@ -282,7 +282,7 @@ class InstrumentTwin:
         InputError
             The materials have no data for a temperature.
         """
-        return self._bench.experiment.state(self.resolved.job)
+        return job_state_in_focus(self._bench.experiment, self.resolved.job)
 
     @property
     def perturbed_by(self) -> str:

@@ -35,7 +35,8 @@ def main(
     file: Annotated[Path, typer.Argument(readable=False, help="YAML file of the study, or the config.yaml of one.")],
     options: cli.Options,
     out: Annotated[
-        Path | None, typer.Option(readable=False, help="Folder of the study. Default: runs/STUDY-001, -002, ...")
+        Path | None,
+        typer.Option(metavar="DIR", readable=False, help="Folder of the study. Default: runs/STUDY-001, -002, ..."),
     ] = None,
     workers: cli.Workers = None,
     scheduler: Annotated[

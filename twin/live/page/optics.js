@@ -153,10 +153,15 @@ export class Optics {
     }));
     pen.fillStyle = this.colour.ink;
     pen.textAlign = 'center';
+    const taken = []; // names stand clear of each other, above and below by turns
     for (const { name, passes, points } of told.surfaces) {
       this.line(pen, points.map(at), passes ? this.colour.soft : this.colour.ink, passes ? 1 : 2.5, passes ? [1, 2] : []);
-      const top = at(points.reduce((a, b) => (b[1] > a[1] ? b : a)));
-      pen.fillText(name, top[0], top[1] - 4);
+      const half = pen.measureText(name).width / 2 + 2;
+      let row = 0;
+      const end = () => at(points.reduce((a, b) => (b[1] > a[1] === (row % 2 === 0) ? b : a)));
+      while (taken.some(([x, size, used]) => used === row && Math.abs(x - end()[0]) < size + half)) row += 1;
+      taken.push([end()[0], half, row]);
+      pen.fillText(name, end()[0], end()[1] + (row % 2 ? 12 : -4) + (row % 2 ? 13 : -13) * Math.floor(row / 2));
     }
   }
 }

@@ -569,6 +569,19 @@ def _of_jump(jump: DetectedJump) -> Alarm:
     return Alarm(JUMP, jump.body, jump.until_us, f"{jump.body} jumped {jump.summary}{rivals}", content)
 
 
+def with_current_interval(alarm: Row, jumps: Sequence[DetectedJump]) -> Row:
+    """Return an alarm of the record with the interval and size of its jump as all readings determine them now.
+
+    The record keeps the text of the reading that raised the alarm; a detected jump is that of the alarm if the times
+    in which both may have occurred overlap.
+    """
+    if alarm["kind"] != JUMP:
+        return alarm
+    began, ended = alarm["content"]["after_us"], alarm["content"]["until_us"]
+    now = (j for j in jumps if j.body == alarm["subject"] and j.after_us < ended and began < j.until_us)
+    return next(({**alarm, "text": _of_jump(jump).text} for jump in now), alarm)
+
+
 def with_sigma(value: float, sigma: float, unit: str, sign: bool = False) -> str:
     """Return a value with its standard deviation (to two digits) and unit as text, with a plus sign on request."""
     decimals = decimals_for(sigma)

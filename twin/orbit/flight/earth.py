@@ -155,6 +155,8 @@ def celestial_pole(epoch: str, first: float, last: float) -> CubicSpline:
 
 
 _WGS84 = pyproj.Geod(ellps="WGS84")
+GM = 3.986004415e14
+"""Gravitational parameter of the Earth, in m^3/s^2 (EGM96)."""
 EQUATORIAL_RADIUS = float(_WGS84.a)
 """Semi-major axis of the WGS84 ellipsoid, in metres."""
 FLATTENING = float(_WGS84.f)

@@ -17,13 +17,11 @@ from scipy.integrate import solve_ivp
 
 from optics.numerics.array_math import UnphysicalError, in_span
 from optics.numerics.extension_table import ExtensionTable
-from twin.orbit.flight.earth import DAY, EQUATORIAL_RADIUS, FLATTENING, Earth, EarthRotation, ut1_of
+from twin.orbit.flight.earth import DAY, EQUATORIAL_RADIUS, FLATTENING, GM, Earth, EarthRotation, ut1_of
 
 if TYPE_CHECKING:
     from scenes.specs.orbit.flight import ElementsSpec, OrbitSpec, PassingSpec
 
-GM = 3.986004415e14
-"""Gravitational parameter of the Earth, in m^3/s^2 (EGM96)."""
 J2 = 1.0826266835e-3
 """Second zonal coefficient of the gravity field (EGM96): -sqrt(5) times the normalised C20, -484.165371736e-6."""
 FIELD_RADIUS = 6378136.3

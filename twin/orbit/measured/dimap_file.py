@@ -36,6 +36,7 @@ from analysis.arrays import Array
 from optics.numerics.array_math import in_span
 from optics.numerics.number_tree import FrozenMap
 from scenes.yaml.errors import InputError, Issue, names_text, shown
+from twin.orbit.flight.earth import GM
 from twin.orbit.flight.platform_table import continuous_quaternions
 from twin.orbit.flight.sensor import earth_rotation_velocity
 from twin.orbit.measured import orbit_files
@@ -197,8 +198,9 @@ class DimapPass:
                 raise InputError(Issue(problem, self.file, None, ("Ephemeris",), found, allowed))
             other, index = (1, 0) if end == 0 else (-2, len(time))
             rate = (velocity[end] - velocity[other]) / (time[end] - time[other])
-            # Velocities a few milliseconds apart are too noisy for an acceleration.
-            rate = rate if abs(time[end] - time[other]) > 0.5 else -_GRAVITY * position[end] / _norm(position[end]) ** 3
+            # Velocities a few milliseconds apart are too noisy for an acceleration. That relative to the rotating Earth
+            # differs by a seventh from gravity: `_NEAR` seconds beyond the end, 6 mm.
+            rate = rate if abs(time[end] - time[other]) > 0.5 else -GM * position[end] / _norm(position[end]) ** 3
             position = np.insert(position, index, position[end] + velocity[end] * step + 0.5 * rate * step**2, axis=0)
             velocity = np.insert(velocity, index, velocity[end] + rate * step, axis=0)
             time = np.insert(time, index, at)
@@ -237,14 +239,6 @@ class DimapPass:
     def _since(self, clock: Readings) -> Array:
         """Return the times of clock readings in seconds from the first line, (N,) for N readings."""
         return np.asarray((clock.day - self.first_line.day[0]) * _DAY + clock.second - self.first_line.second[0])
-
-
-_GRAVITY = 3.986004418e14
-"""Gravitational parameter of the Earth, in m^3/s^2.
-
-The acceleration relative to the rotating Earth differs by a seventh from that of gravity; neglecting this displaces an
-orbit that is extrapolated by `_NEAR` seconds by 6 mm.
-"""
 
 
 def _norm(vector: Array) -> float:

@@ -88,6 +88,10 @@ def jitter(series: Series, seed: int) -> np.ndarray:
     return np.zeros(len(series.values))
 
 
+MOST_LEVELS = 12
+"""Largest number of values of a factor whose runs are averaged value by value."""
+
+
 def bins(factor: Factor, good: np.ndarray) -> Iterator[np.ndarray]:
     """Yield the runs of a numeric factor in groups, for means over neighbouring values.
 
@@ -95,7 +99,7 @@ def bins(factor: Factor, good: np.ndarray) -> Iterator[np.ndarray]:
     values.
     """
     levels = np.unique(factor.values[good])
-    if len(levels) <= 12:
+    if len(levels) <= MOST_LEVELS:
         for level in levels:
             yield np.flatnonzero(good & (factor.values == level))
         return
@@ -193,7 +197,7 @@ def curve_figure(analysis: StudyAnalysis, response: Response) -> Figure:
         if not factor.numeric:
             _bars(axes, factor, other, response)
         elif analysis.runs.sampled:
-            _binned(axes, factor, response)
+            _fitted(axes, factor, response)
         else:
             _lines(axes, factor, other, response)
         axes.set_xlabel(factor.label)
@@ -212,21 +216,51 @@ def _partner(factor: Factor, factors: Sequence[Factor]) -> Factor | None:
     return next((f for f in factors if f is not factor and len(f.levels) > 1), None)
 
 
-def _binned(axes: Axes, factor: Factor, response: Response) -> None:
-    """Plot runs, means of neighbouring runs with their intervals, and the middle 68 % of the runs."""
+def _fitted(axes: Axes, factor: Factor, response: Response) -> None:
+    """Plot runs and the curve of their mean with its band of one standard deviation, from the first run to the last."""
     shown = thinned(response.good)
-    size = dot_size(len(shown))
-    axes.plot(factor.values[shown], response.values[shown], ".", color=GREY, ms=size, alpha=0.7, zorder=1)
+    axes.plot(
+        factor.values[shown], response.values[shown], ".", color=GREY, ms=dot_size(len(shown)), alpha=0.7, zorder=1
+    )
     groups = list(bins(factor, response.good))
     if len(groups) < 2 or min(len(group) for group in groups) < 3:
         return
-    x = np.array([factor.values[group].mean() for group in groups])
-    parts = [response.values[group] for group in groups]
-    low, high = np.array([np.quantile(part, (0.1587, 0.8413)) for part in parts]).T
-    mean = np.array([part.mean() for part in parts])
-    axes.fill_between(x, low, high, color=SKY, alpha=0.35, lw=0, label="middle 68%")
-    style: dict[str, Any] = {"fmt": "o-", "color": BLUE, "ms": 3, "lw": 1.2, "capsize": 2, "label": "mean, 95%"}
-    svg.interval_bars(axes, x, mean, [mean_interval(part) for part in parts], **style)
+    x = np.unique(factor.values[response.good])
+    if len(x) > MOST_LEVELS:
+        x = np.linspace(x[0], x[-1], _CURVE_POINTS)
+        mean, spread = local_fit(factor.values[response.good], response.values[response.good], x)
+        axes.plot(x, mean, color=BLUE, lw=1.4, label="mean")
+    else:
+        parts = [response.values[group] for group in groups]
+        mean, spread = np.array([(part.mean(), part.std()) for part in parts]).T
+        style: dict[str, Any] = {"fmt": "o-", "color": BLUE, "ms": 3, "lw": 1.2, "capsize": 2, "label": "mean, 95%"}
+        svg.interval_bars(axes, x, mean, [mean_interval(part) for part in parts], **style)
+    axes.fill_between(x, mean - spread, mean + spread, color=SKY, alpha=0.35, lw=0, label="± 1 standard deviation")
+
+
+_CURVE_POINTS = 81
+"""Points of the curve of a mean."""
+_NEIGHBOURS = 0.3
+"""Share of the runs that a local fit uses, those nearest to a point; at least ten."""
+
+
+def local_fit(x: np.ndarray, y: np.ndarray, at: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the local mean of y, (N,), over x, (N,), and the standard deviation about it, at M places ``at``, (M,).
+
+    The mean is the value of a parabola fitted to the nearest runs with tricube weights (Cleveland, J. Am. Stat. Assoc.
+    74, 829, 1979): unlike means of neighbours it follows slopes and curvature up to both ends.
+    """
+    count = min(len(x), max(10, round(_NEIGHBOURS * len(x))))
+    mean, spread = np.empty(len(at)), np.empty(len(at))
+    for k, place in enumerate(at):
+        near = np.argpartition(np.abs(x - place), count - 1)[:count]
+        away = x[near] - place
+        weight = (1.0 - np.minimum(np.abs(away) / (1.001 * np.max(np.abs(away)) or 1.0), 1.0) ** 3) ** 3
+        degree = min(2, len(np.unique(away)) - 1)
+        rows = np.vander(away, degree + 1)
+        line = np.linalg.lstsq(rows * np.sqrt(weight)[:, None], y[near] * np.sqrt(weight), rcond=None)[0]
+        mean[k], spread[k] = line[-1], np.sqrt(np.average((y[near] - rows @ line) ** 2, weights=weight))
+    return mean, spread
 
 
 def _groups(other: Factor | None, response: Response) -> list[tuple[str, np.ndarray]]:

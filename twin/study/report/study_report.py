@@ -159,7 +159,10 @@ MOST_FRONT = 50
 
 def sections(analysis: StudyAnalysis) -> list[Section]:
     """Return all sections of the report that have contents, in the order of the page."""
-    makers = (_requirements, _distributions, _influences, _indices, _curves, _pairs, _fronts, _convergence)
+    several = sum(len(factor.levels) > 1 for factor in analysis.runs.factors) > 1
+    makers = [_requirements, _distributions, _influences, _indices, _curves, _pairs, _fronts, _convergence]
+    if not several:  # a study of one factor begins with the response to it
+        makers.insert(1, makers.pop(makers.index(_curves)))
     return [section for make in makers if (section := make(analysis)) is not None]
 
 
@@ -338,7 +341,8 @@ def _curves(analysis: StudyAnalysis) -> Section | None:
     figures = []
     if analysis.runs.sampled:
         caption = (
-            "Points: runs. Line: means of neighbouring runs with 95% intervals. Band: the middle 68% of these runs."
+            "Points: runs. Line: mean, by local parabolas; for few values, by value with 95% intervals. "
+            "Band: one standard deviation of the runs about it."
         )
     else:
         caption = "Means over all other factors; for a text with one standard deviation of the runs as whisker."

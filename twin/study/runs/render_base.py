@@ -25,6 +25,7 @@ from scenes.specs.resolved import ResolvedJob, resolve
 from scenes.yaml.errors import KeyPath
 from scenes.yaml.spec import Spec, validate
 from scenes.yaml.yaml_file import YamlFile
+from twin.camera.refocus import job_state_in_focus
 from twin.main_job.render_results import JobRun, RenderRun
 from twin.monitor.image_quality import QUALITY, quality_dicts
 from twin.monitor.monitor_experiment import MonitorExperiment, pieces
@@ -195,7 +196,7 @@ class RenderBase:
                 name, experiment = shared or self._experiment(resolved, backend)
                 job = checked_nodes(resolved.job, experiment.instrument.nodes)
                 resolved = resolved.with_job(job)
-                state = experiment.state(resolved.job)
+                state = job_state_in_focus(experiment, resolved.job)
             except PHYSICS as error:
                 out[k] = Failure(one_line(error))
                 continue
