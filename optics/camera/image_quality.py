@@ -9,6 +9,8 @@ Rays through a camera: launched at points of its stop, traced to its image plane
 A field is a pair of angles (x, y) in radians: its light travels along (tan x, tan y, 1).
 """
 
+from __future__ import annotations
+
 from collections.abc import Mapping
 from dataclasses import dataclass
 

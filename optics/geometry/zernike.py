@@ -3,6 +3,8 @@
 Annular Zernike polynomials: orthonormal over a ring, in Noll's order (Mahajan, J. Opt. Soc. Am. 71, 75, 1981).
 """
 
+from __future__ import annotations
+
 from collections.abc import Mapping, Sequence
 from functools import cache, lru_cache
 from math import comb, factorial, isqrt, sqrt

@@ -9,6 +9,8 @@ Manufacturers give indices relative to air of 20 C and 1013 hPa (``Glass.index``
 ``Glass.vacuum_index``.
 """
 
+from __future__ import annotations
+
 import csv
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass

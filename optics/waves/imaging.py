@@ -14,6 +14,8 @@ Wavefronts of a traced bundle: eikonal at the image point, optical path differen
 Numbers of a sampled point spread function, and the diffraction limit of round pupils with a central obscuration.
 """
 
+from __future__ import annotations
+
 from collections.abc import Callable
 from dataclasses import dataclass
 

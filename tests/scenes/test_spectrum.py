@@ -8,7 +8,7 @@ import pytest
 from scipy import constants
 from scipy.integrate import quad
 
-from optics.materials.glass import N_BK7
+from optics.materials.glass import GLASSES
 from optics.numerics.quadrature import gauss, gauss_of
 from scenes.models.camera_model import coloured, glass_indices
 from scenes.specs.camera import BandSpec, CameraSpec
@@ -103,17 +103,19 @@ def test_lines_are_all_taken() -> None:
 
 def test_the_index_of_a_named_glass() -> None:
     """Against air as makers state it, in vacuum times that of air; both at the design wavelength and others."""
-    for medium, index in (("air", N_BK7.index), ("vacuum", N_BK7.vacuum_index)):
+    for medium, index in (("air", GLASSES["N-BK7"].index), ("vacuum", GLASSES["N-BK7"].vacuum_index)):
         spec = colour_camera("achromat", medium=medium)
         assert glass_indices(spec)["L1"] == index(587.5618e-9)
         assert glass_indices(spec, 500e-9)["L1"] == index(500e-9)
         # Schott's data sheet of F2: 1.62004 at the d line, 1.63208 at F, in air
         assert glass_indices(spec)["L3"] == pytest.approx(
-            1.62004 * index(587.5618e-9) / N_BK7.index(587.5618e-9), abs=1e-5
+            1.62004 * index(587.5618e-9) / GLASSES["N-BK7"].index(587.5618e-9), abs=1e-5
         )
     state = coloured(spec, "camera", {}, 486.1327e-9)
     assert set(state) == {"camera/L1", "camera/L3"}
-    assert state["camera/L1"].index == pytest.approx(N_BK7.vacuum_index(486.1327e-9) - N_BK7.vacuum_index(587.5618e-9))
+    assert state["camera/L1"].index == pytest.approx(
+        GLASSES["N-BK7"].vacuum_index(486.1327e-9) - GLASSES["N-BK7"].vacuum_index(587.5618e-9)
+    )
     assert coloured(spec, "camera", state, spec.wavelength) is state
     again = validate(CameraSpec, parse_yaml(spec.file_text("")))
     assert again == spec

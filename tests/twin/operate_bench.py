@@ -82,7 +82,9 @@ def filled(place: Any, count: int = COUNT) -> History:
     history.ingest(given("events.csv", events if count > 100 else []))
     texts = (f"the height will break its requirement {EVIL}", "a jump of base/forward/M2")
     for k, (kind, text) in enumerate(zip(("requirements", "jump"), texts, strict=True)):
-        history.raise_alarm(Alarm(kind, "ground height_m", START + (20 - 7 * k) * DAY - 3 * HOUR, text))
+        time = START + (20 - 7 * k) * DAY - 3 * HOUR
+        span = {"after_us": time - HOUR, "until_us": time}
+        history.raise_alarm(Alarm(kind, "ground height_m", time, text, span))
     history.acknowledge(2, "A. Nurse", "seen in the images, too")
     return history
 

@@ -107,7 +107,7 @@ def test_a_record_is_exported_with_units(tmp_path: Path) -> None:
     assert [r["subject"] for r in rows["event"]] == ["safe_mode", "heater_set_point"]
     again = run("export", record, "--out", out)
     assert again.exit_code == 2
-    assert "exists already" in again.stderr
+    assert "exists; choose another" in again.stderr
     assert "did you mean 'parquet'" in run("export", record, "--tables", "parket", "--out", tmp_path / "x").stderr
 
 

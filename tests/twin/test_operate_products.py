@@ -610,6 +610,6 @@ def test_products_that_cannot_be_written_are_told(followed: Followed) -> None:
 def test_a_record_without_a_plan_says_how_to_keep_one(tmp_path: Path) -> None:
     made(tmp_path / "record").close()
     (tmp_path / "there").mkdir()
-    for out, words in (("products", "init RECORD gf7_pair --plan FILE"), ("there", "exists already")):
+    for out, words in (("products", "init RECORD gf7_pair --plan FILE"), ("there", "exists; choose another")):
         result = command(tmp_path / "record", "--time", "2026-03-03T00:00:00Z", "--out", tmp_path / out)
         assert (result.exit_code, words in result.stderr) == (2, True), result.stderr

@@ -13,7 +13,7 @@ from optics.geometry.aperture import Circle, Edge
 from optics.geometry.sag_terms import XYPolynomial, ZernikeSag
 from optics.geometry.surface import GridFigure, SummedFigure, Surface, ZernikeFigure
 from optics.geometry.tree import Motion
-from optics.materials.glass import N_BK7
+from optics.materials.glass import GLASSES
 from optics.raytrace.system import assemble
 from optics.raytrace.trace import make_rays, trace
 from scenes.lens.__main__ import app
@@ -119,7 +119,7 @@ def test_the_camera_file_is_read_and_traces_the_same(tmp_path: Path, backend) ->
 
 def test_a_lens_is_a_lens_either_way(tmp_path: Path, backend) -> None:
     """Focal length by the lensmaker's formula; backward rays come out along those that went in."""
-    n, c, t = N_BK7.index(587.5618e-9), 1.0 / 0.05, 0.004
+    n, c, t = GLASSES["N-BK7"].index(587.5618e-9), 1.0 / 0.05, 0.004
     power = (n - 1.0) * (2.0 * c - (n - 1.0) * t * c * c / n)
     focus = (1.0 - (n - 1.0) * t * c / n) / power
     f_number = SINGLET.replace("ENPD 10", "FNUM 20 0")
@@ -146,7 +146,7 @@ def test_glasses_come_along_with_their_dispersion(tmp_path: Path, backend) -> No
     front = camera_of(singlet(tmp_path), "singlet", backend, Width(pupil=1e-4)).camera
     assert front.medium == "air"
     assert front.plain()["mirrors"]["L1"]["glass"] == "N-BK7"
-    assert front.index_behind("L1", 500e-9) == N_BK7.index(500e-9)
+    assert front.index_behind("L1", 500e-9) == GLASSES["N-BK7"].index(500e-9)
     numbers = "1.34533359 0.00997743871 0.209073176 0.0470450767 0.937357162 111.886764"
     heat = "ED 8.2 9.2 3.6 0 0\nTD 1.51e-6 1.56e-8 -2.78e-11 9.34e-7 1.04e-9 0.25 20"
     agf.write_text(f"NM F2 2 0 1.62 36.37\nCD {numbers} 0 0 0 0\n{heat}\nLD 0.32 2.5\n", "utf-8")

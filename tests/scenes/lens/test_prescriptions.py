@@ -8,7 +8,7 @@ import pytest
 
 from optics.geometry.aperture import Circle, Rectangle
 from optics.geometry.surface import Surface, ZernikeFigure
-from optics.materials.glass import ABBE_LINES, N_BK7, common_glasses
+from optics.materials.glass import ABBE_LINES, GLASSES, common_glasses
 from optics.raytrace.assembly import Interaction
 from optics.raytrace.system import assemble
 from optics.raytrace.trace import make_rays, trace
@@ -219,12 +219,12 @@ def test_a_batoid_file(tmp_path: Path) -> None:
 def test_glasses(tmp_path: Path) -> None:
     glassy, old = read_catalogue(file(tmp_path, "two.agf", AGF))
     for wavelength in (0.4e-6, 0.5875618e-6, 1.0e-6):
-        assert glassy(wavelength) == pytest.approx(N_BK7.index(wavelength), rel=1e-14)
+        assert glassy(wavelength) == pytest.approx(GLASSES["N-BK7"].index(wavelength), rel=1e-14)
     # BK7 of Schott's catalogue of 1967, index at the d line
     assert old(0.5875618e-6) == pytest.approx(1.5168, abs=2e-5)
     known = read_catalogues([tmp_path / "two.agf"])
     assert known[glass_key("GLASSY_MAKER")](0.6e-6) == glassy(0.6e-6)
-    assert own_glasses()[glass_key("NBK7_SCHOTT")](0.6e-6) == N_BK7.index(0.6e-6)
+    assert own_glasses()[glass_key("NBK7_SCHOTT")](0.6e-6) == GLASSES["N-BK7"].index(0.6e-6)
     with pytest.raises(ValueError, match="outside the range"):
         old(2e-6)
 
@@ -232,7 +232,7 @@ def test_glasses(tmp_path: Path) -> None:
 def test_the_same_lens_in_glass(tmp_path: Path) -> None:
     lens = read_zemax(file(tmp_path, "singlet.zmx", SINGLET), own_glasses())
     assert [s.interaction for s in lens.surfaces[:2]] == [Interaction.REFRACT] * 2
-    assert lens.surfaces[0].index == N_BK7.index(587.5618e-9)
+    assert lens.surfaces[0].index == GLASSES["N-BK7"].index(587.5618e-9)
     assert lens.surfaces[1].index == 1.0
 
 
