@@ -135,6 +135,7 @@ def test_commands_of_the_wheel_run_beside_foreign_packages_of_their_names(instal
     files = [path for path in files if path.suffix[1:] in kept]
     assert len(files) > 400
     assert [path for path in files if not (own / path).is_file()] == []
+    assert run(installed, tmp_path, "python", "-m", f"{backend.PREFIX}.scenes.lens", "--help").returncode == 0
     folder_of_traps(tmp_path)
     job = own / "scenes/examples/perturb.yaml"
     done = run(installed, tmp_path, "camtwin", "render", job, "--out", "a", "--frames", "1")
@@ -147,7 +148,6 @@ def test_commands_of_the_wheel_run_beside_foreign_packages_of_their_names(instal
     study = ("study", own / "scenes/examples/study_smoke.yaml", "--workers", "1", "--yes", "--quiet", "--out", "s")
     done = run(installed, tmp_path, "camtwin", *study)
     assert done.returncode == 0, done.stdout + done.stderr
-    assert run(installed, tmp_path, "python", "-m", f"{backend.PREFIX}.scenes.lens", "--help").returncode == 0
     assert hits(tmp_path) == ""
     told = run(installed, tmp_path, "camtwin", "--version").stdout
     assert told == f"camtwin {version()} from {own}\n"

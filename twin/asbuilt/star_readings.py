@@ -117,7 +117,14 @@ class StarReading:
 
         first = np.array([*start, blur / unit] if free else start)
         found = least_squares(
-            lambda x: at(x)[0], first, lambda x: at(x)[1], method="lm", xtol=1e-5, ftol=1e-7, max_nfev=_STEPS
+            lambda x: at(x)[0],
+            first,
+            lambda x: at(x)[1],
+            method="lm",
+            xtol=1e-10,
+            ftol=1e-14,
+            gtol=1e-12,
+            max_nfev=_STEPS,
         ).x
         place = np.array([*found[:2], found[2] * unit if free else blur])
         share = self.image.pixels(irradiance, place[:2], place[2]) * weight
