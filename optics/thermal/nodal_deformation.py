@@ -28,7 +28,6 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from scipy.spatial import Delaunay, QhullError, cKDTree
 
 from optics.geometry import zernike
 from optics.geometry.aperture import Aperture
@@ -443,6 +442,8 @@ class _Interpolator:
     """
 
     def __init__(self, nodes: np.ndarray, values: np.ndarray) -> None:
+        from scipy.spatial import Delaunay, cKDTree
+
         moved = nodes + _JITTER * np.random.default_rng(len(nodes)).uniform(-1.0, 1.0, nodes.shape)
         self.cells = Delaunay(moved)
         self._values, self._tree = values, cKDTree(moved)
@@ -521,6 +522,8 @@ class NodalTemperature:
         NodesError
             There are too few nodes, or too many.
         """
+        from scipy.spatial import cKDTree
+
         nodes, temperatures = np.asarray(points, np.float64), np.asarray(values, np.float64)
         if nodes.ndim != 2 or nodes.shape[1] != 3 or temperatures.shape != nodes.shape[:1]:
             raise ValueError(
@@ -551,7 +554,7 @@ class NodalTemperature:
         if not self.flat:
             try:
                 self._inside = _Interpolator(scaled, self._deviations)
-            except QhullError:
+            except RuntimeError:  # QhullError
                 self.flat = True
                 return
             corners = scaled[self._inside.cells.simplices]
@@ -629,7 +632,7 @@ class NodalTemperature:
                 try:
                     predicted = _Interpolator(scaled[~excluded], self._deviations[~excluded])(scaled[excluded])
                     errors = (predicted - self._deviations[excluded])[np.isfinite(predicted)]
-                except QhullError:
+                except RuntimeError:  # QhullError
                     errors = self._deviations[excluded]
             self._leave_out_error = float(np.sqrt(np.mean(errors**2))) if len(errors) else 0.0
         return self._leave_out_error
