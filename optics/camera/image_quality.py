@@ -20,10 +20,10 @@ from numpy.typing import ArrayLike
 from optics.camera.prescription import Camera
 from optics.geometry import zernike
 from optics.geometry.polygon import covered
-from optics.numerics.array_math import PhysicalError, UnphysicalError, norm
+from optics.numerics.array_math import PhysicalError, UnphysicalError
 from optics.numerics.backend import default_backend
 from optics.numerics.quadrature import PupilNodes, disk, disk_size, nodes_for
-from optics.raytrace.aim import AimError
+from optics.raytrace.aim import AimError, direction_of
 from optics.raytrace.first_order import first_order
 from optics.raytrace.trace import make_rays
 from optics.raytrace.trace import trace as trace_systems
@@ -83,26 +83,6 @@ class TracedRays:
     valid: np.ndarray
     reached: np.ndarray
     hits: np.ndarray
-
-
-def direction_of(field: Field) -> np.ndarray:
-    """Return the unit vector (3,) along the light of a far point.
-
-    Parameters
-    ----------
-    field : (float, float)
-        Angles x and y of the light from the axis, radians.
-
-    Raises
-    ------
-    ValueError
-        The field is not a pair of angles within pi/2.
-    """
-    angles = np.asarray(field, float)
-    if angles.shape != (2,) or not np.all(np.abs(angles) < 0.5 * np.pi):
-        raise ValueError(f"field must be two angles (x, y) in radians between -pi/2 and pi/2, got {field}")
-    vector = np.array([np.tan(angles[0]), np.tan(angles[1]), 1.0])
-    return np.asarray(vector / norm(vector))
 
 
 def launch_rays(camera: Camera, field: Field = (0.0, 0.0), pupil: ArrayLike | None = None) -> tuple[np.ndarray, ...]:

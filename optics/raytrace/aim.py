@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from optics.geometry.tree import State
-from optics.numerics.array_math import PhysicalError, solve_pairs
+from optics.numerics.array_math import PhysicalError, norm, solve_pairs
 from optics.numerics.backend import Backend
 from optics.raytrace.assembly import Assembly, Element
 from optics.raytrace.system import SystemBatch, assemble
@@ -240,3 +240,23 @@ def surviving_rays(
     for count in range(1, len(names) + 1):
         traced = trace(backend, assemble(assembly, [names[:count]], [state or {}]), rays)
         yield assembly.elements[names[count - 1]], traced.numpy()[3][0]
+
+
+def direction_of(field: tuple[float, float]) -> np.ndarray:
+    """Return the unit vector (3,) along the light of a far point.
+
+    Parameters
+    ----------
+    field : (float, float)
+        Angles x and y of the light from the axis, radians.
+
+    Raises
+    ------
+    ValueError
+        The field is not a pair of angles within pi/2.
+    """
+    angles = np.asarray(field, float)
+    if angles.shape != (2,) or not np.all(np.abs(angles) < 0.5 * np.pi):
+        raise ValueError(f"field must be two angles (x, y) in radians between -pi/2 and pi/2, got {field}")
+    vector = np.array([np.tan(angles[0]), np.tan(angles[1]), 1.0])
+    return np.asarray(vector / norm(vector))

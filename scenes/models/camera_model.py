@@ -22,7 +22,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from optics.camera.image_quality import direction_of
 from optics.geometry.aperture import Aperture, Circle, Edge, Ellipse, Rectangle, outer_edge
 from optics.geometry.pose import Pose, about_axis, rotation_matrix
 from optics.geometry.surface import Surface, plane
@@ -32,7 +31,7 @@ from optics.numerics.array_math import PhysicalError, matvec
 from optics.numerics.backend import Backend
 from optics.numerics.number_tree import FrozenMap
 from optics.numerics.quadrature import circle
-from optics.raytrace.aim import AimError, transverse_axes
+from optics.raytrace.aim import AimError, direction_of, transverse_axes
 from optics.raytrace.assembly import Assembly, Element, Interaction
 from optics.raytrace.first_order import (
     FirstOrder,
