@@ -331,6 +331,7 @@ def test_the_example_runs_from_the_command_line(tmp_path: Path):
         assert text in status
     assert "focus of ritchey_chretien" in command("forecast", record)
     assert "report" in command("report", record, "--out", tmp_path / "day.html")
+    assert "Temperatures explain" not in (tmp_path / "day.html").read_text("utf-8")
     assert "excluded" in command("exclude", record, "1", "--why", "entered twice")
 
 

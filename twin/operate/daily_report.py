@@ -407,9 +407,12 @@ def _prediction_section(overview: Overview) -> Section:
 
 
 def _explained_sentence(overview: Overview) -> str:
-    """Return the sentence on the share of the quantities' scatter that measured temperatures explain, or ""."""
+    """Return the sentence on the share of the quantities' scatter that measured temperatures explain, or "".
+
+    Readings of focus have none: their temperatures are inputs of the plan's terms.
+    """
     known = {name: share for name, share in overview.filter_result.explained.items() if math.isfinite(share)}
-    if not known:
+    if not known or overview.operation.reading_kind == "focus":
         return ""
     any_of_them = not overview.filter_result.requirements
     parts = [
