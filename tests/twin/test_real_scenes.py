@@ -7,7 +7,6 @@ project: SPOT6.XML of SaifAati/Geospatial-COSICorr3D (tests/test_dataset), a PlÃ
 
 import os
 import re
-import xml.etree.ElementTree as ET
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +15,7 @@ import pytest
 from twin.orbit.export.quality_run import compare_product
 from twin.orbit.export.rational_polynomial import sensor_polynomial
 from twin.orbit.measured.platform_files import read_scene
+from twin.orbit.measured.xml_file import read_xml
 from twin.validation.real.scenes import delivered_form, ground_segment_polynomials
 
 REAL = Path(os.environ.get("TWIN_REAL", Path(__file__).parents[3] / "shared" / "real"))
@@ -49,7 +49,7 @@ def test_a_pleiades_scene_meets_its_own_polynomials(tmp_path: Path) -> None:
     """The ground segment's numbers in the elements of DIMAP 2: velocities are against the stars, and polynomials hold
     from 160 to 240 m."""
     folder = REAL / "pleiades"
-    root = ET.parse(next(folder.glob("PHRDIMAP*.XML"))).getroot()
+    root = read_xml(next(folder.glob("PHRDIMAP*.XML")), "a scene")
     path = tmp_path / "DIM_SCENE.XML"
     path.write_text(delivered_form(root))
     scene = read_scene(path)
