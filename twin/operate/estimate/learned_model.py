@@ -22,7 +22,7 @@ from scenes.specs.operation import OperationSpec, TermSpec, motion_kind
 from scenes.yaml.errors import Problem, names_text, nearest
 from scenes.yaml.units import parse_quantity
 from twin.framework.artefact import decimals_for, fixed
-from twin.operate.record.entries import DECISION, MICRO, micros, utc_text
+from twin.operate.record.entries import MICRO, micros, utc_text
 from twin.operate.record.history import History, content_of
 
 MOVE, INPUT = "move", "input"
@@ -82,9 +82,8 @@ def terms_of(plan: OperationSpec, prior: Disturbances, history: History, epoch: 
 
 def moves_of(history: History) -> list[dict[str, Any]]:
     """Return the entries of the commanded moves that were not excluded, in the order of time."""
-    decisions = [content_of(entry) for entry in history.entries(DECISION)]
-    excluded = {int(decision["entry"]): not decision["included"] for decision in decisions}
-    return [entry for entry in history.entries(MOVE) if not excluded.get(entry["id"], False)]
+    decisions = history.decisions()
+    return [entry for entry in history.entries(MOVE) if decisions.get(entry["id"], (True, ""))[0]]
 
 
 def _motion(name: str, prior: Disturbances) -> tuple[int, float]:

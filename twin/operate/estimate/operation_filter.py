@@ -49,7 +49,7 @@ from twin.operate.estimate.reported_estimate import (
     SensorState,
     inflation_factors,
 )
-from twin.operate.record.entries import DECISION, MICRO, digest_of_data, utc_text
+from twin.operate.record.entries import MICRO, digest_of_data, utc_text
 from twin.operate.record.history import USED, History, content_of
 
 DAY = 86_400 * MICRO
@@ -221,9 +221,8 @@ class Operation:
 
     @cached_property
     def _decisions(self) -> dict[int, tuple[bool, str]]:
-        """Decisions of persons about entries, by the entry's id: whether it is used, and why."""
-        decisions = (content_of(entry) for entry in self.history.entries(DECISION))
-        return {int(decision["entry"]): (bool(decision["included"]), str(decision["why"])) for decision in decisions}
+        """Decisions of persons about entries, read once."""
+        return self.history.decisions()
 
     @cached_property
     def estimator_state(self) -> EstimatorState:

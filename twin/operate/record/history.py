@@ -332,6 +332,11 @@ class History:
         with self.reading() as connection:
             return _subjects(connection, kind)
 
+    def decisions(self) -> dict[int, tuple[bool, str]]:
+        """Return the newest decision of a person about each entry, by the entry's id: whether it is used, and why."""
+        contents = (content_of(entry) for entry in self.entries(DECISION))
+        return {int(decision["entry"]): (bool(decision["included"]), str(decision["why"])) for decision in contents}
+
     def newest_id(self) -> int:
         """Return the largest id of an entry; 0 if there is none."""
         with self.reading() as connection:
