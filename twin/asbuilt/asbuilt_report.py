@@ -10,7 +10,6 @@ from matplotlib.figure import Figure
 from optics.numerics.number_tree import FrozenMap
 from twin.asbuilt.asbuilt_run import ALONG, AsBuiltRun, MeritPrediction, motions, moves_plain, responses
 from twin.asbuilt.built_instrument import CORRELATION, POSTERIOR, instrument_text, posterior_files
-from twin.asbuilt.star_readings import FWHM
 from twin.framework.artefact import (
     CameraFile,
     Cell,
@@ -287,9 +286,9 @@ def _image_sections(run: AsBuiltRun) -> tuple[Section, ...]:
             *image.field,
             image.fit.flux,
             image.fit.background,
-            FWHM * image.fit.blur / image.star.image.pitch,
+            image.seeing_px,
             100.0 * image.outside,
-            image.test.chi_square / max(1, image.test.degrees),
+            image.chi_square_per_degree,
             image.test.p_value,
         ]
         for image in run.images

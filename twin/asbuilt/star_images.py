@@ -258,9 +258,18 @@ class StarResidual:
         """Share of the star's light outside its cut-out."""
         return 1.0 - float(np.sum(self.fit.model - self.fit.background)) / self.fit.flux
 
+    @property
+    def seeing_px(self) -> float:
+        """Full width at half maximum of the blur, pixels."""
+        return FWHM * self.fit.blur / self.star.image.pitch
+
+    @property
+    def chi_square_per_degree(self) -> float:
+        """Chi-square of the image per degree of freedom."""
+        return self.test.chi_square / max(1, self.test.degrees)
+
     def plain(self) -> dict[str, Any]:
         """Return the numbers of the star as plain data."""
-        blur = FWHM * self.fit.blur / self.star.image.pitch
         return {
             "measurement": self.measurement,
             "field": list(self.field),
@@ -268,7 +277,7 @@ class StarResidual:
             "column_px": float(self.fit.position[1]),
             "flux_e": self.fit.flux,
             "background_e": self.fit.background,
-            "seeing_px": blur,
+            "seeing_px": self.seeing_px,
             "outside": self.outside,
             "chi_square": self.test.chi_square,
             "degrees": self.test.degrees,
@@ -278,8 +287,8 @@ class StarResidual:
         """Return warnings on a star that fits badly, is cut or is saturated."""
         out, name = [], f"{self.measurement}: the star at {field_text(self.field)}"
         if not self.test.passes():
-            ratio = self.test.chi_square / max(1, self.test.degrees)
-            out.append(f"{name} does not have the predicted image: chi-square {ratio:.2f} per degree of freedom")
+            ratio = f"chi-square {self.chi_square_per_degree:.2f} per degree of freedom"
+            out.append(f"{name} does not have the predicted image: {ratio}")
         light = centroid(np.maximum(self.fit.model - self.fit.background, 0.0))
         if self.outside > CUT:
             out.append(f"{name} has {100 * self.outside:.0f} % of its light outside its cut-out: use larger cut-outs")
