@@ -5,8 +5,9 @@ test is imported on first use: help and messages about files do not wait for num
 wait for plotting modules.
 """
 
+import csv
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -35,8 +36,8 @@ class Procedure:
         Function from the result to the plain data of KIND.json, whose keys end in their unit.
     report : callable
         Function from the result to a `twin.framework.report.Report`.
-    measured : type, tuple of types, or None
-        Classes of the tests on measurements, chosen by the keys of the file; None if there is none.
+    measured : tuple of types
+        Classes of the tests on measurements, chosen by the keys of the file.
     export : callable or None
         Function from the result to paths and contents of files with the measured data, for the option ``--export``;
         None if there is none.
@@ -61,7 +62,7 @@ class Procedure:
     run: Any
     numbers: Any
     report: Any
-    measured: Any = None
+    measured: tuple[Any, ...] = ()
     export: Any = None
     files: tuple[FileKind, ...] = ()
     varied: bool = False
@@ -97,7 +98,7 @@ class Procedure:
         InputError
             A file cannot be read or is not valid, or the files do not fit together.
         """
-        for source in (self.measured,) if isinstance(self.measured, str) else self.measured or ():
+        for source in self.measured:
             measured = Named(source).get()
             if measured.measured_by(Named("scenes.specs.resolved:test_keys")(path)):
                 return measured.read(path)
@@ -121,186 +122,20 @@ SENSORS = ("ties", "control", "monitor", "laser", "terrain", "tracker_angles")
 """Sensors that the adjustment of a block can exclude; the command's help lists them."""
 
 
-def _with_help(tests: Mapping[str, Procedure]) -> dict[str, Procedure]:
-    """Return the tests with the texts of ``--help``, each a section of the file beside this module."""
+def _built_in() -> dict[str, Procedure]:
+    """Return the tests of the table beside this module, with the texts of ``--help`` from the file of that name."""
     text = Path(__file__).with_suffix(".md").read_text("utf-8")
     about = dict(section.split("\n", 1) for section in text.split("\n## ")[1:])
-    return {name: replace(test, about=about.get(name, "").strip()) for name, test in tests.items()}
+    tests = {}
+    with Path(__file__).with_suffix(".csv").open(encoding="utf-8", newline="") as rows:
+        for row in csv.DictReader(rows):
+            name = row.pop("command")
+            values: dict[str, Any] = {**row, "export": row["export"] or None, "about": about.get(name, "").strip()}
+            values |= {key: tuple(row[key].split()) for key in ("measured", "options")}
+            values |= {key: row[key] == "yes" for key in ("varied", "judged", "seeded")}
+            tests[name] = Procedure(**values)
+    return tests
 
 
-_PROCEDURES: dict[str, Procedure] = {
-    "lab focus": Procedure(
-        "focus",
-        setup="scenes.specs.resolved:FocusSetup",
-        measured="scenes.specs.resolved:MeasuredFocusSetup",
-        run="twin.laboratory.focus_run:run_focus",
-        numbers="twin.laboratory.focus_run:focus_numbers",
-        report="twin.laboratory.focus_report:focus_report",
-        export="twin.laboratory.export:export_focus",
-        varied=True,
-    ),
-    "lab distortion": Procedure(
-        "distortion",
-        setup="scenes.specs.resolved:DistortionSetup",
-        measured="scenes.specs.resolved:MeasuredDistortionSetup",
-        run="twin.laboratory.distortion_run:run_distortion",
-        numbers="twin.laboratory.distortion_run:DISTORTION",
-        report="twin.laboratory.distortion_report:distortion_report",
-        export="twin.laboratory.export:export_distortion",
-        varied=True,
-    ),
-    "lab turntable": Procedure(
-        "turntable",
-        setup="scenes.specs.resolved:TurntableSetup",
-        measured="scenes.specs.resolved:MeasuredTurntableSetup",
-        run="twin.laboratory.turntable_run:run_turntable_test",
-        numbers="twin.laboratory.turntable_run:TURNTABLE",
-        report="twin.laboratory.turntable_report:turntable_report",
-        export="twin.laboratory.export:export_turntable",
-        varied=True,
-    ),
-    "orbit adjust": Procedure(
-        "block",
-        setup="scenes.specs.orbit.setup:AdjustSetup",
-        measured=("scenes.specs.orbit.setup:MeasuredAdjustSetup", "scenes.specs.orbit.setup:RationalAdjustSetup"),
-        run="twin.operate.operated_block:run_operated_block",
-        numbers="twin.orbit.block.block_numbers:BLOCK",
-        report="twin.orbit.block.block_report:block_report",
-        export="twin.orbit.block.block_files:exported",
-        varied=True,
-    ),
-    "orbit angle": Procedure(
-        "angle",
-        setup="scenes.specs.orbit.setup:AngleSetup",
-        measured="scenes.specs.orbit.setup:MeasuredAngleSetup",
-        run="twin.orbit.angle.measured_angle:run_angle_test",
-        numbers="twin.orbit.angle.angle_run:angle_numbers",
-        report="twin.orbit.angle.angle_report:angle_report",
-        export="twin.orbit.angle.measured_angle:angle_exported",
-        varied=True,
-    ),
-    "orbit calibrate": Procedure(
-        "calibration",
-        setup="scenes.specs.orbit.setup:CalibrationSetup",
-        measured="scenes.specs.orbit.setup:MeasuredCalibrationSetup",
-        run="twin.orbit.calibration.calibration_run:run_calibration",
-        numbers="twin.orbit.calibration.calibration_numbers:CALIBRATION",
-        report="twin.orbit.calibration.calibration_report:calibration_report",
-        export="twin.orbit.calibration.calibration_run:exported",
-        varied=True,
-    ),
-    "orbit check": Procedure(
-        "check",
-        setup="scenes.specs.orbit.setup:CheckSetup",
-        run="twin.orbit.conventions.check_run:run_check",
-        numbers="twin.orbit.conventions.check_report:CHECK",
-        report="twin.orbit.conventions.check_report:check_report",
-        export="twin.orbit.conventions.check_run:exported",
-        judged=False,
-        seeded=False,
-    ),
-    "orbit jitter": Procedure(
-        "jitter",
-        setup="scenes.specs.orbit.setup:JitterSetup",
-        measured="scenes.specs.orbit.setup:MeasuredJitterSetup",
-        run="twin.orbit.jitter.jitter_run:run_jitter",
-        numbers="twin.orbit.jitter.jitter_run:JITTER",
-        report="twin.orbit.jitter.jitter_report:jitter_report",
-        export="twin.orbit.jitter.jitter_run:exported",
-        varied=True,
-        judged=False,
-    ),
-    "orbit match": Procedure(
-        "match",
-        setup="scenes.specs.orbit.setup:MatchSetup",
-        measured=("scenes.specs.orbit.setup:RationalMatchSetup",),
-        run="twin.orbit.matching.match_run:run_match",
-        numbers="twin.orbit.matching.match_run:match_numbers",
-        report="twin.orbit.matching.match_report:match_report",
-        export="twin.orbit.matching.match_run:exported",
-        judged=False,
-        seeded=False,
-    ),
-    "orbit monitor": Procedure(
-        "monitor",
-        setup="scenes.specs.orbit.setup:MonitorSetup",
-        run="twin.orbit.monitoring.monitoring_run:run_monitor",
-        numbers="twin.orbit.monitoring.monitoring_numbers:monitor_numbers",
-        report="twin.orbit.monitoring.monitoring_report:monitor_report",
-        varied=True,
-    ),
-    "orbit simulate": Procedure(
-        "simulate",
-        setup="scenes.specs.orbit.setup:SimulateSetup",
-        run="twin.orbit.images.simulate_run:run_simulation",
-        numbers="twin.orbit.images.simulate_run:SIMULATE",
-        report="twin.orbit.images.simulate_report:simulation_report",
-        export="twin.orbit.images.simulate_run:simulation_exported",
-    ),
-    "design camera": Procedure(
-        "design",
-        setup="scenes.models.camera_design:CameraDesignSetup",
-        run="twin.design.design_run:run_design",
-        numbers="twin.design.design_run:DESIGN",
-        report="twin.design.design_report:design_report",
-        judged=False,
-    ),
-    "design monitor": Procedure(
-        "layouts",
-        setup="scenes.models.monitor_layout:MonitorDesignSetup",
-        run="twin.design.monitor_design:run_monitor_design",
-        numbers="twin.design.monitor_design:LAYOUTS",
-        report="twin.design.monitor_report:monitor_design_report",
-        judged=False,
-    ),
-    "asbuilt estimate": Procedure(
-        "asbuilt",
-        setup="scenes.specs.asbuilt:AsBuiltSetup",
-        run="twin.asbuilt.asbuilt_run:run_asbuilt",
-        numbers="twin.asbuilt.asbuilt_run:ASBUILT",
-        report="twin.asbuilt.asbuilt_report:asbuilt_report",
-    ),
-    "asbuilt check": Procedure(
-        "orientation",
-        setup="scenes.specs.asbuilt:AsBuiltSetup",
-        run="twin.asbuilt.orientation_check:run_check",
-        numbers="twin.asbuilt.orientation_check:ORIENTATION",
-        report="twin.asbuilt.orientation_check:check_report",
-        judged=False,
-    ),
-    "camera": Procedure(
-        "optics",
-        setup="scenes.specs.resolved:resolve_camera",
-        run="twin.camera.camera_run:run_camera",
-        numbers="twin.camera.camera_run:CAMERA",
-        report="twin.camera.camera_report:camera_report",
-        options=("refocus", "tilt"),
-    ),
-    "recover": Procedure(
-        "recovered",
-        setup="scenes.specs.monitor_frames:MeasurementSetup",
-        run="twin.recover.recover_run:run_recover",
-        numbers="twin.recover.recover_run:recover_numbers",
-        report="twin.recover.recover_report:recover_report",
-        judged=False,
-    ),
-    "tolerance": Procedure(
-        "tolerance",
-        setup="scenes.specs.tolerance:ToleranceSetup",
-        run="twin.tolerance.tolerance_run:run_tolerance",
-        numbers="twin.tolerance.tolerance_run:TOLERANCE",
-        report="twin.tolerance.tolerance_report:tolerance_report",
-        judged=False,
-    ),
-    "uncertainty": Procedure(
-        "uncertainty",
-        setup="scenes.specs.resolved:resolve_with",
-        run="twin.uncertainty.coverage:run_uncertainty",
-        numbers="twin.uncertainty.uncertainty_numbers:uncertainty_numbers",
-        report="twin.uncertainty.uncertainty_report:uncertainty_report",
-        judged=False,
-        seeded=False,
-    ),
-}
-PROCEDURES = ExtensionTable("procedures", _with_help(_PROCEDURES), Procedure)
-"""Command without the leading ``twin.`` -> test. A new test consists of its modules, one entry here and its help."""
+PROCEDURES = ExtensionTable("procedures", _built_in(), Procedure)
+"""Command without the leading ``twin.`` -> test. A new test has its modules, a row of procedures.csv and its help."""
