@@ -1,5 +1,6 @@
 """The second process of a command: the same results with it and without, whatever becomes of it."""
 
+import gc
 import os
 import signal
 import subprocess
@@ -15,7 +16,7 @@ import psutil
 import pytest
 
 import twin.framework.second_process as module
-from twin.framework.second_process import MOST_TASKS, SecondProcess
+from twin.framework.second_process import SecondProcess
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -61,6 +62,7 @@ def interrupted() -> None:
 
 
 def open_files() -> int:
+    gc.collect()  # those of earlier processes
     return len(os.listdir("/proc/self/fd"))
 
 
@@ -160,8 +162,6 @@ def test_nothing_is_left_behind() -> None:
             interrupted()
     assert open_files() == before
     assert not children()
-    with SecondProcess(nothing) as beside, pytest.raises(ValueError, match="more than 256 tasks"):
-        beside.start({str(k): nothing for k in range(MOST_TASKS + 1)})
 
 
 @pytest.mark.second
@@ -170,7 +170,7 @@ def test_it_ends_with_a_command_that_is_killed() -> None:
     code = (
         "import os, time; import twin.framework.second_process as m; m.cores = lambda: 2\n"
         "with m.SecondProcess(lambda: None) as beside:\n"
-        "    print(beside._child, flush=True)\n"
+        "    print(beside._child.pid, flush=True)\n"
         "    time.sleep(600)\n"
     )
     with subprocess.Popen([sys.executable, "-c", code], cwd=ROOT, stdout=subprocess.PIPE, text=True) as command:

@@ -11,26 +11,20 @@ from __future__ import annotations
 import gc
 import os
 import pickle
-import select
 import signal
-import struct
-import sys
-import tempfile
 import threading
-import time
-from collections.abc import Callable, Collection, Iterator, Mapping
-from typing import IO, Any
+from collections.abc import Callable, Collection, Mapping
+from concurrent.futures import Future, ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from multiprocessing import active_children, connection, get_context, parent_process
+from typing import Any
 
 from optics.numerics.backend import cores
 
-MOST_TASKS = 256
-"""Largest number of tasks: a task number is one byte."""
-_HEAD = struct.Struct("=QB")
-"""Binary header of a batch of tasks: its size in bytes, and the number of its tasks that are for the second process
-alone.
-"""
 PATIENCE = 120.0
 """Time that the command, once idle, waits for the second process before it repeats the task itself, in seconds."""
+_TASKS: dict[str, Callable[[], Any]] = {}
+"""Tasks that the second process was sent; empty in the first one."""
 
 
 class SecondProcess:
@@ -46,19 +40,25 @@ class SecondProcess:
 
     def __init__(self, prepare: Callable[[], object], wanted: bool = True) -> None:
         self._prepare, self._wanted = prepare, wanted
-        self._child = 0
+        self._pool: ProcessPoolExecutor | None = None
         self._tasks: dict[str, Callable[[], Any]] = {}
+        self._sent: dict[str, Future[Any]] = {}
+        self._apart: set[str] = set()
 
     def __enter__(self) -> SecondProcess:
         alone = threading.current_thread() is threading.main_thread()
         if self._wanted and hasattr(os, "fork") and alone and cores() > 1:
-            self._begin()
+            others = set(active_children())
+            self._pool = ProcessPoolExecutor(1, get_context("fork"), _begin, (self._prepare,))
+            self._pool.submit(os.getpid)  # makes the fork now
+            (self._child,) = set(active_children()) - others
         return self
 
     def __exit__(self, *_: object) -> None:
-        if self._child:
-            self._wait_for_end(0.0)
-            self._from_child.close()
+        if self._pool is not None:
+            self._child.kill()
+            self._pool.shutdown(cancel_futures=True)
+            self._child.close()
 
     def __contains__(self, name: str) -> bool:
         """Return True if a task of that name has been started."""
@@ -76,158 +76,62 @@ class SecondProcess:
         apart : collection of str
             Names of tasks that only the second process does, first, if it exists: it has already imported the modules
             they need, and this process need not import them as well.
-
-        Raises
-        ------
-        ValueError
-            There are more than ``MOST_TASKS`` tasks in total.
         """
-        first = len(self._tasks)
-        if first + len(tasks) > MOST_TASKS:
-            raise ValueError(f"more than {MOST_TASKS} tasks: {first + len(tasks)}")
         self._tasks |= tasks
-        if not self._child:
+        self._apart |= set(apart)
+        if self._pool is None:
             return
-        numbers = dict(zip(tasks, range(first, first + len(tasks)), strict=True))
         try:
-            content = pickle.dumps({numbers[name]: task for name, task in tasks.items()}, pickle.HIGHEST_PROTOCOL)
-        except (pickle.PicklingError, TypeError, AttributeError):
-            return
-        # through a file, since a full pipe without a reader would block this process
-        os.pwrite(self._to_child.fileno(), content, self._sent)
-        self._sent += len(content)
-        alone = bytes(number for name, number in numbers.items() if name in apart)
-        try:
-            # in this order: when a task number can be read, its batch has been announced
-            os.write(self._batches, _HEAD.pack(len(content), len(alone)) + alone)
-            os.write(self._requests[1], bytes(number for name, number in numbers.items() if name not in apart))
-        except BrokenPipeError:
-            pass  # the second process has ended
+            # all in one piece, since they have large values in common
+            self._pool.submit(_keep, pickle.dumps(dict(tasks), pickle.HIGHEST_PROTOCOL))
+            for name in sorted(tasks, key=lambda name: name not in apart):
+                self._sent[name] = self._pool.submit(_do, name)
+        except (pickle.PicklingError, TypeError, AttributeError, BrokenProcessPool):
+            return  # the first process does them
 
     def results(self) -> dict[str, Any]:
         """Return the result of every task by its name; exceptions of tasks are raised here."""
-        names, results = list(self._tasks), {}
-        if self._child:
-            self._close_pipes()
-            for number in _received_numbers(self._requests[0]):
-                results[names[number]] = self._tasks[names[number]]()
-            self._wait_for_end(PATIENCE)
-            for number, result in _stored_results(self._from_child):
-                results[names[number]] = result
-        return {name: results[name] if name in results else task() for name, task in self._tasks.items()}
-
-    def _begin(self) -> None:
-        """Fork the second process."""
-        sys.stdout.flush()
-        sys.stderr.flush()
-        # the process that reads a byte has the task of that number; a pipe gives each byte to one reader
-        self._requests, batches = os.pipe(), os.pipe()
-        os.set_blocking(self._requests[0], False)  # of two processes that wait for a byte, one would wait for ever
-        self._to_child: IO[bytes] = tempfile.TemporaryFile()
-        self._from_child: IO[bytes] = tempfile.TemporaryFile()
-        self._sent = 0
-        child = os.fork()
-        if child == 0:
-            try:
-                os.close(batches[1])
-                os.close(self._requests[1])
-                self._work(batches[0])
-            finally:
-                os._exit(0)  # no buffer of the command is flushed twice
-        os.close(batches[0])
-        self._batches = batches[1]
-        self._child, self._sending = child, True
-
-    def _work(self, batches: int) -> None:
-        """Run the second process: receive tasks, do them and store their results."""
-        gc.disable()  # leaves the memory pages shared with the first process untouched
-        for number in (signal.SIGTERM, signal.SIGHUP):
-            signal.signal(number, signal.SIG_DFL)
-        signal.signal(signal.SIGINT, signal.SIG_IGN)  # the first process ends it
-        nowhere = os.open(os.devnull, os.O_RDWR)
-        for stream in (0, 1, 2):
-            os.dup2(nowhere, stream)
-        # every copy of a lock file's descriptor holds the lock, so close all other descriptors
-        first, requests = 3, self._requests[0]
-        for kept in sorted((batches, requests, self._to_child.fileno(), self._from_child.fileno())):
-            os.closerange(first, kept)
-            first = kept + 1
-        os.closerange(first, os.sysconf("SC_OPEN_MAX"))
-        self._prepare()
-        tasks: dict[int, Callable[[], Any]] = {}
-        waiting, read = [batches, requests], 0
-        while waiting:
-            ready, _, _ = select.select(waiting, (), ())
-            if batches in ready:
-                head = os.read(batches, _HEAD.size)
-                if not head:
-                    waiting.remove(batches)
-                    continue
-                length, count = _HEAD.unpack(head)
-                alone = os.read(batches, count) if count else b""
-                tasks |= pickle.loads(os.pread(self._to_child.fileno(), length, read))
-                read += length
-                for task in alone:
-                    self._do(task, tasks)
-                continue
-            try:
-                request = os.read(requests, 1)
-            except BlockingIOError:  # the first process has taken the task
-                continue
-            if not request:
-                waiting.remove(requests)
-                continue
-            self._do(request[0], tasks)
-
-    def _do(self, number: int, tasks: Mapping[int, Callable[[], Any]]) -> None:
-        """Do a task in the second process and store its result."""
-        pickle.dump((number, tasks[number]()), self._from_child)
-        self._from_child.flush()
-
-    def _close_pipes(self) -> None:
-        """Close the pipes, which tells the second process that no further tasks come."""
-        if self._sending:
-            self._sending = False
-            os.close(self._requests[1])
-            os.close(self._batches)
-            self._to_child.close()
-
-    def _wait_for_end(self, patience: float) -> None:
-        """Wait for the end of the second process, and kill it if it takes longer than ``patience`` seconds."""
-        self._close_pipes()
-        last = time.monotonic() + patience
-        while os.waitpid(self._child, os.WNOHANG) == (0, 0):
-            if time.monotonic() > last:
-                os.kill(self._child, signal.SIGKILL)
-                os.waitpid(self._child, 0)
-                break
-            time.sleep(0.002)
-        self._child = 0
-        os.close(self._requests[0])
+        results: dict[str, Any] = {}
+        for name, task in reversed(self._tasks.items()):
+            sent = self._sent.get(name)
+            if sent is None or (name not in self._apart and sent.cancel()):
+                results[name] = task()
+        for name, task in self._tasks.items():
+            if name not in results:
+                try:
+                    results[name] = self._sent[name].result(PATIENCE)
+                except Exception:
+                    self._child.kill()  # so that none of the others waits
+                    results[name] = task()
+        return {name: results[name] for name in self._tasks}
 
 
-def _received_numbers(pipe: int) -> Iterator[int]:
-    """Yield numbers of tasks from a pipe that both processes read, so that each task is done by one of them.
-
-    It ends when no task is left.
-    """
-    while True:
-        select.select([pipe], (), ())
-        try:
-            number = os.read(pipe, 1)
-        except BlockingIOError:  # the other process has taken the task
-            continue
-        if not number:
-            return
-        yield number[0]
+def _begin(prepare: Callable[[], object]) -> None:
+    """Separate the second process from the terminal and the signals of the first, and end it with the first."""
+    gc.disable()  # leaves the memory pages shared with the first process untouched
+    for number in (signal.SIGTERM, signal.SIGHUP):
+        signal.signal(number, signal.SIG_DFL)
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the first process ends it
+    nowhere = os.open(os.devnull, os.O_RDWR)
+    for stream in (0, 1, 2):
+        os.dup2(nowhere, stream)
+    threading.Thread(target=_end_with_the_first, daemon=True).start()
+    prepare()
 
 
-def _stored_results(file: IO[bytes]) -> Any:
-    """Yield all complete results in a file."""
-    with file:
-        file.seek(0)
-        while True:
-            try:
-                yield pickle.load(file)
-            except (EOFError, pickle.UnpicklingError):  # the end of the file, or the process was killed while it wrote
-                return
+def _end_with_the_first() -> None:
+    """Wait for the end of the first process, also of a killed one, and end this one with it."""
+    first = parent_process()
+    assert first is not None
+    connection.wait([first.sentinel])
+    os._exit(0)
+
+
+def _keep(tasks: bytes) -> None:
+    """Store pickled tasks in the second process."""
+    _TASKS.update(pickle.loads(tasks))
+
+
+def _do(name: str) -> Any:
+    """Return the result of a task in the second process."""
+    return _TASKS[name]()
