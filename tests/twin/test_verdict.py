@@ -30,7 +30,7 @@ from twin.framework.artefact import FAR
 from twin.framework.provenance import VERDICT, negative_verdicts
 from twin.framework.record import Quantity, Record
 from twin.main_job import verdict
-from twin.main_job.render_command import _table
+from twin.main_job.render_command import _print_result
 from twin.main_job.render_job import render_job
 from twin.main_job.render_results import RenderRun
 from twin.main_job.systematics import assumed
@@ -308,8 +308,8 @@ def test_a_change_that_no_cause_makes_has_no_posterior(job, tmp_path) -> None:
     assert numbers["from_statement"]["forward"]["d_alpha_arcsec"] is None
     assert numbers["cameras"]["forward"]["model"]["d_alpha_arcsec_sigma"] > 0.0
     console = Console(record=True, width=120, file=io.StringIO())
-    console.print(_table(run, True))
-    assert "\N{EM DASH}" in console.export_text()
+    _print_result(run, console)
+    assert "Δα [arcsec]" not in console.export_text()
     assert "0.0 ±" not in judge(run).verdict
     assert json.loads(json.dumps(numbers, allow_nan=False)) == numbers
 

@@ -226,6 +226,10 @@ class Marked(str):
     hint: str
 
 
+RESIDUALS = ("near", "far")
+"""Styles of cells with a residual below the value."""
+
+
 def residual_cell(text: str, ratio: float | None, key: str, hint: str = "") -> Marked:
     """Return a cell with a measured value and, below it, its residual in sigma, marked if that exceeds `FAR`.
 

@@ -323,7 +323,7 @@ def _export_folder(setup: Any, target: Path, force: bool) -> RunFolder:
 
 def print_report(report: Report, console: Console) -> None:
     """Print the verdict, the main table, the lead and the warnings of a report."""
-    from twin.framework.artefact import cell_text
+    from twin.framework.artefact import RESIDUALS, Marked, cell_text
 
     cli.print_verdict(console, report.verdict, report.unmet, bool(report.warnings))
     summary = report.summary
@@ -331,8 +331,12 @@ def print_report(report: Report, console: Console) -> None:
     for k, head in enumerate(summary.heads):
         text = all(isinstance(row[k], str) for row in summary.rows)
         table.add_column(escape(head), justify="left" if text else "right", no_wrap=text)
-    for row in summary.shown():
-        table.add_row(*(escape(cell_text(cell)) for cell in row))  # escaped, since [m] is a unit and no markup
+    for k, row in enumerate(summary.shown()):
+        if k in summary.bands:
+            table.add_row(f"[bold]{escape(summary.bands[k])}[/]")
+        below = (f" {cell.below}" if isinstance(cell, Marked) and cell.look in RESIDUALS else "" for cell in row)
+        # escaped, since [m] is a unit and no markup
+        table.add_row(*(escape(cell_text(cell) + more) for cell, more in zip(row, below, strict=True)))
     cli.print_whole(console, table)
     for line in report.lead:
         console.print(line, markup=False, highlight=False, soft_wrap=True)

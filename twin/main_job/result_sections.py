@@ -41,7 +41,7 @@ from twin.monitor.time_series import TimeSeries
 
 IN_PAGE = ""
 """Empty file name, for artefacts that appear only in the report page."""
-_GROUND_TITLE = "Errors of ground points if the changes of the cameras are ignored"
+_GROUND_TITLE = "Errors on the ground if changes are ignored"
 _ANGLE_TITLE = "Angle between the cameras"
 
 
