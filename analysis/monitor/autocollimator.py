@@ -25,10 +25,12 @@ in the autocollimator's frame; a rotation about X alone or about Y alone reads e
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import ArrayLike
 
-from analysis.arrays import Array
+from analysis.arrays import Array, UndeterminedError
 
 AXES = ("X", "Y", "Z")
 
@@ -125,3 +127,88 @@ def mean_difference(first: ArrayLike, second: ArrayLike) -> float:
     scaled reading of mirror 2 with the *turntable's* angle.
     """
     return float(np.mean(np.abs(np.asarray(first, np.float64) - np.asarray(second, np.float64))))
+
+
+@dataclass(frozen=True, eq=False)
+class ReadingMap:
+    """Calibration of an autocollimator: polynomial from the position of its spot to the reading.
+
+    The lens images f tan(2 theta) only to first order: it distorts by some 1e-4. As manufacturers do, the map is
+    determined once by rotating a mirror by known angles, and is used from then on. (f is the focal length, theta the
+    rotation of the mirror.)
+
+    Attributes
+    ----------
+    centre : (2,) ndarray
+        Origin (row, column) of the polynomial, px.
+    scale : float
+        Half range of the spots, px.
+    degree : int
+        Largest sum of the exponents of row and column.
+    coefficients : (terms, 2) ndarray
+        Coefficients of the rotations about X and about Y, rad, for each product of powers of row and column.
+    residual : float
+        Rms residual of the calibration, rad.
+    """
+
+    centre: Array
+    scale: float
+    degree: int
+    coefficients: Array
+    residual: float
+
+    @classmethod
+    def fit(cls, position: ArrayLike, reading: ArrayLike, degree: int = 5) -> ReadingMap:
+        """Fit the polynomial map from spot positions to readings by least squares over P known rotations.
+
+        Parameters
+        ----------
+        position : (P, 2) array_like
+            Positions of the spot (row, column), px.
+        reading : (P, 2) array_like
+            Known rotations about X and about Y, rad.
+        degree : int
+            Degree of the polynomials.
+
+        Raises
+        ------
+        ValueError
+            There are too few rotations.
+        """
+        spots, readings = np.asarray(position, np.float64), np.asarray(reading, np.float64)
+        if spots.ndim != 2 or spots.shape[1] != 2 or readings.shape != spots.shape:
+            raise ValueError(f"reading map: position {spots.shape} and reading {readings.shape} must both be (P, 2)")
+        centre = 0.5 * (spots.min(axis=0) + spots.max(axis=0))
+        scale = float(np.max(np.abs(spots - centre)))
+        design = _monomials((spots - centre) / max(scale, 1e-300), degree)
+        solution, _, rank, _ = np.linalg.lstsq(design, readings, rcond=None)
+        if rank < design.shape[1]:
+            raise UndeterminedError(f"reading map: {len(spots)} spots do not settle a polynomial of degree {degree}")
+        rms = float(np.sqrt(np.mean((design @ solution - readings) ** 2)))
+        return cls(centre, scale, degree, np.asarray(solution, dtype=np.float64), rms)
+
+    def __call__(self, position: ArrayLike) -> Array:
+        """Return the rotations of the mirror about X and Y, (..., 2) rad, for spot positions (row, column) in px."""
+        reduced = (np.asarray(position, np.float64) - self.centre) / self.scale
+        return np.asarray(_monomials(reduced, self.degree) @ self.coefficients)
+
+    def slope(self, position: ArrayLike) -> Array:
+        """Return the derivatives of both angles with respect to the spot's row and column, (..., 2, 2) rad/px."""
+        spot = np.asarray(position, np.float64)
+        step = 0.5 * np.eye(2)
+        return np.stack([self(spot + step[k]) - self(spot - step[k]) for k in range(2)], axis=-1)
+
+    def covariance(self, position: ArrayLike, spot_covariance: ArrayLike) -> Array:
+        """Return the covariance of the two angles read, (..., 2, 2) rad^2, from that of the spot's position in px^2.
+
+        ``position`` is the spot's row and column, (..., 2) px, and ``spot_covariance`` the covariance of both, (..., 2,
+        2) px^2.
+        """
+        slope = self.slope(position)
+        return np.asarray(slope @ np.asarray(spot_covariance, np.float64) @ np.swapaxes(slope, -1, -2))
+
+
+def _monomials(spot: Array, degree: int) -> Array:
+    """Return all products row^i column^j with i + j up to a degree, for spot positions (..., 2): (..., terms)."""
+    row, column = spot[..., 0], spot[..., 1]
+    return np.stack([row**i * column**j for i in range(degree + 1) for j in range(degree + 1 - i)], axis=-1)
