@@ -10,7 +10,7 @@ from typing import Any, TypeVar
 
 from optics.numerics.number_tree import FrozenMap
 from scenes.specs.camera import CameraSpec
-from scenes.specs.camera_tests import CameraUnderTestSpec
+from scenes.specs.camera_tests import AutocollimatorSetup, AutocollimatorTestSpec, CameraUnderTestSpec
 from scenes.specs.detector import DetectorSpec
 from scenes.specs.disturbances import NONE, DisturbancesSpec, ErrorBudgetSpec
 from scenes.specs.instrument import BASE, DESIGN, AsBuiltInstrumentSpec, InstrumentSpec
@@ -238,6 +238,19 @@ def load_detector(reference: str | Path, owner: Spec | None = None, key: KeyPath
         The file cannot be read or is not valid, or there is no such file.
     """
     return load_named(DetectorSpec, DETECTORS, reference, owner, key)
+
+
+def load_autocollimator_test(name_or_path: str | Path = "principle_experiment") -> AutocollimatorSetup:
+    """Read a test with two autocollimators, by name or path, and the data sheet of their CCDs.
+
+    Raises
+    ------
+    InputError
+        The file cannot be read or is not valid, or there is no such file.
+    """
+    spec = load_named(AutocollimatorTestSpec, LAB, name_or_path)
+    key = ("autocollimator", "area_ccd", "detector")
+    return AutocollimatorSetup(spec, load_detector(spec.autocollimator.area_ccd.detector, spec, key))
 
 
 def load_camera_under_test(test: TestType) -> tuple[TestType, CameraSpec]:
