@@ -27,17 +27,9 @@ class StandIn:
         self.opened = Opened({"instrument": "stand-in", "channels": []}, b"glb")
         self.seconds, self.bytes_each = seconds, bytes_each
         self.asked: list[tuple[str, Any]] = []
-        self.condition, self.ending, self.pid, self.started = "runs", "the computing process ended", 4321, 0
 
     def leave(self) -> None:
         pass
-
-    def kill(self) -> None:
-        self.condition = "ended"
-
-    async def restart(self) -> None:
-        self.started += 1
-        self.condition = "runs"
 
     async def ask(self, kind: str, question: Any) -> Any:
         self.asked.append((kind, question))

@@ -119,7 +119,7 @@ def _serve(
         from twin.live.server import LiveServer, addresses, listen
     except ImportError as error:
         raise InputErrorText(f"{EXTRA} ({error.name})") from None
-    from twin.live.computer import CannotStart, Computer
+    from twin.live.computer import Computer, ComputerLost
 
     try:
         token = new_token(TOKEN)
@@ -144,7 +144,7 @@ def _serve(
                 console.print(line, highlight=False, soft_wrap=True)
             console.print("Ctrl-C ends it" + ("." if stay else ", and so does closing the last page."))
         LiveServer(computer, guard, stay).run(listening)
-    except CannotStart as error:
+    except ComputerLost as error:
         raise InputErrorText(str(error)) from None
     finally:
         computer.stop()

@@ -19,17 +19,7 @@ from starlette.websockets import WebSocket
 
 from twin.live.clients import POLICY_VIOLATION, Client, Disconnected, LiveApi
 from twin.live.computer import Computer
-from twin.live.guard import (
-    ACCEPT_BACKLOG,
-    EVERYWHERE,
-    HEADERS,
-    KEEP_ALIVE,
-    Connections,
-    Guard,
-    PageSocket,
-    PatientServer,
-    names_of_this_machine,
-)
+from twin.live.guard import EVERYWHERE, HEADERS, Guard, names_of_this_machine
 from twin.live.messages import LARGEST_MESSAGE
 
 IDLE_TIMEOUT = 10.0
@@ -53,7 +43,7 @@ PARTS = {file.name: file for file in (_TWIN / "live" / "page").iterdir()} | {
 class LiveServer:
     """Server of the live twin, which ends with Ctrl-C or when the last page is closed.
 
-    It raises CannotStart if the computing process ended and cannot be restarted.
+    It raises ComputerLost if the computing process ended.
 
     Parameters
     ----------
@@ -67,7 +57,6 @@ class LiveServer:
 
     def __init__(self, computer: Computer, guard: Guard, stay: bool = False) -> None:
         self.api, self.guard, self.stay = LiveApi(computer), guard, stay
-        self.connections = Connections(guard.has_token_cookie)
         self._last: asyncio.TimerHandle | None = None
         self._uvicorn: uvicorn.Server | None = None
         self._failed: BaseException | None = None
@@ -99,28 +88,27 @@ class LiveServer:
         Raises
         ------
         BaseException
-            Exception that ended one of its tasks.
+            Exception that ended the scheduler.
         """
         config = uvicorn.Config(
             self.app,
-            # print errors of the program, but not those of foreign requests
-            log_level="error",
+            # foreign requests that are no HTTP are errors to uvicorn, and not to the user
+            log_level="critical",
             access_log=False,
             server_header=False,
             date_header=False,
-            http=self.connections.protocol(),
-            ws=PageSocket,
+            http="h11",
+            ws="websockets-sansio",
             ws_max_size=LARGEST_MESSAGE,
             ws_max_queue=16,
             ws_per_message_deflate=False,
             ws_ping_interval=20.0,
             ws_ping_timeout=30.0,
-            timeout_keep_alive=int(KEEP_ALIVE),
+            timeout_keep_alive=30,
             timeout_graceful_shutdown=2,
             h11_max_incomplete_event_size=1 << 15,
-            backlog=ACCEPT_BACKLOG,
         )
-        self._uvicorn = PatientServer(config)
+        self._uvicorn = uvicorn.Server(config)
         # uvicorn shuts down in order and then raises the signal again
         with contextlib.suppress(KeyboardInterrupt):
             self._uvicorn.run(sockets=[listening])
@@ -134,19 +122,17 @@ class LiveServer:
 
     @contextlib.asynccontextmanager
     async def _lifespan(self, app: Starlette) -> AsyncIterator[None]:
-        """Run the scheduler of requests and the monitoring of the computing process while the application runs."""
-        tasks = [asyncio.create_task(make()) for make in (self.api.serve_requests, self.api.watch_process)]
-        for task in tasks:
-            task.add_done_callback(self._ended)
+        """Run the scheduler of requests while the application runs."""
+        task = asyncio.create_task(self.api.serve_requests())
+        task.add_done_callback(self._ended)
         try:
             yield
         finally:
-            for task in tasks:
-                task.cancel()
+            task.cancel()
             self.api.computer.leave()
 
     def _ended(self, task: asyncio.Task[None]) -> None:
-        """Stop the server after an error of one of its tasks."""
+        """Stop the server after an error of the scheduler."""
         if not task.cancelled() and (error := task.exception()) is not None:
             self._failed = error
             self.stop()
@@ -180,8 +166,6 @@ class LiveServer:
             self._last = None
         await ws.accept()
         client.queue_json({"type": "hello", **self.api.computer.opened.greeting})
-        if self.api.process_trouble:
-            client.queue_json(self.api.process_trouble)
         reading = asyncio.create_task(self._read(ws, client))
         sending = asyncio.create_task(client.send(ws.send_text, ws.send_bytes))
         try:
