@@ -28,13 +28,11 @@ from twin.compare.verification import (
     REDRAWN,
     ROUNDED,
     SAME,
-    CannotRepeat,
     FileState,
     file_state,
     folder_state,
     obstacle,
     redrawn,
-    repeat_block,
 )
 from twin.framework.data_files import FrameFacts, netcdf, preview_png, tiff
 from twin.framework.owned_files import MANIFEST
@@ -170,29 +168,6 @@ def test_a_changed_byte_in_each_file_of_a_study_is_found(study, tmp_path) -> Non
         shutil.rmtree(copy)
 
 
-def test_blocks_that_were_taken_out_are_missed(study, tmp_path) -> None:
-    copy = shutil.copytree(study, tmp_path / "copy")
-    (copy / BLOCKS).write_bytes(b"".join((copy / BLOCKS).read_bytes().splitlines(keepends=True)[:-1]))
-    assert folder_state(copy).changed == (BLOCKS,)
-    with pytest.raises(CannotRepeat, match="its blocks are incomplete; --all repeats the whole study"):
-        repeat_block(folder_state(copy))
-    (copy / "config.yaml").write_text("name: levels\n")
-    with pytest.raises(CannotRepeat, match=r"config\.yaml:1: "):
-        repeat_block(folder_state(copy))
-
-
-@pytest.mark.second
-def test_numbers_that_no_run_gave_are_found(study) -> None:
-    """The blocks' checksums are right, and study.nc holds what they hold; only computing tells."""
-    made = repeat_block(folder_state(study))
-    assert made.what == "runs 50 to 74 of 100"
-    states = {one.file: one.state for one in made.files}
-    assert states == {f"{BLOCKS}: 2": DIFFERENT, "study.nc": SAME, "study.json": SAME}
-    found = next(one for one in made.files[0].quantities if one.key.startswith("true_df["))
-    assert abs(float(found.new)) < 5.0  # a draw of 1 um, read exactly
-    assert float(found.old) <= -25.0
-
-
 # what is compared, and how
 
 
@@ -325,9 +300,7 @@ def test_what_is_no_run_folder_is_refused(tmp_path, folder) -> None:
 
 def test_options_that_do_not_go_together_are_refused(folder) -> None:
     for words, said in (
-        (("--files", "--all"), "--files repeats nothing"),
         (("--files", "--keep", folder / "x"), "--files repeats nothing"),
-        (("--all",), "--all is for studies"),
         (("--keep", folder), "exists; choose another folder"),
     ):
         result = invoke(app, folder, *words)

@@ -1,7 +1,4 @@
-"""Repetition of a run from its folder, and the verdict on the folder and the run.
-
-A whole run is repeated by its command in a process of its own. Of a study (many runs of one job) one block of runs is
-repeated in this process.
+"""Repetition of a run from its folder, by its command in another process, and the verdict on folder and run.
 
 State of a run folder: which files differ from its manifest; and differences of machine and program between two runs.
 
@@ -15,27 +12,20 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from scenes.yaml.errors import InputError, Issue
-from scenes.yaml.input_file import read_json
 from twin.compare import folder_difference as difference
 from twin.compare.folder_difference import ArrayDifference, FileDifference, Leaf, NumberDifference
 from twin.framework import provenance, report, run_folder
-from twin.framework.journal import read_pieces
 from twin.framework.owned_files import MANIFEST, PARTIAL, digest, files_below, first_names
 from twin.framework.provenance import Provenance
 from twin.framework.run_folder import Manifest
 from twin.monitor.calibration_cache import recomputed
-from twin.study.runs import blocks, setup
-from twin.study.runs.base_job import BlockResult
-from twin.study.runs.plan import Plan
-from twin.study.study_files import make_dataset, summary
+from twin.study.runs.blocks import BLOCKS
 
 
 @dataclass(frozen=True)
@@ -77,11 +67,6 @@ class FolderState:
     def sealed(self) -> bool:
         """True if the manifest contains a checksum of itself, so that changes to it are detected."""
         return self.manifest.digest is not None
-
-    @property
-    def is_study(self) -> bool:
-        """True if the folder is that of a study (many runs of one job), of which a part can be repeated."""
-        return self.manifest.program == "twin.study" and not self.manifest.gradient
 
 
 def folder_state(folder: Path) -> FolderState:
@@ -168,32 +153,14 @@ class Elsewhere:
     known: bool
 
 
-def elsewhere(manifest: Manifest, here: Provenance | None, now: Mapping[str, str]) -> Elsewhere:
-    """Compare the program and machine of a run with those of its repetition.
-
-    Parameters
-    ----------
-    manifest : Manifest
-        Manifest of the run.
-    here : Provenance | None
-        Record of program and machine of the repetition.
-    now : Mapping[str, str]
-        Versions of the packages of the repetition.
-    """
-    program, made = _changes(manifest.versions, now), manifest.provenance
+def elsewhere(old: Manifest, new: Manifest) -> Elsewhere:
+    """Compare the program and machine of a run, by its manifest, with those of its repetition."""
+    program, made, here = _changes(old.versions, new.versions), old.provenance, new.provenance
     if made is None or here is None:
         return Elsewhere((*program,), (), False)
     program = [*_changes({"source": made.source[:12]}, {"source": here.source[:12]}), *program]
     program += _changes(made.packages, here.packages)
-    kernels, others = _kernels(made), _kernels(here)
-    common = kernels.keys() & others.keys()
-    processor = _changes(_machine(made), _machine(here))
-    processor += [
-        f"{library} with kernels for {kernels[library]} then, {others[library]} now"
-        for library in sorted(common)
-        if kernels[library] != others[library]
-    ]
-    return Elsewhere((*program,), (*processor,), True)
+    return Elsewhere((*program,), (*_changes(_machine(made), _machine(here)),), True)
 
 
 def _changes(then: Mapping[str, str], now: Mapping[str, str]) -> list[str]:
@@ -202,22 +169,15 @@ def _changes(then: Mapping[str, str], now: Mapping[str, str]) -> list[str]:
 
 
 def _machine(where: Provenance) -> dict[str, str]:
-    """Return the properties of a machine that change rounding, except the linear algebra's kernels.
-
-    The number of threads does not change rounding.
-    """
+    """Return the properties of a machine that change rounding; the number of threads does not."""
     settings = [f"{key}={value}" for key, value in where.settings.items() if not key.endswith("THREADS")]
     return {
         "processor": where.processor,
         "instructions": ", ".join(where.simd) or "none",
         "C library": where.libc,
         "settings": ", ".join(settings) or "none",
+        **{f"{library.name} {library.version} with kernels for": library.kernels for library in where.blas},
     }
-
-
-def _kernels(where: Provenance) -> dict[str, str]:
-    """Return name of each linear-algebra library -> processor type for which the kernels that it used are made."""
-    return {f"{library.name} {library.version}": library.kernels for library in where.blas}
 
 
 EQUAL, UNEQUAL, NOT_REPEATED = 0, 1, 2
@@ -234,7 +194,7 @@ GONE, NEW = "only in the run", "only in the repeated run"
 EXCLUDED_FILES: Mapping[str, str] = {
     "html": "a page that states when and where it was made; its numbers are those of the other files",
     "md": "a page that states how long it took; its numbers are those of the other files",
-    blocks.BLOCKS: "runs in the order of their computation; their numbers are those of study.nc",
+    BLOCKS: "runs in the order of their computation; their numbers are those of study.nc",
 }
 """Suffix or name of files that are not compared -> the reason."""
 
@@ -447,14 +407,11 @@ class Repetition:
         Differences of program and machine from those of the run.
     seconds : float
         Duration of the repetition, in seconds.
-    what : str
-        Description of the repeated part if it is not the whole run; otherwise empty.
     """
 
     files: tuple[FileState, ...]
     elsewhere: Elsewhere
     seconds: float
-    what: str = ""
 
     @property
     def state(self) -> str:
@@ -465,7 +422,7 @@ class Repetition:
     def numbers(self) -> dict[str, Any]:
         """Return the repetition as plain data."""
         there = self.elsewhere
-        about = {"state": self.state, "what": self.what or "the whole run", "seconds": self.seconds}
+        about = {"state": self.state, "seconds": self.seconds}
         about |= {"other_program": list(there.program), "other_processor": list(there.processor)}
         files = [
             {"file": f.file, "state": f.state, "quantities": f.count, "why": f.why}
@@ -494,7 +451,7 @@ def obstacle(state: FolderState) -> str:
 
 @recomputed()  # a repetition must not reuse results of the run that it checks
 def repeat(state: FolderState, folder: Path, quiet: bool) -> Repetition:
-    """Repeat a whole run, and compare every file.
+    """Repeat a run, and compare every file.
 
     Parameters
     ----------
@@ -542,7 +499,7 @@ def repeat(state: FolderState, folder: Path, quiet: bool) -> Repetition:
         raise CannotRepeat(
             f"{' '.join(arguments)} ended with exit code {process.returncode}{': ' if text else ''}{text}"
         )
-    where = elsewhere(manifest, repetition.provenance, repetition.versions)
+    where = elsewhere(manifest, repetition)
     names = dict.fromkeys((*manifest.sha256, *repetition.sha256))
     files = [file_state(name, state.folder / name, folder / name, bool(where.processor)) for name in names]
     return Repetition(tuple(redrawn(files)), where, time.monotonic() - began)
@@ -559,70 +516,6 @@ def redrawn(files: Sequence[FileState]) -> Iterator[FileState]:
     numbers = {file.state for file in files if not file.drawn} - {SAME, EXCLUDED}
     for file in files:
         yield replace(file, state=REDRAWN) if numbers == {ROUNDED} and file.drawn and file.state == DIFFERENT else file
-
-
-@recomputed()
-def repeat_block(state: FolderState) -> Repetition:
-    """Repeat the middle block of runs of a study, and compare all blocks with the study's data set.
-
-    Parameters
-    ----------
-    state : FolderState
-        State of its folder, for which `obstacle` is empty.
-
-    Raises
-    ------
-    CannotRepeat
-        Blocks are missing or incomplete, or config.yaml cannot be read.
-    """
-    began, folder = time.monotonic(), state.folder
-    try:
-        plan = Plan.of(setup.resolve_study(folder / CONFIG))
-        content = (folder / blocks.BLOCKS).read_bytes()
-    except (OSError, InputError) as error:
-        raise CannotRepeat(str(error)) from error
-    with blocks.journal_of(plan.setup, None) as journal:
-        journal.known = read_pieces(content, journal.classes)[1]
-        engine = blocks.Engine(plan, journal, state.manifest.backend or "llvm")
-        if engine.missing:
-            raise CannotRepeat("its blocks are incomplete; --all repeats the whole study")
-        middle, whole = plan.blocks // 2, engine.result()
-        kept, repetition = journal.known[str(middle)], blocks.evaluate(engine.task(middle))
-    block = difference.content_difference(
-        f"{blocks.BLOCKS}: {middle}", _responses(kept, plan), _responses(repetition, plan)
-    )
-    where = elsewhere(state.manifest, provenance.Provenance.here(), provenance.versions())
-    files, runs = (file_state_of(block), *_data_states(folder, plan, whole)), plan.block(middle)
-    return Repetition(files, where, time.monotonic() - began, f"runs {runs[0]} to {runs[-1]} of {plan.runs}")
-
-
-def _responses(result: BlockResult, plan: Plan) -> difference.Content:
-    """Return the results (responses) of each run in a block of a study, as numbers to compare."""
-    arrays = {
-        f"{response}{ending}": getattr(result, part)[:, r]
-        for r, response in enumerate(plan.setup.study.responses)
-        for ending, part in (("", "values"), (" sigma", "sigmas"), (" noise", "noises"))
-    }
-    texts = {part: np.array(getattr(result, part), object) for part in ("messages", "doubts")}
-    return difference.Content({}, arrays | texts, {})
-
-
-def _data_states(folder: Path, plan: Plan, whole: BlockResult) -> Iterable[FileState]:
-    """Compare a study's data set and summary, study.nc and study.json, with the results of its blocks."""
-    name = "study.nc"
-    try:
-        stored_arrays = difference.content_of(folder / name, name).arrays
-        stored = read_json(folder / "study.json")
-    except InputError as error:
-        return (FileState(name, DIFFERENT, why=error.issues[0].problem),)
-    data = make_dataset(plan, whole)
-    repetition = {str(key): np.asarray(data[key].values) for key in data.data_vars}
-    common = {key: values for key, values in stored_arrays.items() if key in repetition}
-    again = summary(data, plan)
-    arrays = (name, difference.Content({}, common, {}), difference.Content({}, repetition, {}))
-    # the data set follows from the blocks, and the summary from the data set
-    numbers = ("study.json", difference.plain({key: stored.get(key) for key in again}), difference.plain(again))
-    return [file_state_of(difference.content_difference(*pair)) for pair in (arrays, numbers)]
 
 
 @dataclass(frozen=True)
@@ -686,7 +579,7 @@ class Verification:
             f"{_largest(rounded)}",
             DIFFERENT: f"differs in {first_names(others)}",
         }[repetition.state]
-        out = [f"a repetition of {repetition.what or 'the run'} {text}"]
+        out = [f"a repetition of the run {text}"]
         where = repetition.elsewhere
         if not where.known:
             out.append("the manifest does not name the processor and the source that made it")
