@@ -8,6 +8,7 @@ if __name__ == "__main__":
     end_quietly()
 
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Annotated
 
 import typer
@@ -46,8 +47,8 @@ def main(
 
     **Repeated run.** It takes as long as the run did, which is printed first. Every number is identical to the bit,
     equal up to rounding (1e-9 of the largest of its kind, on another processor 1e-6, or 1e-3 of its sigma), or
-    different, with key, old and new value. Report pages are not compared: they contain the time. Differences in the
-    version of the program, in packages or in the processor are reported.
+    different, with key, old and new value. Report pages, which contain the time, and pictures are not compared.
+    Differences in the version of the program, in packages or in the processor are reported.
 
     Nothing is written, except with `--keep`. `python -m twin.compare RUN DIR` then compares both in a report.
 
@@ -59,7 +60,6 @@ def main(
     with cli.explained(errors), durable.exit_on_terminate():
         from twin.compare import verification
         from twin.compare.verification import folder_state
-        from twin.framework.owned_files import scratch
 
         if files and keep is not None:
             raise cli.InputErrorText("--files repeats nothing, so that it cannot be combined with --keep")
@@ -72,8 +72,8 @@ def main(
                 took = cli.time_text(state.manifest.wall_time_s)
                 errors.print(f"repeating the run, which took {took}", markup=False, highlight=False, soft_wrap=True)
             try:
-                with scratch("twin-verify") as folder:
-                    made = verification.repeat(state, keep or folder / "again", silent)
+                with TemporaryDirectory(prefix="twin-verify-") as folder:
+                    made = verification.repeat(state, keep or Path(folder) / "again", silent)
             except verification.CannotRepeat as error:
                 why = str(error)
         done = verification.Verification(state, made, why)

@@ -13,9 +13,8 @@ from typing import Any
 
 from websockets.sync import client as client_of
 
-from twin.live.guard import COOKIE, Guard
 from twin.live.messages import Opened, packed
-from twin.live.server import LiveServer, listen
+from twin.live.server import COOKIE, Guard, LiveServer, listen
 
 SECRET = "a-secret-of-enough-letters"
 

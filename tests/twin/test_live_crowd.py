@@ -15,7 +15,7 @@ pytest.importorskip("websockets.sync.client", reason="the extra `live` is not in
 from websockets.frames import Frame, Opcode
 
 from tests.twin.live_client import SECRET, StandIn, ask, connect, numbered, serving, state
-from twin.live.guard import COOKIE, Guard, names_of_this_machine
+from twin.live.server import COOKIE, Guard, names_of_this_machine
 
 WRONG = [
     b"\x16\x03\x01\x02\x00\x01\x00\x01\xfc\x03\x03" + bytes(range(256)),  # TLS

@@ -22,9 +22,8 @@ from twin.framework.cli import InputErrorText
 from twin.live.__main__ import TOKEN, _serve
 from twin.live.clients import BAD_MESSAGES, Client, Disconnected
 from twin.live.computer import ComputerLost
-from twin.live.guard import BadToken, Guard, new_token
 from twin.live.messages import LARGEST_MESSAGE, AskedState, BadMessage, BlindState, read_message
-from twin.live.server import LiveServer, listen
+from twin.live.server import BadToken, Guard, LiveServer, listen, new_token
 
 
 @contextmanager

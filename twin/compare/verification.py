@@ -12,7 +12,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -188,12 +188,11 @@ MOST_PRINTED = 5
 MOST_LISTED = 20
 """Largest number of differing quantities of a file in the JSON output; those that differ most are listed."""
 SAME, ROUNDED, DIFFERENT, EXCLUDED = "same", "rounding", "different", "excluded"
-REDRAWN = "redrawn"
-"""State of a picture drawn from numbers that differ by rounding only, so that its lines are slightly displaced."""
 GONE, NEW = "only in the run", "only in the repeated run"
 EXCLUDED_FILES: Mapping[str, str] = {
     "html": "a page that states when and where it was made; its numbers are those of the other files",
     "md": "a page that states how long it took; its numbers are those of the other files",
+    **dict.fromkeys(("svg", "png", "glb"), "a picture; the numbers that it shows are those of the other files"),
     BLOCKS: "runs in the order of their computation; their numbers are those of study.nc",
 }
 """Suffix or name of files that are not compared -> the reason."""
@@ -226,13 +225,6 @@ PIXEL_SHARE, GREY_LEVELS = 1e-4, 2
 Where the expected photons of a pixel lie, within rounding, at a value where the random number of photons changes by
 one, the frames differ.
 """
-PICTURE_LEVELS = 4
-"""Largest difference of rendered figures that counts as rounding, in grey levels of 255.
-
-Partly covered pixels along drawn edges may differ by so much.
-"""
-RELATIVE_OF_GEOMETRY = 1e-6
-"""Largest difference of 3-D geometry in single precision that counts as rounding, relative to its largest value."""
 
 
 @dataclass(frozen=True)
@@ -271,7 +263,7 @@ class FileState:
     file : str
         Path in the folder.
     state : str
-        ``SAME``, ``ROUNDED`` (equal within rounding), ``DIFFERENT``, ``EXCLUDED`` (not compared), ``REDRAWN``, ``GONE``
+        ``SAME``, ``ROUNDED`` (equal within rounding), ``DIFFERENT``, ``EXCLUDED`` (not compared), ``GONE``
         (only in the run) or ``NEW`` (only in the repeated run).
     quantities : tuple[Quantity, ...]
         Quantities that differ, the largest difference first, at most `MOST_LISTED`.
@@ -286,11 +278,6 @@ class FileState:
     quantities: tuple[Quantity, ...] = ()
     count: int = 0
     why: str = ""
-
-    @property
-    def drawn(self) -> bool:
-        """True if the file is a picture."""
-        return difference.ending(self.file) in ("svg", "png", "glb")
 
 
 def file_state(name: str, old: Path, new: Path, elsewhere: bool) -> FileState:
@@ -332,7 +319,7 @@ def file_state_of(compared: FileDifference, elsewhere: bool = False) -> FileStat
         Whether the run was repeated on a different processor, which rounds otherwise.
     """
     quantities = [*(_number(entry, elsewhere) for entry in compared.numbers)]
-    quantities += [_array(array, compared.drawn, elsewhere) for array in compared.arrays]
+    quantities += [_array(array, elsewhere) for array in compared.arrays]
     if not quantities:
         quantities = [
             Quantity(claim.key, _short(claim.reference), _short(claim.other)) for claim in compared.statements
@@ -358,10 +345,10 @@ def _number(number: NumberDifference, elsewhere: bool) -> Quantity:
     return Quantity(number.key, number.reference, number.other, relative, in_sigma, rounding)
 
 
-def _array(array: ArrayDifference, drawn: bool, elsewhere: bool) -> Quantity:
+def _array(array: ArrayDifference, elsewhere: bool) -> Quantity:
     """Return the largest difference of an array in two files, with the decision whether it is rounding.
 
-    ``drawn`` is True for a picture, ``elsewhere`` if the run was repeated on a different processor.
+    ``elsewhere`` is True if the run was repeated on a different processor.
     """
     name = array.name or "pixels"
     if array.share is None:
@@ -372,14 +359,10 @@ def _array(array: ArrayDifference, drawn: bool, elsewhere: bool) -> Quantity:
     if array.largest is None or array.peak is None:
         return Quantity(key, _short(array.reference), _short(array.other))
     worst = array.largest if array.finite else math.inf
-    if drawn and array.depth:
-        rounding = worst <= PICTURE_LEVELS * (257 if array.depth == 2 else 1)
-    elif elsewhere and array.depth:
+    if elsewhere and array.depth:
         rounding = worst <= GREY_LEVELS and array.share <= PIXEL_SHARE
     else:
-        rounding = (
-            worst <= (RELATIVE_OF_GEOMETRY if drawn else RELATIVE_ELSEWHERE if elsewhere else RELATIVE) * array.peak
-        )
+        rounding = worst <= (RELATIVE_ELSEWHERE if elsewhere else RELATIVE) * array.peak
     relative = worst / array.peak if array.peak and array.finite else None
     return Quantity(key, array.reference, array.other, relative, None, rounding)
 
@@ -417,7 +400,7 @@ class Repetition:
     def state(self) -> str:
         """SAME, ROUNDED or DIFFERENT: the state of the file that differs most."""
         states = {file.state for file in self.files} - {SAME, EXCLUDED}
-        return DIFFERENT if states - {ROUNDED, REDRAWN} else ROUNDED if states else SAME
+        return DIFFERENT if states - {ROUNDED} else ROUNDED if states else SAME
 
     def numbers(self) -> dict[str, Any]:
         """Return the repetition as plain data."""
@@ -502,20 +485,7 @@ def repeat(state: FolderState, folder: Path, quiet: bool) -> Repetition:
     where = elsewhere(manifest, repetition)
     names = dict.fromkeys((*manifest.sha256, *repetition.sha256))
     files = [file_state(name, state.folder / name, folder / name, bool(where.processor)) for name in names]
-    return Repetition(tuple(redrawn(files)), where, time.monotonic() - began)
-
-
-def redrawn(files: Sequence[FileState]) -> Iterator[FileState]:
-    """Yield the files of one run, with state REDRAWN for pictures that differ while all numbers agree to rounding.
-
-    Parameters
-    ----------
-    files : Sequence[FileState]
-        Compared files of one run.
-    """
-    numbers = {file.state for file in files if not file.drawn} - {SAME, EXCLUDED}
-    for file in files:
-        yield replace(file, state=REDRAWN) if numbers == {ROUNDED} and file.drawn and file.state == DIFFERENT else file
+    return Repetition(tuple(files), where, time.monotonic() - began)
 
 
 @dataclass(frozen=True)
@@ -571,7 +541,7 @@ class Verification:
         if repetition is None:
             return ["the run was not repeated"]
         compared = [file for file in repetition.files if file.state != EXCLUDED]
-        rounded = [comparison for comparison in compared if comparison.state in (ROUNDED, REDRAWN)]
+        rounded = [comparison for comparison in compared if comparison.state == ROUNDED]
         others = [comparison.file for comparison in compared if comparison.state != SAME and comparison not in rounded]
         text = {
             SAME: f"has the same numbers in all {len(compared)} files",
@@ -629,7 +599,7 @@ class Verification:
 
 def _largest(files: Sequence[FileState]) -> str:
     """Return a text with the largest differences of numbers, relative to their size and in sigmas."""
-    numbers = [quantity for file in files if not file.drawn for quantity in file.quantities]
+    numbers = [quantity for file in files for quantity in file.quantities]
     relative = max((number.relative or 0.0 for number in numbers), default=0.0)
     in_sigma = max((number.in_sigma or 0.0 for number in numbers), default=0.0)
     return f"{relative:.2g} of their value" + (f" and {in_sigma:.2g} sigma" if in_sigma else "")

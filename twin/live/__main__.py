@@ -115,8 +115,7 @@ def _serve(
         The extra is missing, the address is in use, or the instrument cannot be built.
     """
     try:
-        from twin.live.guard import BadToken, Guard, new_token
-        from twin.live.server import LiveServer, addresses, listen
+        from twin.live.server import BadToken, Guard, LiveServer, addresses, listen, new_token
     except ImportError as error:
         raise InputErrorText(f"{EXTRA} ({error.name})") from None
     from twin.live.computer import Computer, ComputerLost
