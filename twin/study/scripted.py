@@ -8,16 +8,15 @@ import signal
 import subprocess
 import sys
 import tempfile
+import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from functools import partial
 from itertools import takewhile
 from pathlib import Path
 from typing import Any, Protocol, cast
 
 import xarray as xr
-from rich.console import Console
 
 from analysis.monitor import parameters
 from scenes.specs.perturbation import find_node, motion_of, put
@@ -26,7 +25,6 @@ from scenes.specs.study import NOISE, TOTAL, StudySpec
 from scenes.yaml.errors import InputError, Issue, KeyPath, Problem, shown
 from scenes.yaml.spec import validate
 from scenes.yaml.yaml_file import YamlFile, dump_yaml
-from twin.framework.command import progress_shown
 from twin.study.runs.base_job import Tree
 
 ProgressCallback = Callable[[int, int], None]
@@ -116,8 +114,8 @@ def study(
     quiet : bool
         True to show neither progress nor warnings.
     progress : bool or callable
-        True to show progress, as a bar on a terminal and as lines in a notebook; or a function ``progress(done, runs)``
-        that is called whenever runs have finished.
+        True to show a progress bar on a terminal and in a notebook; or a function ``progress(done, runs)`` that is
+        called whenever runs have finished.
 
     Returns
     -------
@@ -167,14 +165,9 @@ def _loaded(instrument: Any) -> Perturbed:
 
 def _run(command: list[str], quiet: bool, progress: bool | ProgressCallback) -> tuple[int, str]:
     """Run a study's command to its end; return its exit code and, if ``quiet``, the messages that it printed."""
-    silent = quiet or progress is not True or not (sys.stderr.isatty() or "ipykernel" in sys.modules)
+    callback = progress if callable(progress) else _progress_bar() if progress and not quiet else _silent
     reading, writing = os.pipe()
-    with (
-        os.fdopen(reading) as lines,
-        tempfile.TemporaryFile("w+") as messages,
-        progress_shown(Console(stderr=True), silent) as advance,
-    ):
-        callback = progress if callable(progress) else partial(advance, "runs")
+    with os.fdopen(reading) as lines, tempfile.TemporaryFile("w+") as messages:
         words = [*command, "--progress-fd", str(writing)]
         try:
             done = subprocess.Popen(
@@ -194,6 +187,36 @@ def _run(command: list[str], quiet: bool, progress: bool | ProgressCallback) -> 
             raise
         messages.seek(0)
         return code, messages.read()
+
+
+def _silent(done: int, runs: int) -> None:
+    """Ignore the progress of a study; used without a progress bar."""
+
+
+def _progress_bar() -> ProgressCallback:
+    """Return a callback that draws a progress bar on stderr, on a terminal or in a notebook; elsewhere a silent one.
+
+    The command has its own progress display; this one needs only what is available in a script.
+    """
+    stream = sys.stderr
+    if not (stream.isatty() or "ipykernel" in sys.modules):
+        return _silent
+    begun = time.monotonic()
+
+    def show(done: int, total: int) -> None:
+        full = _WIDTH * done // max(total, 1)
+        spent = time.monotonic() - begun
+        remaining = f", about {spent * (total - done) / done:.0f} s left" if 0 < done < total else ""
+        bar = f"runs {'#' * full}{'.' * (_WIDTH - full)} {done} of {total}, {spent:.0f} s{remaining}"
+        # padded, since the previous line may have been longer
+        stream.write(f"\r{bar:<79}" + ("\n" if done == total else ""))
+        stream.flush()
+
+    return show
+
+
+_WIDTH = 30
+"""Length of the progress bar, characters."""
 
 
 def pipe_progress(descriptor: int) -> ProgressCallback:
