@@ -1,6 +1,5 @@
 """Lock files, bill of materials, licences and known vulnerabilities: complete, and refusing what is not."""
 
-import importlib.metadata
 import itertools
 import json
 import os
@@ -18,9 +17,8 @@ from packaging.requirements import Requirement
 
 from docs.supply.__main__ import findings
 from docs.supply.licences import read_carried, read_table
+from docs.supply.lock_file import FOLDER, LAYERS, LockError, normal, parse, read_layer, read_lock
 from docs.supply.make_lock import EXTRAS, SupplyError
-from twin import doctor
-from twin.framework.lock_file import FOLDER, LAYERS, LockError, differences, normal, parse, read_layer, read_lock
 
 ROOT = Path(__file__).resolve().parent.parent
 PROJECT = "space-camera-twin"
@@ -92,31 +90,6 @@ def test_a_lock_file_that_is_none_is_refused() -> None:
     ):
         with pytest.raises(LockError, match=re.escape(told)):
             parse(text, "runtime", "x")
-
-
-@pytest.fixture
-def lock(tmp_path: Path) -> Path:
-    for layer in LAYERS:
-        shutil.copy(FOLDER / f"{layer}.txt", tmp_path)
-    return tmp_path
-
-
-def test_what_differs_from_the_lock_is_told(lock: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    file, before = lock / "runtime.txt", differences(PROJECT, lock)
-    assert before.equal > 80
-    version = importlib.metadata.version("jinja2")
-    text = file.read_text("utf-8").replace(f"jinja2=={version}", "jinja2==99.1")
-    file.write_text(text + f"no-such-package==1.0 \\\n    --hash=sha256:{'0' * 64}\n", "utf-8")
-    found = differences(PROJECT, lock)
-    assert f"jinja2 {version}, locked 99.1" in found.other
-    assert "no-such-package==1.0" in found.missing
-    assert found.equal == before.equal - 1
-    monkeypatch.setattr("twin.framework.lock_file.FOLDER", lock)
-    monkeypatch.setattr("twin.framework.lock_file.differences", lambda own: found)
-    (line,) = doctor._lock()
-    assert line.status == "failed"
-    assert "99.1" in line.detail
-    assert "bash setup.sh" in line.detail
 
 
 def forged(folder: Path, name: str, version: str) -> None:

@@ -1,8 +1,8 @@
 """Command ``python -m twin.doctor [--quick] [--json]``: checks that this machine can run the twin.
 
-It reports Python, cores, LLVM, Dr.Jit, Mitsuba, GPU, the versions of the dependencies and whether all packages are
-those of the lock files. A small float64 kernel and a small render run in child processes, so that an unsuitable LLVM,
-which aborts its process, does not abort the doctor. Exit code 0 if the twin can run, 1 if not.
+It reports Python, cores, LLVM, Dr.Jit, Mitsuba, GPU and the versions of the dependencies. A small float64 kernel and a
+small render run in child processes, so that an unsuitable LLVM, which aborts its process, does not abort the doctor.
+Exit code 0 if the twin can run, 1 if not.
 """
 
 if __name__ == "__main__":
@@ -116,7 +116,7 @@ def examine(quick: bool = False) -> list[Check]:
         )
     if not quick:
         checks.append(_gpu())
-    return [*checks, *_versions(), *_lock(), *_extensions()]
+    return [*checks, *_versions(), *_extensions()]
 
 
 def _python() -> Check:
@@ -239,32 +239,6 @@ def _extensions() -> list[Check]:
             hint = f"did you mean {PREFIX}{near}?" if near else f"allowed: {', '.join(GROUPS)}"
             checks.append(Check("extension", "note", f"{entry} is not used, no such group of entry points; {hint}"))
     return checks
-
-
-def _lock() -> list[Check]:
-    """Compare all installed packages, indirect dependencies included, with the lock files that setup.sh installs.
-
-    There is no check without lock files, as beside an installed wheel.
-    """
-    from twin.framework.lock_file import FOLDER, LockError, differences
-
-    if not FOLDER.is_dir():
-        return []
-    try:
-        comparison = differences(DISTRIBUTION)
-    except (LockError, OSError) as error:
-        return [Check("lock", "failed", f"cannot be read: {error}")]
-    parts = [f"{comparison.equal} packages as in docs/supply/lock"]
-    if comparison.other:
-        parts.append(f"other versions than locked: {'; '.join(comparison.other)}")
-    if comparison.missing:
-        parts.append(f"not installed: {', '.join(comparison.missing)}")
-    if comparison.other or comparison.missing:
-        parts.append("to install the locked versions, delete .venv/installed and run bash setup.sh")
-    if comparison.unknown:
-        parts.append(f"not in the lock: {', '.join(comparison.unknown)}")
-    status: Status = "failed" if comparison.missing else "note" if comparison.other else "ok"
-    return [Check("lock", status, "; ".join(parts))]
 
 
 def _show(checks: list[Check], good: bool, console: Console) -> None:

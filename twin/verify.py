@@ -8,16 +8,14 @@ if __name__ == "__main__":
     end_quietly()
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from tempfile import TemporaryDirectory
+from typing import Annotated
 
 import typer
 from rich.console import Console
 
 from scenes.yaml.standard_output import Terminal, print_json, to_stdout
 from twin.framework import cli, durable
-
-if TYPE_CHECKING:  # modules that compute are imported on use
-    from twin.compare.verification import FolderState, Repetition
 
 app = cli.program()
 
@@ -27,9 +25,6 @@ def main(
     run: Annotated[Path, typer.Argument(readable=False, help="Run folder of any command.")],
     files: Annotated[
         bool, typer.Option("--files", help="Check only the files; repeat nothing. A second for most folders.")
-    ] = False,
-    every: Annotated[
-        bool, typer.Option("--all", help="Repeat all runs of a study on all cores, not one block of them.")
     ] = False,
     keep: Annotated[
         Path | None,
@@ -50,11 +45,10 @@ def main(
     included. Files outside the folder that the run read, such as measured frames, are compared with their checksums at
     that time.
 
-    **Repeated run.** It takes as long as the run did, which is printed first. For a study one block of runs is
-    computed, a few seconds, and compared with study.nc. Every number is identical to the bit, equal up to rounding
-    (1e-9 of the largest of its kind, on another processor 1e-6, or 1e-3 of its sigma), or different, with key, old and
-    new value. Report pages are not compared: they contain the time. Differences in the version of the program, in
-    packages or in the processor are reported.
+    **Repeated run.** It takes as long as the run did, which is printed first. Every number is identical to the bit,
+    equal up to rounding (1e-9 of the largest of its kind, on another processor 1e-6, or 1e-3 of its sigma), or
+    different, with key, old and new value. Report pages, which contain the time, and pictures are not compared.
+    Differences in the version of the program, in packages or in the processor are reported.
 
     Nothing is written, except with `--keep`. `python -m twin.compare RUN DIR` then compares both in a report.
 
@@ -67,22 +61,19 @@ def main(
         from twin.compare import verification
         from twin.compare.verification import folder_state
 
-        if files and (every or keep is not None):
-            raise cli.InputErrorText("--files repeats nothing, so that it cannot be combined with --all or --keep")
+        if files and keep is not None:
+            raise cli.InputErrorText("--files repeats nothing, so that it cannot be combined with --keep")
         if keep is not None and (keep.exists() or keep.is_symlink()):
             raise cli.InputErrorText(f"--keep: {keep} exists; choose another folder")
         state = folder_state(run)
-        if every and not state.is_study:
-            raise cli.InputErrorText("--all is for studies; other runs are always repeated as a whole")
-        block = state.is_study and not every and keep is None
         why, made = "" if files else verification.obstacle(state), None
         if not files and not why:
             if not silent:
                 took = cli.time_text(state.manifest.wall_time_s)
-                text = "one block of the study" if block else f"the run, which took {took}"
-                errors.print(f"repeating {text}", markup=False, highlight=False, soft_wrap=True)
+                errors.print(f"repeating the run, which took {took}", markup=False, highlight=False, soft_wrap=True)
             try:
-                made = verification.repeat_block(state) if block else _whole(state, keep, silent)
+                with TemporaryDirectory(prefix="twin-verify-") as folder:
+                    made = verification.repeat(state, keep or Path(folder) / "again", silent)
             except verification.CannotRepeat as error:
                 why = str(error)
         done = verification.Verification(state, made, why)
@@ -96,17 +87,6 @@ def main(
                 console.print(line, markup=False, highlight=False, soft_wrap=True)
     if done.code:
         raise typer.Exit(done.code)
-
-
-def _whole(state: FolderState, keep: Path | None, silent: bool) -> Repetition:
-    """Repeat the whole run, in a folder to keep or in a temporary one."""
-    from twin.compare.verification import repeat
-    from twin.framework.owned_files import scratch
-
-    if keep is not None:
-        return repeat(state, keep, silent)
-    with scratch("twin-verify") as folder:
-        return repeat(state, folder / "again", silent)
 
 
 if __name__ == "__main__":

@@ -14,8 +14,8 @@ from typing import Annotated, Literal, NoReturn
 
 import typer
 
+from docs.supply.lock_file import FOLDER, LAYERS, LockError
 from docs.supply.make_lock import SupplyError, make_lock
-from twin.framework.lock_file import FOLDER, LAYERS, LockError
 
 app = typer.Typer(
     add_completion=False,

@@ -12,8 +12,8 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+from docs.supply.lock_file import FOLDER, Locked, normal, read_lock
 from docs.supply.make_lock import PLATFORM, PYTHONS, SupplyError, run_uv
-from twin.framework.lock_file import FOLDER, Locked, normal, read_lock
 
 TABLE = Path(__file__).with_name("licences.csv")
 CARRIED = Path(__file__).with_name("carried.csv")

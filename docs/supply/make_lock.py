@@ -9,7 +9,7 @@ import tempfile
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 
-from twin.framework.lock_file import FOLDER, Locked, normal, parse, read_layer
+from docs.supply.lock_file import FOLDER, Locked, normal, parse, read_layer
 
 ROOT = Path(__file__).resolve().parents[2]
 EXTRAS: Mapping[str, tuple[str, ...] | None] = {"runtime": (), "live": ("live",), "test": None}

@@ -19,8 +19,8 @@ from cyclonedx.validation.json import JsonStrictValidator
 from packageurl import PackageURL
 
 from docs.supply.licences import Carried, read_carried, read_table, unique
+from docs.supply.lock_file import FOLDER, LAYERS, read_lock
 from docs.supply.make_lock import ROOT, SupplyError
-from twin.framework.lock_file import FOLDER, LAYERS, read_lock
 
 EPOCH = datetime(1980, 1, 1, tzinfo=UTC)
 """Time stamp of every bill, so that the same lock gives the same bytes. The history of the lock gives the real date."""

@@ -13,9 +13,8 @@ from typing import Any
 
 from websockets.sync import client as client_of
 
-from twin.live.guard import COOKIE, Guard
 from twin.live.messages import Opened, packed
-from twin.live.server import LiveServer, listen
+from twin.live.server import COOKIE, Guard, LiveServer, listen
 
 SECRET = "a-secret-of-enough-letters"
 
@@ -27,17 +26,9 @@ class StandIn:
         self.opened = Opened({"instrument": "stand-in", "channels": []}, b"glb")
         self.seconds, self.bytes_each = seconds, bytes_each
         self.asked: list[tuple[str, Any]] = []
-        self.condition, self.ending, self.pid, self.started = "runs", "the computing process ended", 4321, 0
 
     def leave(self) -> None:
         pass
-
-    def kill(self) -> None:
-        self.condition = "ended"
-
-    async def restart(self) -> None:
-        self.started += 1
-        self.condition = "runs"
 
     async def ask(self, kind: str, question: Any) -> Any:
         self.asked.append((kind, question))

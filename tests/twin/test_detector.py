@@ -5,11 +5,8 @@ Every statistical limit is a two-sided chi-square (or normal) quantile with a fa
 
 from __future__ import annotations
 
-import itertools
 import re
-import time
 from contextlib import nullcontext
-from typing import Any
 
 import numpy as np
 import pytest
@@ -33,7 +30,7 @@ from twin.framework.data_files import FrameFacts, preview_png, tiff
 from twin.framework.frame_store import allocate_frames, in_file, largest_of, mean_of, release_memory, resident_bytes
 from twin.main_job.render_job import render_job
 from twin.render import app
-from twin.sensors import area_detector, exposure_kernel
+from twin.sensors import area_detector
 from twin.sensors.area_detector import (
     EmvaDetector,
     FixedOffsets,
@@ -42,9 +39,8 @@ from twin.sensors.area_detector import (
     coarse_step_warnings,
     coarse_warnings,
 )
-from twin.sensors.exposure_kernel import FEWEST
 from twin.sensors.line_ccd import Collection, LineCcd, Motion
-from twin.sensors.poisson_numbers import SERIES_END, TABLE_END, poisson_numbers, poisson_quantile
+from twin.sensors.poisson_numbers import SERIES_END, TABLE_END, poisson_pieces
 
 FALSE_ALARM = 1e-6
 SHEET = {
@@ -135,61 +131,22 @@ def test_many_frames_in_pieces_have_the_same_bits(full_well, noise, monkeypatch)
     pattern = ccd.fixed_pattern((1, 12, 20), 3)
     whole = ccd.expose(photons, pattern, 7, 0.01, 5)
     assert ccd.frames_at_once(7, 240) == 7
-    monkeypatch.setattr(area_detector, "_FRAMES_PIXELS", 500)
-    monkeypatch.setattr(area_detector, "_FURTHER_PIXELS", 500)
+    monkeypatch.setattr(area_detector, "_PIXELS_AT_ONCE", 500)
     monkeypatch.setattr(module, "_ROOM", 500)
     assert ccd.frames_at_once(7, 240) == 2
     np.testing.assert_array_equal(ccd.expose(photons, pattern, 7, 0.01, 5), whole)
 
 
-@pytest.mark.parametrize("dark_noise_e", [0.0, 9.0])
-def test_kernels_make_the_frames_of_numpy(dark_noise_e, monkeypatch):
-    """Bit for bit, at means below, in and beyond the tables, whatever is drawn together; a row of the table that is
-    wrong by one number is seen."""
-    ccd = detector(full_well_e=2e5, system_gain_dn_per_e=0.3, dark_noise_e=dark_noise_e)
-    photons = np.geomspace(1e-3, 4e5, 3 * 41 * 31).reshape(3, 41, 31)
+def test_exposures_of_several_seeds_are_those_of_one_after_the_other() -> None:
+    """Also where means beyond the expansion draw numbers in between, and whatever shares a seed."""
+    ccd = detector(full_well_e=2e5, system_gain_dn_per_e=0.3)
+    dim, huge = (np.geomspace(1e-3, high, 3 * 41 * 31).reshape(3, 41, 31) for high in (4e3, 4e5))
+    photons, seeds = np.stack([dim, huge, 1.1 * dim, huge]), [5, 5, 6, 6]
     pattern = ccd.fixed_pattern((3, 41, 31), 3)
-
-    def exposed(fewest: int) -> np.ndarray:
-        monkeypatch.setattr(area_detector, "FEWEST", fewest)
-        return ccd.expose(photons, pattern, 7, 0.01, 5)
-
-    by_numpy = exposed(10**9)
-    np.testing.assert_array_equal(exposed(0), by_numpy)
-    assert len(np.unique(by_numpy)) > 1000
-    monkeypatch.setattr(exposure_kernel, "_TOGETHER", 2 * 7 * 41 * 31)
-    np.testing.assert_array_equal(exposed(0), by_numpy)
-    monkeypatch.setattr(area_detector, "_FRAMES_PIXELS", 3 * 41 * 31)
-    np.testing.assert_array_equal(exposed(0), by_numpy)
-    seeds = [np.random.SeedSequence(5), np.random.SeedSequence(6)]
-    both = ccd.expose(np.stack([photons, photons]), pattern, 7, 0.01, seeds)
-    np.testing.assert_array_equal(both[0], by_numpy)
-    with pytest.raises(ValueError, match="2 seeds for 3 exposures"):
-        ccd.expose(photons, pattern, 7, 0.01, seeds)
-
-
-@pytest.mark.parametrize(("kept", "drawn"), [(0, 21), (2 * 7 * 41 * 31, 15), (1 << 22, 8)])
-@pytest.mark.parametrize("dark_noise_e", [0.0, 9.0])
-def test_exposures_of_one_seed_share_what_is_drawn_and_not_their_light(dark_noise_e, kept, drawn, monkeypatch):
-    """Bit for bit the frames of one exposure after the other, also where huge means draw numbers in between."""
-    ccd = detector(full_well_e=2e5, system_gain_dn_per_e=0.3, dark_noise_e=dark_noise_e)
-    dim = np.geomspace(1e-3, 4e3, 3 * 41 * 31).reshape(3, 41, 31)
-    huge = np.geomspace(1e-3, 4e5, 3 * 41 * 31).reshape(3, 41, 31)
-    photons = np.stack([dim, huge, dim[::-1], dim, 1.1 * dim, 2.0 * dim, huge])
-    seeds = [5, 5, 5, 6, 5, 6, 6]
-    pattern = ccd.fixed_pattern((3, 41, 31), 3)
-    monkeypatch.setattr(area_detector, "FEWEST", 0)
     alone = [ccd.expose(light, pattern, 7, 0.01, seed) for light, seed in zip(photons, seeds, strict=True)]
-    monkeypatch.setattr(exposure_kernel, "_TOGETHER", 2 * 7 * 41 * 31)
-    monkeypatch.setattr(exposure_kernel, "_MOST_KEPT", kept)
-    times, words_of = [], module.words_of
-    monkeypatch.setattr(module, "words_of", lambda *how: times.append(how) or words_of(*how))
-    for threads in (1, 4):
-        times.clear()
-        np.testing.assert_array_equal(ccd.expose(photons, pattern, 7, 0.01, seeds, threads), alone)
-        assert len(times) == drawn
-    monkeypatch.setattr(area_detector, "_FRAMES_PIXELS", 3 * 41 * 31)
     np.testing.assert_array_equal(ccd.expose(photons, pattern, 7, 0.01, seeds), alone)
+    with pytest.raises(ValueError, match="4 seeds for 3 exposures"):
+        ccd.expose(photons[:3], pattern, 7, 0.01, seeds)
 
 
 def test_well_and_converter_clip():
@@ -334,6 +291,12 @@ def words(rng: np.random.Generator, shape: tuple[int, ...]) -> np.ndarray:
     return rng.integers(0, LAST, shape, dtype=np.uint64, endpoint=True)
 
 
+def poisson_quantile(mean: np.ndarray, word: np.ndarray) -> np.ndarray:
+    out = np.empty(word.shape)
+    module._Plan.of(mean).fill(out, word)
+    return out
+
+
 def is_quantile(number: np.ndarray, mean: np.ndarray, word: np.ndarray) -> np.ndarray:
     """Whether F(n - 1) < u <= F(n), by SciPy's functions alone; the upper half of u by the upper tail."""
     upper = word > np.uint64(2**63 - 1)
@@ -382,7 +345,7 @@ def test_mixed_means_are_independent_and_each_has_its_own(kind) -> None:
     """All ways of one call, also of a generator whose words have 32 bits: means, variances, and neighbours, frames and
     means that do not know of each other."""
     mean = np.array([0.0, 1e-4, 0.5, 7.0, 31.0, 33.0, 900.0, 7e4, 3e5])
-    number = poisson_numbers(mean, 200_000, np.random.Generator(kind(2)))
+    (number,) = poisson_pieces(mean, 200_000, np.random.Generator(kind(2)), 200_000)
     assert np.all(number[:, 0] == 0.0)
     assert 3 <= np.count_nonzero(number[:, 1]) <= 48  # of 20: 1e-6 on either side
     scaled = (number[:, 2:] - mean[2:]) / np.sqrt(mean[2:])
@@ -412,7 +375,7 @@ def exposed(frames: int, threads: int | None = None, images: int = 3) -> np.ndar
 
 
 def test_frames_in_a_file_are_those_in_memory(small: None, monkeypatch: pytest.MonkeyPatch) -> None:
-    frames = 2 * FEWEST // (3 * 24 * 32)
+    frames = 43
     stored = exposed(frames)
     monkeypatch.setattr(frame_store, "IN_MEMORY", 1 << 28)
     kept = exposed(frames)
@@ -429,23 +392,6 @@ def test_frames_in_a_file_are_those_in_memory(small: None, monkeypatch: pytest.M
     facts = FrameFacts("a camera", 5e-6, 1e-3)
     assert bytes(tiff(stored[1], facts)) == tiff(kept[1], facts)
     assert preview_png(stored[2]) == preview_png(kept[2])
-
-
-@pytest.mark.second
-def test_threads_do_not_change_the_frames_of_one_image(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Several pieces of one image: a thread must not draw the next one while another draws the last."""
-    monkeypatch.setattr(area_detector, "_FRAMES_PIXELS", 32 * 24 * 32)
-    frames = 8 * FEWEST // (24 * 32)
-    first = exposed(frames, threads=1, images=1)
-    drawn, calls = module.words_of, itertools.count()
-
-    def slow(*arguments: Any) -> np.ndarray:
-        if next(calls) == 0:
-            time.sleep(0.2)
-        return drawn(*arguments)
-
-    monkeypatch.setattr(module, "words_of", slow)
-    np.testing.assert_array_equal(exposed(frames, threads=4, images=1), first)
 
 
 def test_a_full_disk_is_said_before(small: None, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -14,7 +14,7 @@ from packaging.requirements import Requirement
 from optics.numerics.extension_table import GROUPS, PREFIX, Entry
 from optics.numerics.llvm import VARIABLE, LibraryMissing, ensure_llvm, find_llvm
 from twin import doctor
-from twin.framework import doctor_probe, lock_file
+from twin.framework import doctor_probe
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -140,24 +140,6 @@ def test_every_check_says_what_fails(monkeypatch: pytest.MonkeyPatch) -> None:
     for found, status in (({"available": False}, "note"), ({"version": "12", "compute_capability": "9.0"}, "ok")):
         monkeypatch.setattr(doctor, "run_probe", lambda words, found=found: {"available": True, **found})
         assert doctor._gpu().status == status
-
-
-@pytest.mark.parametrize(
-    ("missing", "other", "unknown", "status"),
-    [("", "", "", "ok"), ("", "", "c", "ok"), ("", "b 1, locked 2", "", "note"), ("a==1", "b 1", "", "failed")],
-)
-def test_packages_that_are_not_as_locked_are_told(missing, other, unknown, status, monkeypatch) -> None:
-    lists = [tuple(filter(None, [text])) for text in (missing, other, unknown)]
-    monkeypatch.setattr(lock_file, "FOLDER", Path("/"))
-    monkeypatch.setattr(lock_file, "differences", lambda own: lock_file.Differences(3, *lists))
-    (check,) = doctor._lock()
-    assert (check.name, check.status) == ("lock", status)
-    assert all(text in check.detail for text in (missing, other, unknown))
-    assert ("bash setup.sh" in check.detail) == (status != "ok")
-    monkeypatch.setattr(lock_file, "differences", lambda own: lock_file.parse("numpy==1\n", "runtime", "a.txt"))
-    assert [(one.status, one.detail[:24]) for one in doctor._lock()] == [("failed", "cannot be read: a.txt:1:")]
-    monkeypatch.setattr(lock_file, "FOLDER", Path("/nowhere"))
-    assert doctor._lock() == []
 
 
 def test_extensions_are_listed_and_a_misspelt_group_is_named(monkeypatch: pytest.MonkeyPatch) -> None:

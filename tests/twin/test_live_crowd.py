@@ -12,19 +12,10 @@ import pytest
 pytest.importorskip("uvicorn", reason="the extra `live` is not installed")
 pytest.importorskip("websockets.sync.client", reason="the extra `live` is not installed")
 
-from websockets.exceptions import ConnectionClosed
 from websockets.frames import Frame, Opcode
 
 from tests.twin.live_client import SECRET, StandIn, ask, connect, numbered, serving, state
-from twin.live import guard
-from twin.live.guard import (
-    COOKIE,
-    MOST_AUTHENTICATED,
-    MOST_OF_ONE_ADDRESS,
-    MOST_UNAUTHENTICATED,
-    Guard,
-    names_of_this_machine,
-)
+from twin.live.server import COOKIE, Guard, names_of_this_machine
 
 WRONG = [
     b"\x16\x03\x01\x02\x00\x01\x00\x01\xfc\x03\x03" + bytes(range(256)),  # TLS
@@ -63,26 +54,6 @@ def lines(stack: ExitStack, port: int, number: int, said: bytes = b"", source: s
     return out
 
 
-def known(path: str, port: int) -> bytes:
-    """A request with the token."""
-    return (
-        f"GET {path} HTTP/1.1\r\nHost: 127.0.0.1:{port}\r\nCookie: {COOKIE.format(port=port)}={SECRET}\r\n\r\n".encode()
-    )
-
-
-def ended(line: socket.socket, seconds: float) -> bool:
-    """Whether the server ends a connection in this time."""
-    line.settimeout(seconds)
-    try:
-        while line.recv(65536):
-            pass
-    except TimeoutError:
-        return False
-    except OSError:
-        pass
-    return True
-
-
 def answered(port: int, ws, rounds: int, secret: str = SECRET) -> np.ndarray:
     """Seconds that parts of the page and states took, on a new connection and on the page's own."""
     out = []
@@ -100,9 +71,9 @@ def answered(port: int, ws, rounds: int, secret: str = SECRET) -> np.ndarray:
     return np.array(out)
 
 
-def test_who_says_nothing_locks_nobody_out(capfd):
-    """70 idle connections did: the server counted them, and answered 503 until they went."""
-    with serving(StandIn()) as (port, server), ExitStack() as stack:
+def test_who_says_nothing_or_nonsense_locks_nobody_out(capfd):
+    """300 idle connections and requests that are none: the page is answered promptly, and nothing is printed."""
+    with serving(StandIn()) as (port, _), ExitStack() as stack:
         for k in range(10):
             lines(stack, port, 30, source=f"127.0.0.{2 + k}")
         for text in WRONG:
@@ -111,96 +82,27 @@ def test_who_says_nothing_locks_nobody_out(capfd):
             ws.recv(5)
             # a machine on which much else runs holds up one answer or the other
             assert np.quantile(answered(port, ws, 20), 0.9) < PROMPT
-        assert len(server.connections) <= MOST_UNAUTHENTICATED + MOST_AUTHENTICATED
     said = capfd.readouterr()
     assert (said.out, said.err) == ("", "")
 
 
 @pytest.mark.second
-def test_one_address_does_not_take_the_places_of_others():
-    with serving(StandIn()) as (port, _), ExitStack() as stack:
-        quiet = lines(stack, port, 5, source="127.0.0.9")
-        time.sleep(0.1)
-        loud = lines(stack, port, 3 * MOST_OF_ONE_ADDRESS)
-        time.sleep(0.3)
-        assert not any(ended(line, 0.01) for line in quiet)
-        assert sum(ended(line, 0.01) for line in loud) == 2 * MOST_OF_ONE_ADDRESS
-
-
-@pytest.mark.second
-@pytest.mark.parametrize(
-    "said",
-    [b"", b"GET / HTTP/1.1\r\nHo", b"POST / HTTP/1.1\r\nHost: x\r\nContent-Length: 9000\r\n\r\nx"],
-    ids=["nothing", "half a head", "half a body"],
-)
-def test_what_is_never_said_whole_has_its_time(said, monkeypatch):
-    monkeypatch.setattr(guard, "HEAD_TIMEOUT", 0.4)
-    with serving(StandIn()) as (port, server), ExitStack() as stack:
-        [line] = lines(stack, port, 1, said)
-        began = time.monotonic()
-        while not ended(line, 0.1) and time.monotonic() - began < 3.0:
-            line.sendall(b"x")
-        assert time.monotonic() - began < 1.5
-        time.sleep(0.05)
-        assert len(server.connections) == 0
-
-
-@pytest.mark.second
-def test_the_next_request_of_a_connection_has_its_time_too(monkeypatch):
-    monkeypatch.setattr(guard, "HEAD_TIMEOUT", 0.4)
-    with serving(StandIn()) as (port, _), ExitStack() as stack:
-        [line] = lines(stack, port, 1, known("/session", port))
-        assert b" 200 " in line.recv(65536)
-        assert not ended(line, 0.8)  # between requests there is more time
-        line.sendall(b"GET /")
-        assert ended(line, 1.5)
-
-
-@pytest.mark.second
-def test_an_answer_that_is_not_taken_is_given_up(monkeypatch):
-    monkeypatch.setattr(guard, "ANSWER_TIMEOUT", 0.5)
-    with serving(StandIn()) as (port, server), ExitStack() as stack:
-        lines(stack, port, 1, known("/three.min.js", port) * 40)
-        time.sleep(0.2)
-        assert len(server.connections) == 1
-        time.sleep(1.0)
-        assert len(server.connections) == 0
-
-
-@pytest.mark.second
-def test_a_page_that_never_reads_is_dropped_and_leaves_nothing(monkeypatch):
+def test_a_page_that_never_reads_is_dropped(monkeypatch):
     """A client of its own: others read by themselves, in a thread."""
     monkeypatch.setattr("twin.live.clients.SEND_TIMEOUT", 0.3)
-    monkeypatch.setattr(guard, "CLOSE_TIMEOUT", 0.3)
     with serving(StandIn(bytes_each=30_000_000)) as (port, server), ExitStack() as stack:
         head = SOCKET.replace(b"127.0.0.1", f"127.0.0.1:{port}".encode())
         said = head + f"Cookie: {COOKIE.format(port=port)}={SECRET}\r\n\r\n".encode()
         [line] = lines(stack, port, 1, said)
         assert b" 101 " in line.recv(4096)
         came, n = time.monotonic(), 0
-        while server.api.clients or server._uvicorn.server_state.connections:
+        while server.api.clients:
             assert time.monotonic() - came < 20.0
             n += 1
             with suppress(OSError):  # it may be cut off by now
                 line.sendall(Frame(Opcode.TEXT, state(n).encode()).serialize(mask=True))
             time.sleep(0.1)
         assert server.api.states >= 2
-
-
-@pytest.mark.parametrize("pieces", [[b"\xff\xfe"], [b'{"type": "\xc3', b'\x28"}']])
-def test_text_that_is_not_utf_8_ends_the_page_without_a_traceback(pieces, capfd):
-    with serving(StandIn()) as (port, _):
-        with connect(port) as ws:
-            ws.recv(5)
-            for k, piece in enumerate(pieces):
-                kind = Opcode.CONT if k else Opcode.TEXT
-                ws.socket.sendall(Frame(kind, piece, fin=k == len(pieces) - 1).serialize(mask=True))
-            with pytest.raises(ConnectionClosed) as closed:
-                ws.recv(5)
-            assert closed.value.rcvd is not None
-            assert closed.value.rcvd.code == 1007
-        assert ask(port, "/session")[0] == 200
-    assert capfd.readouterr().err == ""
 
 
 # --- several servers, other names -------------------------------------------------------------------------------------

@@ -21,10 +21,9 @@ from tests.twin.live_client import SECRET, StandIn, ask, connect, numbered, serv
 from twin.framework.cli import InputErrorText
 from twin.live.__main__ import TOKEN, _serve
 from twin.live.clients import BAD_MESSAGES, Client, Disconnected
-from twin.live.computer import CannotStart, ComputerLost
-from twin.live.guard import BadToken, Guard, new_token
+from twin.live.computer import ComputerLost
 from twin.live.messages import LARGEST_MESSAGE, AskedState, BadMessage, BlindState, read_message
-from twin.live.server import LiveServer, listen
+from twin.live.server import BadToken, Guard, LiveServer, listen, new_token
 
 
 @contextmanager
@@ -45,9 +44,6 @@ def wait_for(ws, n: int) -> None:
 
 def told(*lines) -> list[dict[str, Any]]:
     return [json.loads(line.recv(5)) for line in lines]
-
-
-RUNS = {"type": "computing", "state": "runs", "problem": ""}
 
 
 @pytest.fixture(scope="module")
@@ -377,108 +373,34 @@ def test_what_is_hidden_is_chosen_here_and_stays_until_it_is_revealed():
     assert not isinstance(client.state, BlindState)
 
 
-class Fragile(StandIn):
-    """Ends over state 1, as often as it is told."""
-
-    def __init__(self, times: int) -> None:
-        super().__init__()
-        self.times = times
-
-    async def ask(self, kind: str, question: Any) -> Any:
-        if question[0].n == 1 and self.times:
-            self.times -= 1
-            raise ComputerLost("the computing process ended (killed by SIGKILL)")
-        return await super().ask(kind, question)
-
-
-@pytest.mark.second
-def test_a_lost_computer_is_told_to_every_page_and_what_was_asked_for_is_answered():
-    computer = Fragile(1)
-    with pages(computer, 2) as (_, _, ws, other):
-        ws.send(state(1))
-        for lost in told(ws, other):
-            assert (lost["type"], lost["state"]) == ("computing", "ended")
-            assert "killed by SIGKILL" in lost["problem"]
-        assert told(ws, other) == [RUNS, RUNS]
-        assert numbered(ws.recv(5)) == 1
-    assert computer.started == 1
-
-
-def test_what_ends_it_twice_is_left_out():
-    computer = Fragile(5)
-    with pages(computer) as (_, _, ws):
-        ws.send(state(1))
-        *states, refused, runs = told(*[ws] * 5)
-        assert [one["state"] for one in states] == ["ended", "runs", "ended"]
-        assert (refused["type"], "twice" in refused["problem"], runs) == ("refused", True, RUNS)
-        ws.send(state(2))
-        assert numbered(ws.recv(5)) == 2
-    assert computer.started == 2
-
-
-@pytest.mark.second
-def test_a_computer_that_ends_while_nobody_asks_is_told_and_started_again():
-    computer = StandIn()
-    with pages(computer) as (_, _, ws):
-        began = time.monotonic()
-        computer.condition = "ended"
-        assert told(ws)[0]["state"] == "ended"
-        assert time.monotonic() - began < 2.0
-        assert told(ws) == [RUNS]
-
-
-@pytest.mark.second
-def test_a_stopped_computer_is_told_and_started_again_if_it_stays(monkeypatch):
-    monkeypatch.setattr("twin.live.clients.STOP_TIMEOUT", 1.0)
-    computer = StandIn()
-    with pages(computer) as (port, _, ws):
-        began = time.monotonic()
-        computer.condition = "stopped"
-        problem = told(ws)[0]["problem"]
-        assert time.monotonic() - began < 2.0
-        assert "kill -CONT 4321" in problem
-        with connect(port) as late:  # who comes later is told as well
-            assert told(late, late)[1]["problem"] == problem
-        computer.condition = "runs"
-        assert told(ws) == [RUNS]
-        computer.condition = "stopped"
-        assert [one["state"] for one in told(ws, ws, ws)] == ["stopped", "ended", "runs"]
-    assert computer.started == 1
-
-
-def test_a_computer_that_goes_on_is_told_before_its_answer_comes():
-    class GoesOn(StandIn):
+def test_a_computer_that_ends_is_told_to_every_page_and_ends_the_server_with_the_reason():
+    class Fragile(StandIn):
         async def ask(self, kind: str, question: Any) -> Any:
-            self.condition = "runs"
-            return await super().ask(kind, question)
-
-    computer = GoesOn()
-    with pages(computer, 2) as (_, _, ws, other):
-        computer.condition = "stopped"
-        assert [one["state"] for one in told(ws, other)] == ["stopped", "stopped"]
-        ws.send(state(1))
-        # the next look at the process is a quarter of a second away, the answer some milliseconds
-        assert told(ws, other) == [RUNS, RUNS]
-        assert numbered(ws.recv(5)) == 1
-
-
-def test_a_computer_that_cannot_be_started_again_ends_the_server_with_the_reason():
-    class Gone(StandIn):
-        async def restart(self) -> None:
-            raise CannotStart("job.yaml: no such file")
+            raise ComputerLost("the computing process ended (killed by SIGKILL)")
 
     listening = listen("127.0.0.1", 0)
     port = listening.getsockname()[1]
-    computer = Gone()
-    server = LiveServer(computer, Guard.of(SECRET, "127.0.0.1", port), True)  # type: ignore[arg-type]
-    threading.Timer(0.5, computer.kill).start()
-    with pytest.raises(CannotStart, match="no such file"):
+    server = LiveServer(Fragile(), Guard.of(SECRET, "127.0.0.1", port), True)  # type: ignore[arg-type]
+    told = []
+
+    def page() -> None:
+        with connect(port) as ws, connect(port) as other:
+            for one in (ws, other):
+                one.recv(5)
+            ws.send(state(1))
+            told.extend(json.loads(one.recv(5)) for one in (ws, other))
+
+    thread = threading.Thread(target=page)
+    thread.start()
+    with pytest.raises(ComputerLost, match="killed by SIGKILL"):
         server.run(listening)
+    thread.join(10)
+    assert [(one["type"], "killed by SIGKILL" in one["problem"]) for one in told] == [("refused", True)] * 2
 
 
 def test_an_instrument_that_cannot_be_built_is_told_by_the_command(monkeypatch):
     def start(*words: object) -> None:
-        raise CannotStart("job.yaml: no such file")
+        raise ComputerLost("job.yaml: no such file")
 
     monkeypatch.setattr("twin.live.computer.Computer.start", start)
     with pytest.raises(InputErrorText, match=r"job\.yaml: no such file"):

@@ -18,7 +18,7 @@ import xarray as xr
 
 from tests.twin.study_bench import ROOT
 from twin.framework import durable, run_folder
-from twin.framework.owned_files import LOCK, MANIFEST, OLD, PARTIAL, Unfinished, scratch
+from twin.framework.owned_files import MANIFEST, PARTIAL, make_unfinished
 from twin.framework.provenance import versions
 from twin.framework.run_folder import KeptWork, Numbered, RunFolder, RunFolderError, is_run_folder
 
@@ -186,6 +186,7 @@ def test_force_puts_the_old_run_back_when_the_rename_fails(tmp_path, monkeypatch
             raise OSError(13, "no")
         real(source, end)
 
+    monkeypatch.setattr(durable, "exchange", lambda first, second: False)
     monkeypatch.setattr(run_folder.os, "rename", rename)
     with pytest.raises(RunFolderError, match="Permission denied"):
         a_run(target, "second", force=True)
@@ -348,7 +349,7 @@ def kill_a_run(target: Path, act: str = "") -> None:
 @pytest.mark.second
 def test_what_a_killed_run_left_is_removed_by_the_next(tmp_path):
     kill_a_run(tmp_path / "other")
-    assert {path.suffix for path in tmp_path.iterdir()} == {f".{PARTIAL}", f".{LOCK}"}
+    assert [path.suffix for path in tmp_path.iterdir()] == [f".{PARTIAL}"]
     (tmp_path / ".mine.partial").mkdir()
     (tmp_path / ".mine.01234567.partial").touch()
     a_run(tmp_path / "run")
@@ -368,56 +369,12 @@ def test_what_a_living_run_has_is_left_alone(tmp_path):
     assert {path.name for path in tmp_path.iterdir()} == {"run", "other", "third"}
 
 
-AWAY = "os.rename(folder.target, folder._unfinished.path('old'))"
-
-
-def test_a_run_that_was_being_replaced_is_put_back(tmp_path):
-    """Killed between the two renames: the old folder stands under its hidden name, none under its own."""
-    target = a_run(tmp_path / "run")
-    kill_a_run(target, AWAY)
-    assert not target.exists()
-    with pytest.raises(RunFolderError, match="exists"):
-        a_run(target, "second")
-    assert (target / "a/b.txt").read_text() == "first"
-    assert {path.name for path in tmp_path.iterdir()} == {"run"}
-
-
-LEFT = """
-import os, signal
-from twin.framework.owned_files import scratch
-with scratch("twin-own") as folder:
-    (folder / "sub").mkdir()
-    os.kill(os.getpid(), signal.SIGKILL)
-"""
-
-
-def test_scratch_of_a_killed_process_goes_and_that_of_others_stays(tmp_path, monkeypatch):
-    monkeypatch.setenv("TMPDIR", str(tmp_path))
-    monkeypatch.setattr("tempfile.tempdir", None)
-    subprocess.run([sys.executable, "-c", LEFT], cwd=ROOT, timeout=60)
-    left = everything(tmp_path)
-    assert len(left) == 3
-    with monkeypatch.context() as patch:
-        patch.setattr(os, "getuid", lambda: 12345)
-        with scratch("twin-own"):
-            assert left < everything(tmp_path)
-    theirs = tmp_path / ".twin-own.01234567.lock"  # a trap
-    (tmp_path / "precious").write_text("mine")
-    theirs.symlink_to(tmp_path / "precious")
-    with scratch("twin-own") as first:
-        assert stat.S_IMODE(first.stat().st_mode) == 0o700
-        with scratch("twin-own") as second:
-            assert first.exists()
-            assert second != first
-    assert everything(tmp_path) == {theirs.name, "precious"}
-
-
 def test_a_run_that_has_changed_places_with_the_old_one(tmp_path):
     """Killed just after that: what stands under the new one's hidden name is the old one, with what was put there."""
     target = a_run(tmp_path / "run")
     act = "from twin.framework import run_folder as r; (folder.target / 'late.txt').write_text('mine'); "
     act += "r.write_manifest(folder, 'twin.test', 1.0, 1.0); "
-    act += "os.rename(folder.path / r._WAITING, folder.path / r.MANIFEST); r.replace_folder.__globals__['exchange']("
+    act += "os.rename(folder.path / r._WAITING, folder.path / r.MANIFEST); r.replace_folder("
     kill_a_run(target, act + "folder.path, folder.target)")
     assert everything(target) == {"half.txt", MANIFEST}
     a_run(tmp_path / "other")
@@ -436,20 +393,23 @@ def test_folders_that_cannot_change_places_in_one_step(tmp_path, monkeypatch):
     assert {path.name for path in tmp_path.iterdir()} == {"run"}
 
 
-def test_a_run_that_was_replaced_is_removed(tmp_path):
-    """Killed between the second rename and the removal; a file that was put there meanwhile is kept."""
-    target = a_run(tmp_path / "run", "new")
-    left = Unfinished(target)
-    old = a_run(tmp_path / "old", "old")
-    (old / "late.txt").write_text("mine")
-    os.rename(old, left.path(OLD))
-    a_run(tmp_path / "while it lives")
-    assert left.path(OLD).exists()
-    os.close(left._lock)
-    a_run(tmp_path / "afterwards")
-    assert {path.name for path in tmp_path.iterdir()} == {"run", "while it lives", "afterwards"}
-    assert (target / "a/b.txt").read_text() == "new"
-    assert (target / "late.txt").read_text() == "mine"
+def test_a_complete_run_that_was_not_put_in_its_place_goes_only_if_that_is_taken(tmp_path):
+    """Killed just before; nothing is removed while its process lives, or is the last copy of a run."""
+    unfinished, lock = make_unfinished(tmp_path / "run")
+    a_run(tmp_path / "new").rename(unfinished / "below")
+    for path in list((unfinished / "below").iterdir()):
+        path.rename(unfinished / path.name)
+    (unfinished / "below").rmdir()
+    a_run(tmp_path / "run", "second")
+    assert unfinished.exists()
+    os.close(lock)
+    (tmp_path / "run").rename(tmp_path / "away")
+    a_run(tmp_path / "other")
+    assert unfinished.exists()
+    (tmp_path / "away").rename(tmp_path / "run")
+    a_run(tmp_path / "third")
+    assert {path.name for path in tmp_path.iterdir()} == {"run", "other", "third"}
+    assert (tmp_path / "run/a/b.txt").read_text() == "second"
 
 
 # what commands keep beside their run folder

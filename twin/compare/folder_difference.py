@@ -7,17 +7,14 @@ excluded. `file_difference` lists every number, text and array that is not equal
 
 import csv
 import io
-import json
 import math
 import re
-import struct
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import tifffile
 
@@ -61,14 +58,11 @@ class Content:
         Name -> array.
     statements : Mapping[str, Any]
         Key -> sentences that follow from the numbers.
-    drawn : bool
-        Whether the file is a picture.
     """
 
     numbers: Mapping[str, Leaf]
     arrays: Mapping[str, np.ndarray]
     statements: Mapping[str, Any]
-    drawn: bool = False
 
 
 @dataclass(frozen=True)
@@ -177,8 +171,6 @@ class FileDifference:
         Differing sentences that follow from the numbers.
     common_numbers, common_arrays : int
         Number of values and of arrays that both files have; 0 and 1 for files of equal bytes that are not JSON.
-    drawn : bool
-        Whether the file is a picture.
     """
 
     file: str
@@ -187,7 +179,6 @@ class FileDifference:
     statements: tuple[NumberDifference, ...] = ()
     common_numbers: int = 0
     common_arrays: int = 1
-    drawn: bool = False
 
 
 def file_difference(name: str, reference: Path | None, other: Path | None) -> FileDifference:
@@ -245,7 +236,7 @@ def content_difference(name: str, reference: Content, other: Content) -> FileDif
         if before.get(key) != after.get(key)
     ]
     common = (len(reference_numbers.keys() & other_numbers.keys()), len(reference.arrays.keys() & other.arrays.keys()))
-    return FileDifference(name, tuple(numbers), tuple(arrays), tuple(statements), *common, reference.drawn)
+    return FileDifference(name, tuple(numbers), tuple(arrays), tuple(statements), *common)
 
 
 def array_difference(file: str, name: str, here: np.ndarray | None, there: np.ndarray | None) -> ArrayDifference | None:
@@ -519,19 +510,10 @@ def _parquet(content: bytes) -> Content:
     return Content({}, {str(name): table[name].to_numpy() for name in table.columns}, {})
 
 
-def _png(content: bytes) -> Content:
-    pixels = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED)
-    if pixels is None:
-        raise ValueError("no PNG")
-    return Content({}, {"": pixels}, {}, drawn=True)
-
-
 _NUMBER = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?")
-_IDENTIFIER = re.compile(r"""(\bid="|url\(#|href="#)[^")]*""")
-"""Identifiers in an SVG, which are checksums of the elements they name."""
 
 
-def _text(content: bytes, drawn: bool = False) -> Content:
+def _text(content: bytes) -> Content:
     """Return a text file's content: its numbers as an array, and its words with "#" instead of each number.
 
     Of a file that is not text, the bytes are the array.
@@ -541,20 +523,7 @@ def _text(content: bytes, drawn: bool = False) -> Content:
     except UnicodeDecodeError:
         return Content({}, {"bytes": np.frombuffer(content, np.uint8)}, {})
     numbers = np.array([float(number) for number in _NUMBER.findall(text)])
-    return Content({"text": _NUMBER.sub("#", text)}, {"numbers": numbers}, {}, drawn)
-
-
-def _drawing(content: bytes) -> Content:
-    return _text(_IDENTIFIER.sub(r"\1", content.decode("utf-8")).encode(), drawn=True)
-
-
-def _scene(content: bytes) -> Content:
-    """Return the JSON of a GLB, and the numbers of its geometry."""
-    length = struct.unpack_from("<I", content, 12)[0]
-    scene = plain(json.loads(content[20 : 20 + length]))
-    binary = content[20 + length + 8 :]
-    geometry = np.frombuffer(binary, "<f4", len(binary) // 4)
-    return Content(scene.numbers, {**scene.arrays, "geometry": geometry}, {}, drawn=True)
+    return Content({"text": _NUMBER.sub("#", text)}, {"numbers": numbers}, {})
 
 
 READERS: dict[str, Callable[[bytes], Content]] = {
@@ -565,9 +534,6 @@ READERS: dict[str, Callable[[bytes], Content]] = {
     "tif": _tiff,
     "fits": _fits,
     "parquet": _parquet,
-    "png": _png,
-    "svg": _drawing,
-    "glb": _scene,
     "journal": lambda content: Content({}, {}, {}),  # journal of a study, whose numbers are in study.nc
 }
 """Suffix of a file name -> function that reads the numbers, texts and arrays of such a file."""

@@ -1,7 +1,4 @@
-"""Repetition of a run from its folder, and the verdict on the folder and the run.
-
-A whole run is repeated by its command in a process of its own. Of a study (many runs of one job) one block of runs is
-repeated in this process.
+"""Repetition of a run from its folder, by its command in another process, and the verdict on folder and run.
 
 State of a run folder: which files differ from its manifest; and differences of machine and program between two runs.
 
@@ -15,27 +12,20 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from scenes.yaml.errors import InputError, Issue
-from scenes.yaml.input_file import read_json
 from twin.compare import folder_difference as difference
 from twin.compare.folder_difference import ArrayDifference, FileDifference, Leaf, NumberDifference
 from twin.framework import provenance, report, run_folder
-from twin.framework.journal import read_pieces
 from twin.framework.owned_files import MANIFEST, PARTIAL, digest, files_below, first_names
 from twin.framework.provenance import Provenance
 from twin.framework.run_folder import Manifest
 from twin.monitor.calibration_cache import recomputed
-from twin.study.runs import blocks, setup
-from twin.study.runs.base_job import BlockResult
-from twin.study.runs.plan import Plan
-from twin.study.study_files import make_dataset, summary
+from twin.study.runs.blocks import BLOCKS
 
 
 @dataclass(frozen=True)
@@ -77,11 +67,6 @@ class FolderState:
     def sealed(self) -> bool:
         """True if the manifest contains a checksum of itself, so that changes to it are detected."""
         return self.manifest.digest is not None
-
-    @property
-    def is_study(self) -> bool:
-        """True if the folder is that of a study (many runs of one job), of which a part can be repeated."""
-        return self.manifest.program == "twin.study" and not self.manifest.gradient
 
 
 def folder_state(folder: Path) -> FolderState:
@@ -168,32 +153,14 @@ class Elsewhere:
     known: bool
 
 
-def elsewhere(manifest: Manifest, here: Provenance | None, now: Mapping[str, str]) -> Elsewhere:
-    """Compare the program and machine of a run with those of its repetition.
-
-    Parameters
-    ----------
-    manifest : Manifest
-        Manifest of the run.
-    here : Provenance | None
-        Record of program and machine of the repetition.
-    now : Mapping[str, str]
-        Versions of the packages of the repetition.
-    """
-    program, made = _changes(manifest.versions, now), manifest.provenance
+def elsewhere(old: Manifest, new: Manifest) -> Elsewhere:
+    """Compare the program and machine of a run, by its manifest, with those of its repetition."""
+    program, made, here = _changes(old.versions, new.versions), old.provenance, new.provenance
     if made is None or here is None:
         return Elsewhere((*program,), (), False)
     program = [*_changes({"source": made.source[:12]}, {"source": here.source[:12]}), *program]
     program += _changes(made.packages, here.packages)
-    kernels, others = _kernels(made), _kernels(here)
-    common = kernels.keys() & others.keys()
-    processor = _changes(_machine(made), _machine(here))
-    processor += [
-        f"{library} with kernels for {kernels[library]} then, {others[library]} now"
-        for library in sorted(common)
-        if kernels[library] != others[library]
-    ]
-    return Elsewhere((*program,), (*processor,), True)
+    return Elsewhere((*program,), (*_changes(_machine(made), _machine(here)),), True)
 
 
 def _changes(then: Mapping[str, str], now: Mapping[str, str]) -> list[str]:
@@ -202,22 +169,15 @@ def _changes(then: Mapping[str, str], now: Mapping[str, str]) -> list[str]:
 
 
 def _machine(where: Provenance) -> dict[str, str]:
-    """Return the properties of a machine that change rounding, except the linear algebra's kernels.
-
-    The number of threads does not change rounding.
-    """
+    """Return the properties of a machine that change rounding; the number of threads does not."""
     settings = [f"{key}={value}" for key, value in where.settings.items() if not key.endswith("THREADS")]
     return {
         "processor": where.processor,
         "instructions": ", ".join(where.simd) or "none",
         "C library": where.libc,
         "settings": ", ".join(settings) or "none",
+        **{f"{library.name} {library.version} with kernels for": library.kernels for library in where.blas},
     }
-
-
-def _kernels(where: Provenance) -> dict[str, str]:
-    """Return name of each linear-algebra library -> processor type for which the kernels that it used are made."""
-    return {f"{library.name} {library.version}": library.kernels for library in where.blas}
 
 
 EQUAL, UNEQUAL, NOT_REPEATED = 0, 1, 2
@@ -228,13 +188,12 @@ MOST_PRINTED = 5
 MOST_LISTED = 20
 """Largest number of differing quantities of a file in the JSON output; those that differ most are listed."""
 SAME, ROUNDED, DIFFERENT, EXCLUDED = "same", "rounding", "different", "excluded"
-REDRAWN = "redrawn"
-"""State of a picture drawn from numbers that differ by rounding only, so that its lines are slightly displaced."""
 GONE, NEW = "only in the run", "only in the repeated run"
 EXCLUDED_FILES: Mapping[str, str] = {
     "html": "a page that states when and where it was made; its numbers are those of the other files",
     "md": "a page that states how long it took; its numbers are those of the other files",
-    blocks.BLOCKS: "runs in the order of their computation; their numbers are those of study.nc",
+    **dict.fromkeys(("svg", "png", "glb"), "a picture; the numbers that it shows are those of the other files"),
+    BLOCKS: "runs in the order of their computation; their numbers are those of study.nc",
 }
 """Suffix or name of files that are not compared -> the reason."""
 
@@ -266,13 +225,6 @@ PIXEL_SHARE, GREY_LEVELS = 1e-4, 2
 Where the expected photons of a pixel lie, within rounding, at a value where the random number of photons changes by
 one, the frames differ.
 """
-PICTURE_LEVELS = 4
-"""Largest difference of rendered figures that counts as rounding, in grey levels of 255.
-
-Partly covered pixels along drawn edges may differ by so much.
-"""
-RELATIVE_OF_GEOMETRY = 1e-6
-"""Largest difference of 3-D geometry in single precision that counts as rounding, relative to its largest value."""
 
 
 @dataclass(frozen=True)
@@ -311,7 +263,7 @@ class FileState:
     file : str
         Path in the folder.
     state : str
-        ``SAME``, ``ROUNDED`` (equal within rounding), ``DIFFERENT``, ``EXCLUDED`` (not compared), ``REDRAWN``, ``GONE``
+        ``SAME``, ``ROUNDED`` (equal within rounding), ``DIFFERENT``, ``EXCLUDED`` (not compared), ``GONE``
         (only in the run) or ``NEW`` (only in the repeated run).
     quantities : tuple[Quantity, ...]
         Quantities that differ, the largest difference first, at most `MOST_LISTED`.
@@ -326,11 +278,6 @@ class FileState:
     quantities: tuple[Quantity, ...] = ()
     count: int = 0
     why: str = ""
-
-    @property
-    def drawn(self) -> bool:
-        """True if the file is a picture."""
-        return difference.ending(self.file) in ("svg", "png", "glb")
 
 
 def file_state(name: str, old: Path, new: Path, elsewhere: bool) -> FileState:
@@ -372,7 +319,7 @@ def file_state_of(compared: FileDifference, elsewhere: bool = False) -> FileStat
         Whether the run was repeated on a different processor, which rounds otherwise.
     """
     quantities = [*(_number(entry, elsewhere) for entry in compared.numbers)]
-    quantities += [_array(array, compared.drawn, elsewhere) for array in compared.arrays]
+    quantities += [_array(array, elsewhere) for array in compared.arrays]
     if not quantities:
         quantities = [
             Quantity(claim.key, _short(claim.reference), _short(claim.other)) for claim in compared.statements
@@ -398,10 +345,10 @@ def _number(number: NumberDifference, elsewhere: bool) -> Quantity:
     return Quantity(number.key, number.reference, number.other, relative, in_sigma, rounding)
 
 
-def _array(array: ArrayDifference, drawn: bool, elsewhere: bool) -> Quantity:
+def _array(array: ArrayDifference, elsewhere: bool) -> Quantity:
     """Return the largest difference of an array in two files, with the decision whether it is rounding.
 
-    ``drawn`` is True for a picture, ``elsewhere`` if the run was repeated on a different processor.
+    ``elsewhere`` is True if the run was repeated on a different processor.
     """
     name = array.name or "pixels"
     if array.share is None:
@@ -412,14 +359,10 @@ def _array(array: ArrayDifference, drawn: bool, elsewhere: bool) -> Quantity:
     if array.largest is None or array.peak is None:
         return Quantity(key, _short(array.reference), _short(array.other))
     worst = array.largest if array.finite else math.inf
-    if drawn and array.depth:
-        rounding = worst <= PICTURE_LEVELS * (257 if array.depth == 2 else 1)
-    elif elsewhere and array.depth:
+    if elsewhere and array.depth:
         rounding = worst <= GREY_LEVELS and array.share <= PIXEL_SHARE
     else:
-        rounding = (
-            worst <= (RELATIVE_OF_GEOMETRY if drawn else RELATIVE_ELSEWHERE if elsewhere else RELATIVE) * array.peak
-        )
+        rounding = worst <= (RELATIVE_ELSEWHERE if elsewhere else RELATIVE) * array.peak
     relative = worst / array.peak if array.peak and array.finite else None
     return Quantity(key, array.reference, array.other, relative, None, rounding)
 
@@ -447,25 +390,22 @@ class Repetition:
         Differences of program and machine from those of the run.
     seconds : float
         Duration of the repetition, in seconds.
-    what : str
-        Description of the repeated part if it is not the whole run; otherwise empty.
     """
 
     files: tuple[FileState, ...]
     elsewhere: Elsewhere
     seconds: float
-    what: str = ""
 
     @property
     def state(self) -> str:
         """SAME, ROUNDED or DIFFERENT: the state of the file that differs most."""
         states = {file.state for file in self.files} - {SAME, EXCLUDED}
-        return DIFFERENT if states - {ROUNDED, REDRAWN} else ROUNDED if states else SAME
+        return DIFFERENT if states - {ROUNDED} else ROUNDED if states else SAME
 
     def numbers(self) -> dict[str, Any]:
         """Return the repetition as plain data."""
         there = self.elsewhere
-        about = {"state": self.state, "what": self.what or "the whole run", "seconds": self.seconds}
+        about = {"state": self.state, "seconds": self.seconds}
         about |= {"other_program": list(there.program), "other_processor": list(there.processor)}
         files = [
             {"file": f.file, "state": f.state, "quantities": f.count, "why": f.why}
@@ -494,7 +434,7 @@ def obstacle(state: FolderState) -> str:
 
 @recomputed()  # a repetition must not reuse results of the run that it checks
 def repeat(state: FolderState, folder: Path, quiet: bool) -> Repetition:
-    """Repeat a whole run, and compare every file.
+    """Repeat a run, and compare every file.
 
     Parameters
     ----------
@@ -542,87 +482,10 @@ def repeat(state: FolderState, folder: Path, quiet: bool) -> Repetition:
         raise CannotRepeat(
             f"{' '.join(arguments)} ended with exit code {process.returncode}{': ' if text else ''}{text}"
         )
-    where = elsewhere(manifest, repetition.provenance, repetition.versions)
+    where = elsewhere(manifest, repetition)
     names = dict.fromkeys((*manifest.sha256, *repetition.sha256))
     files = [file_state(name, state.folder / name, folder / name, bool(where.processor)) for name in names]
-    return Repetition(tuple(redrawn(files)), where, time.monotonic() - began)
-
-
-def redrawn(files: Sequence[FileState]) -> Iterator[FileState]:
-    """Yield the files of one run, with state REDRAWN for pictures that differ while all numbers agree to rounding.
-
-    Parameters
-    ----------
-    files : Sequence[FileState]
-        Compared files of one run.
-    """
-    numbers = {file.state for file in files if not file.drawn} - {SAME, EXCLUDED}
-    for file in files:
-        yield replace(file, state=REDRAWN) if numbers == {ROUNDED} and file.drawn and file.state == DIFFERENT else file
-
-
-@recomputed()
-def repeat_block(state: FolderState) -> Repetition:
-    """Repeat the middle block of runs of a study, and compare all blocks with the study's data set.
-
-    Parameters
-    ----------
-    state : FolderState
-        State of its folder, for which `obstacle` is empty.
-
-    Raises
-    ------
-    CannotRepeat
-        Blocks are missing or incomplete, or config.yaml cannot be read.
-    """
-    began, folder = time.monotonic(), state.folder
-    try:
-        plan = Plan.of(setup.resolve_study(folder / CONFIG))
-        content = (folder / blocks.BLOCKS).read_bytes()
-    except (OSError, InputError) as error:
-        raise CannotRepeat(str(error)) from error
-    with blocks.journal_of(plan.setup, None) as journal:
-        journal.known = read_pieces(content, journal.classes)[1]
-        engine = blocks.Engine(plan, journal, state.manifest.backend or "llvm")
-        if engine.missing:
-            raise CannotRepeat("its blocks are incomplete; --all repeats the whole study")
-        middle, whole = plan.blocks // 2, engine.result()
-        kept, repetition = journal.known[str(middle)], blocks.evaluate(engine.task(middle))
-    block = difference.content_difference(
-        f"{blocks.BLOCKS}: {middle}", _responses(kept, plan), _responses(repetition, plan)
-    )
-    where = elsewhere(state.manifest, provenance.Provenance.here(), provenance.versions())
-    files, runs = (file_state_of(block), *_data_states(folder, plan, whole)), plan.block(middle)
-    return Repetition(files, where, time.monotonic() - began, f"runs {runs[0]} to {runs[-1]} of {plan.runs}")
-
-
-def _responses(result: BlockResult, plan: Plan) -> difference.Content:
-    """Return the results (responses) of each run in a block of a study, as numbers to compare."""
-    arrays = {
-        f"{response}{ending}": getattr(result, part)[:, r]
-        for r, response in enumerate(plan.setup.study.responses)
-        for ending, part in (("", "values"), (" sigma", "sigmas"), (" noise", "noises"))
-    }
-    texts = {part: np.array(getattr(result, part), object) for part in ("messages", "doubts")}
-    return difference.Content({}, arrays | texts, {})
-
-
-def _data_states(folder: Path, plan: Plan, whole: BlockResult) -> Iterable[FileState]:
-    """Compare a study's data set and summary, study.nc and study.json, with the results of its blocks."""
-    name = "study.nc"
-    try:
-        stored_arrays = difference.content_of(folder / name, name).arrays
-        stored = read_json(folder / "study.json")
-    except InputError as error:
-        return (FileState(name, DIFFERENT, why=error.issues[0].problem),)
-    data = make_dataset(plan, whole)
-    repetition = {str(key): np.asarray(data[key].values) for key in data.data_vars}
-    common = {key: values for key, values in stored_arrays.items() if key in repetition}
-    again = summary(data, plan)
-    arrays = (name, difference.Content({}, common, {}), difference.Content({}, repetition, {}))
-    # the data set follows from the blocks, and the summary from the data set
-    numbers = ("study.json", difference.plain({key: stored.get(key) for key in again}), difference.plain(again))
-    return [file_state_of(difference.content_difference(*pair)) for pair in (arrays, numbers)]
+    return Repetition(tuple(files), where, time.monotonic() - began)
 
 
 @dataclass(frozen=True)
@@ -678,7 +541,7 @@ class Verification:
         if repetition is None:
             return ["the run was not repeated"]
         compared = [file for file in repetition.files if file.state != EXCLUDED]
-        rounded = [comparison for comparison in compared if comparison.state in (ROUNDED, REDRAWN)]
+        rounded = [comparison for comparison in compared if comparison.state == ROUNDED]
         others = [comparison.file for comparison in compared if comparison.state != SAME and comparison not in rounded]
         text = {
             SAME: f"has the same numbers in all {len(compared)} files",
@@ -686,7 +549,7 @@ class Verification:
             f"{_largest(rounded)}",
             DIFFERENT: f"differs in {first_names(others)}",
         }[repetition.state]
-        out = [f"a repetition of {repetition.what or 'the run'} {text}"]
+        out = [f"a repetition of the run {text}"]
         where = repetition.elsewhere
         if not where.known:
             out.append("the manifest does not name the processor and the source that made it")
@@ -736,7 +599,7 @@ class Verification:
 
 def _largest(files: Sequence[FileState]) -> str:
     """Return a text with the largest differences of numbers, relative to their size and in sigmas."""
-    numbers = [quantity for file in files if not file.drawn for quantity in file.quantities]
+    numbers = [quantity for file in files for quantity in file.quantities]
     relative = max((number.relative or 0.0 for number in numbers), default=0.0)
     in_sigma = max((number.in_sigma or 0.0 for number in numbers), default=0.0)
     return f"{relative:.2g} of their value" + (f" and {in_sigma:.2g} sigma" if in_sigma else "")

@@ -13,12 +13,12 @@ from contextlib import AbstractContextManager, ExitStack, contextmanager
 from dataclasses import dataclass, field
 from itertools import islice
 from multiprocessing import resource_tracker
-from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
 from urllib.parse import urlsplit
 
 from optics.numerics.backend import ONE_THREAD, cores
-from twin.framework import cli, durable, owned_files, provenance
+from twin.framework import cli, durable, provenance
 
 if TYPE_CHECKING:  # its import takes half a second, and a study's file is read before workers are started
     from distributed import Client
@@ -37,7 +37,7 @@ RETRIES = 2
 """Number of times that a task is given to another worker after its worker died."""
 SCHEMES = ("tcp://", "tls://", "ws://", "wss://")
 ENCRYPTED = ("tls://", "wss://")
-SCRATCH = "twin-study"
+SCRATCH = "twin-study-"
 """Prefix of the names of the temporary folders in which worker processes write files."""
 
 
@@ -170,12 +170,12 @@ def local_workers(count: int) -> Iterator[Workers]:
     All connections therefore use TLS with a key that is made for the command and kept in memory; a peer without it is
     refused.
     """
-    with owned_files.scratch(SCRATCH) as folder, _cluster(count, folder) as workers:
+    with TemporaryDirectory(prefix=SCRATCH, ignore_cleanup_errors=True) as folder, _cluster(count, folder) as workers:
         yield workers
 
 
 @contextmanager
-def _cluster(count: int, folder: Path) -> Iterator[Workers]:
+def _cluster(count: int, folder: str) -> Iterator[Workers]:
     """Start local worker processes that write their files below the folder ``folder``."""
     import dask
     from distributed import Client, LocalCluster
@@ -196,7 +196,7 @@ def _cluster(count: int, folder: Path) -> Iterator[Workers]:
         "distributed.scheduler.worker-ttl": None,
         "distributed.admin.large-graph-warning-threshold": "1GB",
         "distributed.comm.timeouts.connect": "60s",
-        "temporary-directory": str(folder),
+        "temporary-directory": folder,
         "logging": {"distributed": "critical", "distributed.nanny": "critical", "tornado": "critical"},
     }
     with _restored_environment():
@@ -214,7 +214,7 @@ def _cluster(count: int, folder: Path) -> Iterator[Workers]:
                     dashboard_address="127.0.0.1:0",
                     worker_dashboard_address="127.0.0.1:0",
                     scheduler_kwargs={"dashboard": False},
-                    local_directory=str(folder),
+                    local_directory=folder,
                     memory_limit=0,
                     silence_logs=logging.CRITICAL,
                 )

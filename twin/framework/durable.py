@@ -160,8 +160,8 @@ def exchange(first: Path, second: Path) -> bool:
     raise OSError(number, os.strerror(number), str(second))
 
 
-def replace_folder(new: Path, target: Path, aside: Path) -> None:
-    """Replace a folder by another and move the former aside; ``new`` must already be written through.
+def replace_folder(new: Path, target: Path) -> None:
+    """Replace a folder by another, already written through, under whose name the former one then is.
 
     A program that is killed meanwhile leaves the target either old or new. Only where folders cannot be exchanged
     atomically it may leave no target; both folders then exist beside it.
@@ -172,27 +172,21 @@ def replace_folder(new: Path, target: Path, aside: Path) -> None:
         Folder to put at ``target``.
     target : Path
         Existing folder to replace.
-    aside : Path
-        Free path for the former target.
 
     Raises
     ------
     OSError
         The replacement failed; nothing has changed.
     """
-    if exchange(new, target):
-        try:
-            os.rename(new, aside)
-        except BaseException:
-            exchange(new, target)
-            raise
-    else:
+    if not exchange(new, target):
+        aside = new.with_suffix(".old")
         os.rename(target, aside)
         try:
             os.rename(new, target)
         except BaseException:
             os.rename(aside, target)
             raise
+        os.rename(aside, new)
     # the former target is removed next, which must not reach the disk before this
     sync_folder(target.parent)
 

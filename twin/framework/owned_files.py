@@ -1,9 +1,8 @@
 """Ownership of the files in the folder of a run or study, and of the temporary names beside it.
 
-Inside the folder checksums decide: a file that was changed belongs to the user. Beside it are hidden names of a folder
-that is being made or replaced: ``.NAME.TOKEN.partial`` (a run that is being written), ``.NAME.TOKEN.old`` (the run that
-it replaces) and ``.NAME.TOKEN.lock``, which the process holds locked as long as it lives. The operating system releases
-the lock when the process ends, however it ends; a name without a held lock therefore belongs to no process.
+Inside the folder checksums decide: a file that was changed belongs to the user. Beside it is a hidden folder,
+``.NAME.TOKEN.partial``: the run that is being written or, while it is removed, the run that was replaced. The process
+holds it locked as long as it lives. The operating system releases the lock when the process ends, however it ends.
 """
 
 import fcntl
@@ -12,7 +11,6 @@ import os
 import re
 import secrets
 import shutil
-import tempfile
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -98,125 +96,79 @@ def remove_files(folder: Path, kept: set[str]) -> None:
             os.rmdir(subfolder)
 
 
-PARTIAL, OLD, LOCK = "partial", "old", "lock"
-
-_NAME = re.compile(rf"\.(?P<name>.+)\.(?P<token>[0-9a-f]{{8}})\.(?:{PARTIAL}|{OLD}|{LOCK})")
-
-
-def _beside(target: Path, token: str) -> dict[str, Path]:
-    """Return the hidden temporary paths beside a target folder, by their ending (PARTIAL, OLD or LOCK)."""
-    return {ending: target.with_name(f".{target.name}.{token}.{ending}") for ending in (PARTIAL, OLD, LOCK)}
+PARTIAL = "partial"
+"""Extension of the hidden name of a run folder that is being written."""
+_NAME = re.compile(rf"\.(?P<name>.+)\.[0-9a-f]{{8}}\.{PARTIAL}")
 
 
-class Unfinished:
-    """Hidden temporary names beside a folder, reserved for this process until ``close``.
+def make_unfinished(target: Path) -> tuple[Path, int]:
+    """Make a hidden folder beside a target folder, locked by this process.
 
-    Parameters
-    ----------
-    target
-        Folder that is being made; its parent exists.
+    Returns
+    -------
+    tuple of Path and int
+        Path of the folder, and the descriptor that holds the lock.
 
     Raises
     ------
     OSError
-        Nothing can be written beside the folder.
+        Nothing can be written beside the target.
     """
-
-    def __init__(self, target: Path) -> None:
-        lock = None
-        while lock is None:  # a process that sweeps the folder may hold the lock of a new file for a moment
-            self._names = _beside(target, secrets.token_hex(4))
-            lock = locked(self._names[LOCK])
-        self._lock = lock
-
-    def path(self, ending: str) -> Path:
-        """Return the hidden name with the ending PARTIAL or OLD."""
-        return self._names[ending]
-
-    def close(self) -> None:
-        """Release the names; nothing may exist under them any more."""
-        self._names[LOCK].unlink(missing_ok=True)
-        os.close(self._lock)
+    while True:
+        path = target.with_name(f".{target.name}.{secrets.token_hex(4)}.{PARTIAL}")
+        path.mkdir()
+        with suppress(FileNotFoundError):  # a process that sweeps the folder has removed it before it was locked
+            lock = os.open(path, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+            with suppress(OSError):  # a file system without locks
+                fcntl.flock(lock, fcntl.LOCK_EX)
+            if os.fstat(lock).st_nlink:
+                return path, lock
+            os.close(lock)
 
 
-@contextmanager
-def scratch(stem: str) -> Iterator[Path]:
-    """Make a temporary folder that only this user can read and that is removed at the end of the block.
+def sweep(folder: Path, remove_replaced: Callable[[Path, Path], None]) -> None:
+    """Remove hidden run folders that dead processes of this user left in ``folder``.
 
-    Folders that killed processes of this user left there are removed first.
-
-    Raises
-    ------
-    OSError
-        The folder cannot be made.
-    """
-    target = Path(tempfile.gettempdir()) / stem
-    sweep(target.parent)
-    names = Unfinished(target)
-    folder = names.path(PARTIAL)
-    try:
-        folder.mkdir(mode=0o700)
-        yield folder
-    finally:
-        shutil.rmtree(folder, ignore_errors=True)
-        names.close()
-
-
-def sweep(folder: Path, replaced: Callable[[Path, Path], bool] = lambda former, new: False) -> None:
-    """Remove what dead processes of this user left in ``folder``; names of living processes are not touched.
-
-    Partly written folders are removed. A folder that was to be replaced is restored if nothing has taken its place.
+    One that is complete is the run that its target replaced, or was about to replace it; without a target it stays.
 
     Parameters
     ----------
     folder : Path
         Folder that contains run folders.
-    replaced : callable
-        Function of the replaced folder and of the one in its place. It removes the former if that is right, and returns
-        True if it did.
+    remove_replaced : callable
+        Function that removes a complete hidden folder; the second argument is its target.
     """
+    with suppress(OSError):  # a folder that cannot be read is reported when it is written to
+        for path in sorted(folder.iterdir()):
+            if (match := _NAME.fullmatch(path.name)) is not None:
+                with suppress(OSError), _lock_of_dead(path):
+                    target = folder / match["name"]
+                    if not (path / MANIFEST).exists():
+                        shutil.rmtree(path)
+                    elif target.exists():
+                        remove_replaced(path, target)
+
+
+@contextmanager
+def _lock_of_dead(path: Path) -> Iterator[None]:
+    """Lock a hidden folder of this user. Raises OSError if it is another's, or a process holds it."""
+    lock = os.open(path, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC)
     try:
-        names = {(m["name"], m["token"]) for path in folder.iterdir() if (m := _NAME.fullmatch(path.name))}
-    except OSError:  # a folder that cannot be read is reported when it is written to
-        return
-    for name, token in sorted(names):
-        paths = _beside(folder / name, token)
-        with suppress(OSError):  # without permission to remove it, it stays
-            if any(existing.lstat().st_uid != os.getuid() for existing in paths.values() if os.path.lexists(existing)):
-                continue
-            if (lock := locked(paths[LOCK], certain=True)) is not None:
-                try:
-                    _clear(folder / name, paths, replaced)
-                finally:
-                    os.close(lock)
+        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        if os.fstat(lock).st_uid != os.getuid():
+            raise PermissionError(str(path))
+        yield
+    finally:
+        os.close(lock)
 
 
-def _clear(target: Path, paths: dict[str, Path], replaced: Callable[[Path, Path], bool]) -> None:
-    """Remove or restore the hidden files and folders that a dead process left beside a target."""
-    partial, former = paths[PARTIAL], paths[OLD]
-    if partial.is_dir() and not partial.is_symlink():
-        if (partial / MANIFEST).exists() and target.exists() and not former.exists():
-            # complete: it had been exchanged with the target, or was about to be
-            partial.rename(former)
-        else:
-            shutil.rmtree(partial)
-    if former.is_dir() and not former.is_symlink():
-        if not os.path.lexists(target):
-            former.rename(target)
-        elif not replaced(former, target):
-            return
-    paths[LOCK].unlink(missing_ok=True)
-
-
-def locked(path: Path, certain: bool = False) -> int | None:
+def locked(path: Path) -> int | None:
     """Open a file, making it if it is missing, and lock it.
 
     Parameters
     ----------
     path : Path
         Path of the file.
-    certain : bool
-        True to return None also if the file system has no locks.
 
     Returns
     -------
@@ -233,7 +185,7 @@ def locked(path: Path, certain: bool = False) -> int | None:
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError as error:
-            if certain or isinstance(error, BlockingIOError):
+            if isinstance(error, BlockingIOError):
                 os.close(lock)
                 return None
         if os.fstat(lock).st_nlink:

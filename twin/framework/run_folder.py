@@ -90,7 +90,7 @@ class RunFolder:
         self.target = target.free() if isinstance(target, Numbered) else Path(target)
         self.force = force
         self.path = self.target
-        self._unfinished: owned_files.Unfinished | None = None
+        self._lock: int | None = None
         self._made_parents: list[Path] = []
         try:
             self._check_target()
@@ -121,12 +121,8 @@ class RunFolder:
         """Make the temporary folder."""
         try:
             self._made_parents = make_folders(self.target.parent)
-            owned_files.sweep(self.target.parent, remove_replaced)
-            if self._numbered is None:
-                self._check_target()  # the sweep may have restored a folder that a killed run had moved aside
-            self._unfinished = owned_files.Unfinished(self.target)
-            self.path = self._unfinished.path(owned_files.PARTIAL)
-            self.path.mkdir()
+            owned_files.sweep(self.target.parent, remove_run)
+            self.path, self._lock = owned_files.make_unfinished(self.target)
         except BaseException as error:
             self._remove()
             if isinstance(error, OSError):
@@ -152,26 +148,25 @@ class RunFolder:
 
     def _remove(self) -> None:
         """Remove the temporary folder and everything in it after a failure."""
-        if self._unfinished is not None:
-            shutil.rmtree(self._unfinished.path(owned_files.PARTIAL), ignore_errors=True)
-            self._unfinished.close()
+        if self._lock is not None:
+            shutil.rmtree(self.path, ignore_errors=True)
+            os.close(self._lock)
         with suppress(OSError):  # another program has put a file there
             for parent in self._made_parents:
                 parent.rmdir()
 
     def _publish(self) -> None:
         """Write the folder through to the disk and rename it to the target."""
-        assert self._unfinished is not None
+        assert self._lock is not None
         sync_tree(self.path)
         if (self.path / _WAITING).exists():
             os.rename(self.path / _WAITING, self.path / MANIFEST)
             sync_folder(self.path)
         with ending_later():
             if self.force and self.target.exists():
-                old = self._unfinished.path(owned_files.OLD)
-                replace_folder(self.path, self.target, old)
+                replace_folder(self.path, self.target)
                 with suppress(OSError):  # the next run in this folder tries again
-                    remove_run(old, self.target)
+                    remove_run(self.path, self.target)
             else:
                 self._claim()
                 try:
@@ -180,7 +175,7 @@ class RunFolder:
                     self.target.rmdir()
                     raise
                 sync_folder(self.target.parent)
-            self._unfinished.close()
+            os.close(self._lock)
 
     def _claim(self) -> None:
         """Reserve the target's name with an empty folder, which the rename replaces; only one process can make it."""
@@ -488,27 +483,6 @@ def remove_run(old: Path, new: Path) -> None:
         path.parent.mkdir(parents=True, exist_ok=True)
         (old / name).rename(path)
     owned_files.remove_files(old, set())
-
-
-def remove_replaced(old: Path, new: Path) -> bool:
-    """Remove a folder that a killed process had replaced, if the folder in its place is complete.
-
-    Parameters
-    ----------
-    old : Path
-        Replaced folder, under another name.
-    new : Path
-        Folder in its place.
-
-    Returns
-    -------
-    bool
-        True if it was removed.
-    """
-    if not is_run_folder(new):
-        return False
-    remove_run(old, new)
-    return True
 
 
 def reason(error: OSError) -> str:

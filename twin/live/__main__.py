@@ -115,11 +115,10 @@ def _serve(
         The extra is missing, the address is in use, or the instrument cannot be built.
     """
     try:
-        from twin.live.guard import BadToken, Guard, new_token
-        from twin.live.server import LiveServer, addresses, listen
+        from twin.live.server import BadToken, Guard, LiveServer, addresses, listen, new_token
     except ImportError as error:
         raise InputErrorText(f"{EXTRA} ({error.name})") from None
-    from twin.live.computer import CannotStart, Computer
+    from twin.live.computer import Computer, ComputerLost
 
     try:
         token = new_token(TOKEN)
@@ -144,7 +143,7 @@ def _serve(
                 console.print(line, highlight=False, soft_wrap=True)
             console.print("Ctrl-C ends it" + ("." if stay else ", and so does closing the last page."))
         LiveServer(computer, guard, stay).run(listening)
-    except CannotStart as error:
+    except ComputerLost as error:
         raise InputErrorText(str(error)) from None
     finally:
         computer.stop()

@@ -18,7 +18,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from twin.live import messages
-from twin.live.computer import BeforeKey, Computer, ComputerLost, Kind
+from twin.live.computer import BeforeKey, Computer, ComputerLost
 
 MOST_CLIENTS = 8
 """Largest number of connected pages."""
@@ -33,22 +33,10 @@ MOST_RECORDED = 20_000
 """Largest number of states in a recording; the oldest are dropped."""
 MOST_QUEUED = 32
 """Largest number of text messages queued for a slow connection, in addition to states and pictures."""
-WATCH_INTERVAL = 0.25
-"""Interval at which the computing process is checked, in seconds."""
-STOP_TIMEOUT = 10.0
-"""Time after which a process stopped by a signal is restarted, in seconds."""
 SEND_TIMEOUT = 20.0
 """Time that a page may take to receive one answer, in seconds."""
 POLICY_VIOLATION, TRY_AGAIN = 1008, 1013
 """Codes with which the server closes a WebSocket: the page violates a rule, or it may try again later."""
-
-
-RESTARTED_TEXT = "{}; it is being restarted, and the knobs are kept"
-STOPPED_TEXT = (
-    "the computing process ({pid}) was stopped by a signal; `kill -CONT {pid}` resumes it, otherwise it is "
-    "restarted after {seconds:.0f} s; the knobs are kept"
-)
-"""Message to the pages that the computing process was stopped by a signal."""
 
 
 class Disconnected(Exception):
@@ -63,22 +51,6 @@ class Disconnected(Exception):
     def __init__(self, code: int, reason: str) -> None:
         super().__init__(reason)
         self.code, self.reason = code, reason
-
-
-@dataclass(frozen=True, eq=False)
-class _Request:
-    """Request of a page to the computing process.
-
-    Attributes
-    ----------
-    kind : str
-        Name of the attribute of `Client` that held the request; "save" for one of ``saves``.
-    asked : Message
-        The message.
-    """
-
-    kind: str
-    asked: Any
 
 
 @dataclass(eq=False)
@@ -134,21 +106,17 @@ class Client:
         """True if the page has a request that is not served yet."""
         return bool(self.state or self.view or self.factors or self.saves or self.reveal)
 
-    def next_request(self) -> _Request:
-        """Remove and return the page's next request; the page must have one."""
-        if self.saves and not (self.factors or self.state or self.reveal):
-            return _Request("save", self.saves.popleft())
-        kind = next(kind for kind in ("factors", "state", "reveal", "view") if getattr(self, kind) is not None)
-        request = _Request(kind, getattr(self, kind))
-        setattr(self, kind, None)
-        return request
+    def next_request(self) -> tuple[str, Any]:
+        """Remove and return the page's next request, by its kind and message; the page must have one.
 
-    def requeue(self, request: _Request) -> None:
-        """Put back a request that could not be served, unless a later one of the same kind replaces it."""
-        if request.kind == "save":
-            self.saves.appendleft(request.asked)
-        elif getattr(self, request.kind) is None:
-            setattr(self, request.kind, request.asked)
+        The kind is the name of the attribute that held the request, or "save" for one of ``saves``.
+        """
+        if self.saves and not (self.factors or self.state or self.reveal):
+            return "save", self.saves.popleft()
+        kind = next(kind for kind in ("factors", "state", "reveal", "view") if getattr(self, kind) is not None)
+        asked = getattr(self, kind)
+        setattr(self, kind, None)
+        return kind, asked
 
     def receive(self, text: str | bytes) -> None:
         """Handle a message that the page sent.
@@ -279,10 +247,7 @@ class LiveApi:
         self.clients: list[Client] = []
         self.states = 0
         """Number of states computed so far."""
-        self.process_trouble: dict[str, Any] = {}
-        """Message to the pages about a problem of the computing process; empty without a problem."""
         self._wake = asyncio.Event()
-        self._suspect_message: object = None
 
     def connect(self) -> Client:
         """Add a new page.
@@ -312,90 +277,21 @@ class LiveApi:
 
         Raises
         ------
-        CannotStart
-            The computing process ended and cannot be restarted.
+        ComputerLost
+            The computing process ended; all pages are told before.
         """
         while True:
-            if self.computer.condition == "ended":
-                await self._restart()
             client = self._next()
             if client is None:
                 self._wake.clear()
                 await self._wake.wait()
                 continue
-            request = client.next_request()
             try:
-                await self._answer_request(client, request)
+                await self._answer_request(client, *client.next_request())
             except ComputerLost as error:
-                self._requeue_lost(client, request, str(error))
-                await self._restart()
-
-    async def watch_process(self) -> None:
-        """Check the computing process, without end, and inform the pages when its condition changes."""
-        since = 0.0
-        while True:
-            await asyncio.sleep(WATCH_INTERVAL)
-            condition, known = self.computer.condition, self.process_trouble.get("state", "runs")
-            if condition == "ended":
-                self._announce("ended", RESTARTED_TEXT.format(self.computer.ending))
-                self.notify()
-            elif condition == "stopped" and known != "stopped":
-                since = time.monotonic()
-                self._announce("stopped", STOPPED_TEXT.format(pid=self.computer.pid, seconds=STOP_TIMEOUT))
-            elif condition == "stopped" and time.monotonic() - since > STOP_TIMEOUT:
-                self.computer.kill()
-            elif condition == "runs":
-                self._announce_running()
-
-    async def _ask(self, kind: Kind, question: Any) -> Any:
-        """Return the answer of the computing process.
-
-        An answer shows that a process reported as stopped runs again; the pages are informed before they get it.
-
-        Raises
-        ------
-        ComputerLost
-            The process ended.
-        """
-        answer = await self.computer.ask(kind, question)
-        if self.process_trouble and self.computer.condition == "runs":
-            self._announce_running()
-        return answer
-
-    def _announce_running(self) -> None:
-        """Inform the pages that the process runs, if it was reported as stopped."""
-        if self.process_trouble.get("state") == "stopped":
-            self._announce("runs")
-
-    def _announce(self, state: str, problem: str = "") -> None:
-        """Inform all present and later pages about the computing process, once for each change of its state."""
-        news = {"type": "computing", "state": state, "problem": problem}
-        if news == self.process_trouble or (state == "ended" and self.process_trouble.get("state") == "ended"):
-            return
-        self.process_trouble = news if problem else {}
-        for client in self.clients:
-            client.queue_json(news)
-
-    def _requeue_lost(self, client: Client, request: _Request, problem: str) -> None:
-        """Put back a request during which the process ended, unless it did so twice for this request."""
-        self._announce("ended", RESTARTED_TEXT.format(problem))
-        if request.asked is self._suspect_message:
-            text = f"{problem} twice during the same {request.kind}, which is skipped"
-            client.queue_json({"type": "refused", "problem": text})
-        else:
-            self._suspect_message = request.asked
-            client.requeue(request)
-
-    async def _restart(self) -> None:
-        """Restart the computing process; waiting requests stay."""
-        self._announce("ended", RESTARTED_TEXT.format(self.computer.ending))
-        before = self.computer.opened.greeting
-        await self.computer.restart()
-        for client in self.clients:
-            client.before = None
-            if self.computer.opened.greeting != before:  # the instrument's files have changed
-                client.queue_json({"type": "hello", **self.computer.opened.greeting})
-        self._announce("runs")
+                for one in self.clients:
+                    one.queue_json({"type": "refused", "problem": str(error)})
+                raise
 
     def _next(self) -> Client | None:
         """Return the next page to be served: one that requests a state, or else any with a request.
@@ -414,7 +310,7 @@ class LiveApi:
         """Have the instrument built with other values of a study's factors, and inform all pages."""
         for one in self.clients:
             one.queue_json({"type": "building"})
-        answer = await self._ask("factors", asked.values)
+        answer = await self.computer.ask("factors", asked.values)
         if isinstance(answer, str):
             client.queue_json({"type": "refused", "problem": answer})
         else:
@@ -423,22 +319,21 @@ class LiveApi:
         for one in self.clients:
             one.queue_json({"type": "hello", **self.computer.opened.greeting})
 
-    async def _answer_request(self, client: Client, request: _Request) -> None:
+    async def _answer_request(self, client: Client, kind: str, asked: Any) -> None:
         """Have the computing process answer a request of a page, and queue the answer."""
-        asked = request.asked
-        match request.kind:
+        match kind:
             case "factors":
                 await self._build(client, asked)
             case "state":
                 key = (asked.noise, asked.frames, asked.seed)
-                client.queue_state(await self._ask("state", (asked, client.before)), key)
+                client.queue_state(await self.computer.ask("state", (asked, client.before)), key)
                 client.state_computed(asked)
                 self.states += 1
             case "reveal":
-                client.queue_text(await self._ask("hidden", asked))
+                client.queue_text(await self.computer.ask("hidden", asked))
             case "save" if asked.what != "course":
-                client.queue_text(await self._ask(asked.what, asked.state))
+                client.queue_text(await self.computer.ask(asked.what, asked.state))
             case "save":
-                client.queue_text(await self._ask("course", list(client.recorded or ())))
+                client.queue_text(await self.computer.ask("course", list(client.recorded or ())))
             case _:
-                client.queue_picture(await self._ask("view", asked))
+                client.queue_picture(await self.computer.ask("view", asked))

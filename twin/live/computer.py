@@ -20,7 +20,6 @@ from dataclasses import asdict
 from itertools import pairwise
 from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection
-from pathlib import Path
 from typing import Any, Literal
 
 from optics.numerics.backend import BackendUnavailable, cores, kernel_threads, one_blas_thread
@@ -165,19 +164,12 @@ class RequestHandler:
 
 Kind = Literal["state", "view", "hidden", "job", "course", "camera", "factors"]
 BeforeKey = tuple[bool, int, int]
-Condition = Literal["starts", "runs", "stopped", "ended"]
 EXIT_TIMEOUT = 3.0
 """Time that the process may take to end by itself before it is killed, in seconds."""
-ATTEMPTS = 3
-"""Number of attempts to restart the process if it ends during its start."""
 
 
 class ComputerLost(Exception):
-    """Error that the computing process has ended; the message says how."""
-
-
-class CannotStart(Exception):
-    """Error that the instrument cannot be built; the message is the one that a command would print."""
+    """Error that the computing process has ended or cannot be started; the message says how or why."""
 
 
 class Computer:
@@ -198,10 +190,7 @@ class Computer:
         self._process: Any = None
         self._pipe: Connection | None = None
         self._request_lock = asyncio.Lock()
-        self._starting = self._asked = self._shutting_down = False
-        # two threads that poll the exit of one process would take its status from each other
-        self._process_lock = threading.Lock()
-        self._factors: Any = None
+        self._asked = False
         self.opened = Opened({}, b"")
 
     def start(self, advance: Callable[[str], None] = lambda part: None) -> None:
@@ -214,23 +203,8 @@ class Computer:
 
         Raises
         ------
-        CannotStart
-            The process cannot be started; the message says why.
-        """
-        try:
-            self._start(advance)
-        except ComputerLost as error:
-            raise CannotStart(str(error)) from error
-
-    def _start(self, advance: Callable[[str], None] = lambda part: None) -> None:
-        """Start the process once and wait until it is ready.
-
-        Raises
-        ------
-        CannotStart
-            The instrument cannot be built.
         ComputerLost
-            The process ended during its start.
+            The instrument cannot be built, or the process ended during its start.
         """
         context = multiprocessing.get_context("spawn")
         self._pipe, child_pipe = context.Pipe()
@@ -255,44 +229,9 @@ class Computer:
                     self.opened = value
                     return
                 else:
-                    raise CannotStart(value)
+                    raise ComputerLost(value)
         except (EOFError, OSError) as error:
             raise ComputerLost(self._describe_end()) from error
-
-    def _restart(self) -> None:
-        """Start the process again, with the latest values of a study's factors.
-
-        Raises
-        ------
-        CannotStart
-            The process cannot be started; the message says why.
-        """
-        for attempt in range(1, ATTEMPTS + 1):
-            try:
-                self._start()
-                if self._factors is not None:
-                    answer = self._exchange("factors", self._factors)
-                    if not isinstance(answer, str):
-                        self.opened = answer
-                return
-            except ComputerLost as error:
-                if attempt == ATTEMPTS or self._shutting_down:
-                    raise CannotStart(f"{error}, {attempt} times during its restart") from error
-
-    async def restart(self) -> None:
-        """Replace a process that ended by a new one.
-
-        Raises
-        ------
-        CannotStart
-            The process cannot be started; the message says why.
-        """
-        async with self._request_lock:
-            self._starting = True
-            try:
-                await asyncio.get_running_loop().run_in_executor(None, self._restart)
-            finally:
-                self._starting = False
 
     async def ask(self, kind: Kind, question: Any) -> Any:
         """Return the answer to a request.
@@ -305,7 +244,7 @@ class Computer:
         async with self._request_lock:
             answer = await asyncio.get_running_loop().run_in_executor(None, self._exchange, kind, question)
             if kind == "factors" and not isinstance(answer, str):
-                self._factors, self.opened = question, answer
+                self.opened = answer
             return answer
 
     def _exchange(self, kind: Kind, question: Any) -> Any:
@@ -323,49 +262,18 @@ class Computer:
     def _describe_end(self) -> str:
         """Wait for the end of a process that has closed its pipe, and return how it ended."""
         last = time.monotonic() + EXIT_TIMEOUT
-        while self._alive():
+        while self._process.is_alive():
             if time.monotonic() > last:
-                self.kill()
+                self._process.kill()
             time.sleep(0.01)
-        return self.ending
-
-    def _alive(self) -> bool:
-        with self._process_lock:
-            return self._process is not None and bool(self._process.is_alive())
-
-    @property
-    def ending(self) -> str:
-        """Description, as text, of how the computing process ended."""
-        code = None if self._process is None else self._process.exitcode
-        if code is None:
-            return "the computing process ended"
+        code = self._process.exitcode
         how = f"exit code {code}" if code >= 0 else f"killed by {signal.Signals(-code).name}"
         return f"the computing process ended ({how})"
 
-    @property
-    def pid(self) -> int | None:
-        """Process id of the computing process; None before its start."""
-        return None if self._process is None else self._process.pid
-
-    @property
-    def condition(self) -> Condition:
-        """Condition of the process: starting, running, stopped by a signal, or ended."""
-        alive = self._alive()
-        if alive and _stopped(self._process.pid):
-            return "stopped"
-        return "starts" if self._starting else "runs" if alive else "ended"
-
-    def kill(self) -> None:
-        """Kill the process; callers that wait for an answer get ComputerLost."""
-        with self._process_lock:
-            if self._process is not None:
-                self._process.kill()
-
     def leave(self) -> None:
         """Prepare the end of the server: kill the process if an answer is awaited, which would delay the server."""
-        self._shutting_down = True
-        if self._asked or self._starting or self.condition == "stopped":
-            self.kill()
+        if self._asked:
+            self._process.kill()
 
     def stop(self) -> None:
         """End the computing process."""
@@ -376,15 +284,6 @@ class Computer:
             if self._process.is_alive():
                 self._process.kill()
                 self._process.join()
-
-
-def _stopped(pid: int) -> bool:
-    """Return whether a process was stopped by a signal (not by a debugger); False if the system cannot tell."""
-    try:
-        message = Path(f"/proc/{pid}/stat").read_text("utf-8", "replace")
-    except OSError:
-        return False
-    return message.rpartition(")")[2].split()[:1] == ["T"]
 
 
 def compute(pipe: Connection, what: str, backend: str, run: int | None) -> None:

@@ -38,7 +38,6 @@ from scenes.yaml.errors import Problem, unknown
 from scenes.yaml.spec import Spec
 from twin.framework.frame_store import allocate_frames, largest_of, release_memory
 from twin.framework.random_streams import stream
-from twin.sensors.exposure_kernel import FEWEST, Reading, exposing_bytes, kernels_available
 from twin.sensors.poisson_numbers import poisson_pieces
 
 
@@ -141,9 +140,8 @@ Seed = int | np.random.SeedSequence
 
 # Above this the input must be in a wrong unit; NumPy's generator, which draws the largest means, works up to 9e18.
 _MAX_PHOTONS = 1e12
-# Read-noise numbers drawn at once: 9 frames of a CCD of 682 x 682 pixels, 455 of one of 96 x 96. With further
-# noise terms each thread needs its own memory, so fewer are drawn.
-_FRAMES_PIXELS, _FURTHER_PIXELS = 1 << 22, 1 << 20
+# Pixels that a thread exposes at once: 2 frames of a CCD of 682 x 682 pixels, 113 of one of 96 x 96.
+_PIXELS_AT_ONCE = 1 << 20
 # A pixel counts as saturated from this many read-noise sigmas below the clipped level, because read noise is added
 # after the well is clipped: half of all full wells would otherwise read below "full".
 _SATURATION_SIGMAS = 4.0
@@ -402,26 +400,16 @@ class EmvaDetector:
         threads = min(cores(), 8) if threads is None else threads
         if threads < 1:
             raise ValueError(f"detector: threads must be >= 1, found {threads!r}")
-        scale = self.system_gain_dn_per_e
-
-        def expected(index: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
-            mean_e = light[index] * gain[index]
-            mean_e *= self.quantum_efficiency
-            mean_e += dark_e
-            shift = offset_e[index] * scale
-            shift += self.offset_dn
-            return mean_e, shift
-
-        if not self.noise and out.size >= FEWEST and kernels_available():
-            images = out.reshape(len(indices), int(frames), -1)
-            self._reading.frames(lambda number: expected(indices[number]), streams, images, together, threads)
-            return out
 
         def image(index: tuple[int, ...], image_seed: np.random.SeedSequence) -> None:
             rng = np.random.Generator(np.random.SFC64(image_seed))
             # each term has its own stream, so that its numbers do not depend on other terms or on the pieces
             others = [np.random.Generator(np.random.SFC64(stream(image_seed, k))) for k in range(len(self.noise))]
-            mean_e, shift = expected(index)
+            mean_e = light[index] * gain[index]
+            mean_e *= self.quantum_efficiency
+            mean_e += dark_e
+            shift = offset_e[index] * self.system_gain_dn_per_e
+            shift += self.offset_dn
             start = 0
             for collected in poisson_pieces(mean_e, int(frames), rng, together):
                 out[index][start : start + together] = self._read_out(collected, shift, (rng, *others))
@@ -446,7 +434,7 @@ class EmvaDetector:
         pixels : int
             Number of pixels of a frame.
         """
-        return min(frames, max(1, (_FURTHER_PIXELS if self.noise else _FRAMES_PIXELS) // pixels))
+        return min(frames, max(1, _PIXELS_AT_ONCE // pixels))
 
     def exposing_bytes(self, frames: int, pixels: int, threads: int) -> int:
         """Return the temporary memory of an exposure, in addition to the resulting frames, in bytes.
@@ -460,14 +448,8 @@ class EmvaDetector:
         threads : int
             Number of threads that expose.
         """
-        together = self.frames_at_once(frames, pixels)
         # electrons, read noise, and electrons as they were collected for noise that depends on them
-        return threads * pixels * together * 24 if self.noise else exposing_bytes(together, pixels)
-
-    @property
-    def _reading(self) -> Reading:
-        """Detector's numbers for converting electrons to grey values: read noise, gain, full well, largest value."""
-        return Reading(self.dark_noise_e, self.system_gain_dn_per_e, self.full_well_e, self.max_dn)
+        return threads * pixels * self.frames_at_once(frames, pixels) * 24
 
     def _read_out(self, level: np.ndarray, shift: np.ndarray, each: Sequence[np.random.Generator]) -> np.ndarray:
         """Return grey values of frames (N, H, W) from their electrons ``level``; the array is overwritten.
@@ -481,7 +463,13 @@ class EmvaDetector:
         before = level.copy() if self.noise else level
         terms = ReadNoise(self.dark_noise_e), *self.noise
         added = [term.temporal_e(before, rng) for term, rng in zip(terms, each, strict=True)]
-        return self._reading.read_out(level, [noise for noise in added if noise is not None], shift)
+        for noise in added:
+            if noise is not None:
+                level += noise
+        level *= self.system_gain_dn_per_e
+        level += shift
+        np.rint(level, out=level)
+        return np.clip(level, 0, self.max_dn, out=level)
 
     def saturated(self, frames: NDArray[np.uint16]) -> SaturationReport:
         """Count saturated pixels in recorded frames (..., frames, H, W); counts have shape (...,).

@@ -107,34 +107,8 @@ def _guide() -> _Guide:
     return _Guide(*tables)
 
 
-@cache
-def quantile_table() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the table of Poisson quantiles over cells of mean and uniform number u, as compiled kernels read it.
-
-    Returns
-    -------
-    cells : ndarray of uint8
-        Smallest quantile in each cell of mean and u, row-major, with the highest bit set if the cell has others.
-    law : ndarray
-        Poisson distribution function F of the whole numbers below ``MOST_IN_TABLE`` for the mean at which each row of
-        cells begins, row by row.
-    bound : ndarray
-        For each row, error bound of a linear interpolation of F between its mean and the next. The second derivative of
-        F by the mean is p(n) - p(n - 1), whose own derivative is a difference of two such terms.
-    """
-    guide = _guide()
-    cells = np.where(guide.known == _UNDECIDED, guide.least | 128, guide.known).astype(np.uint8)
-    step = 1.0 / CELLS_PER_UNIT
-    probability = np.diff(guide.law.reshape(-1, MOST_IN_TABLE), axis=1, prepend=0.0)
-    bend = np.abs(np.diff(probability, axis=1, prepend=0.0)).max(axis=1)
-    bound = 1.01 * np.maximum(bend[:-1], bend[1:]) * (1.0 + 2.0 * step) * step**2 / 8.0
-    for table in (cells, bound):
-        table.flags.writeable = False
-    return cells, guide.law, bound
-
-
-def poisson_numbers(mean: np.ndarray, count: int, rng: np.random.Generator) -> np.ndarray:
-    """Draw independent Poisson numbers.
+def poisson_pieces(mean: np.ndarray, count: int, rng: np.random.Generator, together: int) -> Iterator[np.ndarray]:
+    """Yield independent Poisson numbers, some draws at a time, to limit memory.
 
     Parameters
     ----------
@@ -144,28 +118,7 @@ def poisson_numbers(mean: np.ndarray, count: int, rng: np.random.Generator) -> n
         Number of draws for each mean.
     rng : np.random.Generator
         Generator: one word of 64 bits for every number, in the order of the result, then the numbers of means beyond
-        ``SERIES_END``.
-
-    Returns
-    -------
-    (count, ...) ndarray
-        Whole numbers as float64.
-    """
-    (out,) = poisson_pieces(mean, count, rng, count)
-    return out
-
-
-def poisson_pieces(mean: np.ndarray, count: int, rng: np.random.Generator, together: int) -> Iterator[np.ndarray]:
-    """Yield the numbers that ``poisson_numbers`` would draw, some draws at a time, to limit memory.
-
-    Parameters
-    ----------
-    mean : (...) ndarray
-        Means, finite and >= 0; not checked.
-    count : int
-        Number of draws for each mean.
-    rng : np.random.Generator
-        Generator. Once the first piece is returned, its state is that after all numbers.
+        ``SERIES_END``. Once the first piece is returned, its state is that after all numbers.
     together : int
         Number of draws for each mean in a piece.
 
@@ -176,11 +129,11 @@ def poisson_pieces(mean: np.ndarray, count: int, rng: np.random.Generator, toget
     """
     flat = np.ascontiguousarray(mean, dtype=np.float64).reshape(-1)
     plan, huge = _Plan.of(flat), np.flatnonzero(flat >= SERIES_END)
-    words, second = split_stream(rng, flat[huge], count, flat.size, together)
+    words, second = _split_stream(rng, flat[huge], count, flat.size, together)
     for first in range(0, count, together):
         out = np.empty((min(together, count - first), flat.size))
         for start, end in _steps(0, len(out), flat.size):
-            plan.fill(out[start:end], words_of(words, end - start, flat.size))
+            plan.fill(out[start:end], _words_of(words, end - start, flat.size))
         if huge.size:
             out[:, huge] = second.poisson(flat[huge], (len(out), huge.size))
         yield out.reshape(len(out), *np.shape(mean))
@@ -195,7 +148,7 @@ def _steps(first: int, last: int, size: int) -> Iterator[tuple[int, int]]:
     return ((start, min(start + step, last)) for start in range(first, last, step))
 
 
-def split_stream(
+def _split_stream(
     rng: np.random.Generator, huge: np.ndarray, count: int, size: int, together: int
 ) -> tuple[np.random.Generator, np.random.Generator]:
     """Return two random generators: one for 64-bit words, one for Poisson numbers of means from ``SERIES_END`` on.
@@ -222,14 +175,14 @@ def split_stream(
         return rng, rng
     words = deepcopy(rng)
     for start, end in _steps(0, count, size):
-        words_of(rng, end - start, size)
+        _words_of(rng, end - start, size)
     second = deepcopy(rng)
     for start, end in _steps(0, count if huge.size else 0, huge.size):
         rng.poisson(huge, (end - start, huge.size))
     return words, second
 
 
-def words_of(rng: np.random.Generator, count: int, size: int) -> np.ndarray:
+def _words_of(rng: np.random.Generator, count: int, size: int) -> np.ndarray:
     """Draw random words of 64 bits, (count, size).
 
     They are not raw words of the bit generator, which have 32 bits in some.
@@ -244,29 +197,6 @@ def words_of(rng: np.random.Generator, count: int, size: int) -> np.ndarray:
         Number of means.
     """
     return rng.integers(0, _LAST, (count, size), dtype=np.uint64, endpoint=True)
-
-
-def poisson_quantile(mean: np.ndarray, word: np.ndarray) -> np.ndarray:
-    """Return quantiles of Poisson distributions.
-
-    Dimensions: N means.
-
-    Parameters
-    ----------
-    mean : (N,) ndarray
-        Means, at least 0 and below ``SERIES_END``.
-    word : (..., N) ndarray of uint64
-        Words; u = (word + 1/2) / 2^64.
-
-    Returns
-    -------
-    (..., N) ndarray
-        Smallest whole numbers whose distribution function is at least u, as float64.
-    """
-    flat = np.ascontiguousarray(mean, dtype=np.float64)
-    out = np.empty(word.shape)
-    _Plan.of(flat).fill(out.reshape(-1, flat.size), word.reshape(-1, flat.size))
-    return out
 
 
 @dataclass(frozen=True, eq=False)

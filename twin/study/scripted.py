@@ -25,7 +25,6 @@ from scenes.specs.study import NOISE, TOTAL, StudySpec
 from scenes.yaml.errors import InputError, Issue, KeyPath, Problem, shown
 from scenes.yaml.spec import validate
 from scenes.yaml.yaml_file import YamlFile, dump_yaml
-from twin.framework.owned_files import scratch
 from twin.study.runs.base_job import Tree
 
 ProgressCallback = Callable[[int, int], None]
@@ -132,8 +131,8 @@ def study(
         The study could not be completed; the message gives the reason.
     """
     config = config_text(_loaded(instrument), vary, n, seed, design, responses)
-    with scratch("twin-study") as folder:
-        file, target = folder / "config.yaml", folder / "study" if out is None else Path(out)
+    with tempfile.TemporaryDirectory(prefix="twin-study-") as folder:
+        file, target = Path(folder) / "config.yaml", Path(folder) / "study" if out is None else Path(out)
         file.write_text(config, "utf-8")
         # a separate process, since workers started from here would each run the caller's script again
         command = [sys.executable, "-m", str(__package__), str(file), "--out", str(target), "--yes", "--json"]

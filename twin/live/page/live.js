@@ -18,7 +18,6 @@ class Live {
     this.ws = null;
     this.n = 0;
     this.waiting = new Map(); // number of a state -> when it was asked for
-    this.trouble = ''; // what is wrong with the process that computes
     this.dirty = false;
     this.touched = 0;
     this.wait = 500;
@@ -163,12 +162,11 @@ class Live {
   silence() {
     const [asked] = this.waiting.values();
     const seconds = (performance.now() - asked) / 1000;
-    if (1000 * seconds > SLOW && !this.trouble) this.status(`no answer for ${Math.floor(seconds)} s`, true);
+    if (1000 * seconds > SLOW) this.status(`no answer for ${Math.floor(seconds)} s`, true);
   }
 
   async lost(reason) {
     this.waiting.clear();
-    this.trouble = '';
     this.status(reason || 'no connection, trying again', true);
     await new Promise((done) => setTimeout(done, this.wait));
     this.wait = Math.min(5000, 1.5 * this.wait);
@@ -201,27 +199,11 @@ class Live {
       case 'blind': this.setBlind(message.on); break;
       case 'revealed': this.reveal(message); break;
       case 'record': this.recording(message); break;
-      case 'computing': this.computing(message); break;
       case 'refused':
         this.note(message.problem);
         this.waiting.clear();
         break;
     }
-  }
-
-  // the process that computes does, or does not; what was asked for is kept and answered when it does again
-  computing({ state, problem }) {
-    const shown = byId('problem').textContent === this.trouble;
-    this.trouble = problem;
-    if (problem) {
-      this.note(problem);
-      this.status(state === 'stopped' ? 'computation is stopped' : 'computation is being restarted', true);
-      return;
-    }
-    if (shown) byId('problem').hidden = true;
-    const now = performance.now();
-    for (const n of this.waiting.keys()) this.waiting.set(n, now);
-    this.status('connected');
   }
 
   greet(hello) {

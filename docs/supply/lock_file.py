@@ -1,18 +1,12 @@
-"""Reader of the lock files in docs/supply/lock, which list the packages that setup.sh installs.
+"""Reader of the lock files in docs/supply/lock, which list the packages that setup.sh installs."""
 
-The installed packages can be compared with these lists.
-"""
-
-import importlib.metadata
 import re
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
-from packaging.markers import Marker
-
-FOLDER = Path(__file__).resolve().parents[2] / "docs" / "supply" / "lock"
-"""Folder of the lock files beside the source; an installed wheel has none."""
+FOLDER = Path(__file__).resolve().parent / "lock"
+"""Folder of the lock files."""
 LAYERS = ("install", "runtime", "live", "test", "peers")
 """Names of the lock files, in the order of installation. Each has only the packages that it adds; the peers are
 installed in a folder of their own.
@@ -52,11 +46,6 @@ class Locked:
     hashes: tuple[str, ...]
     asked_by: tuple[str, ...]
     layer: str
-
-    @property
-    def here(self) -> bool:
-        """True if the marker includes this Python on this platform."""
-        return not self.marker or Marker(self.marker).evaluate()
 
 
 def normal(name: str) -> str:
@@ -121,58 +110,3 @@ def parse(text: str, layer: str, file: str) -> tuple[Locked, ...]:
 def read_lock(folder: Path = FOLDER, layers: Iterable[str] = LAYERS) -> tuple[Locked, ...]:
     """Read the packages of several lock files, in their order. Raises the errors of `read_layer`."""
     return tuple(package for layer in layers for package in read_layer(layer, folder))
-
-
-@dataclass(frozen=True)
-class Differences:
-    """Differences between this environment and the lock files.
-
-    Attributes
-    ----------
-    equal : int
-        Number of packages whose version is that of the lock.
-    missing : tuple of str
-        Required packages that are not installed, as ``name==version``.
-    other : tuple of str
-        Packages of another version, as ``name version, locked version``.
-    unknown : tuple of str
-        Names of installed packages that no lock file lists, so that nobody has checked them.
-    """
-
-    equal: int
-    missing: tuple[str, ...]
-    other: tuple[str, ...]
-    unknown: tuple[str, ...]
-
-
-def differences(project: str, folder: Path = FOLDER) -> Differences:
-    """Compare the installed packages with the lock files.
-
-    Packages of the live page, and those that setup.sh installs only with --test, may be missing.
-
-    Parameters
-    ----------
-    project : str
-        Name of the project itself, which no lock file lists.
-    folder : Path
-        Folder of the lock files.
-
-    Raises
-    ------
-    LockError, OSError
-        A lock file cannot be read, see `read_layer`.
-    """
-    installed = {normal(d.name): d.version for d in importlib.metadata.distributions() if d.name}
-    names, equal, missing, other = {project}, set(), [], []
-    for package in read_lock(folder, LAYERS[:-1]):
-        if not package.here:
-            continue
-        names.add(package.name)
-        version = installed.get(package.name)
-        if version == package.version:
-            equal.add(package.name)
-        elif version is not None:
-            other.append(f"{package.name} {version}, locked {package.version}")
-        elif package.layer == "runtime":
-            missing.append(f"{package.name}=={package.version}")
-    return Differences(len(equal), tuple(missing), tuple(other), tuple(sorted(set(installed) - names)))
