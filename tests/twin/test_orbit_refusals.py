@@ -71,7 +71,7 @@ from twin.orbit.flight.earth import Earth
 from twin.orbit.ground.grid import GroundFrame
 from twin.orbit.images.image_points import PointsError, measure_points
 from twin.orbit.images.line_optics import optics_of
-from twin.orbit.images.patch import Patch, PatchError, true_ground
+from twin.orbit.images.patch import Patch, PatchError
 from twin.orbit.images.simulate_run import run_simulation
 from twin.orbit.jitter import jitter_run, sights
 from twin.orbit.jitter.sights import SightsError, sights_of
@@ -332,7 +332,6 @@ STEEP: Any = Ns(
 """Ground that rises by 1.5 m where the look, followed up by 1 m, leads."""
 CASES: list[tuple[Callable[[], object], type[Exception], str]] = [
     (lambda: measure_points(UNMADE, Ns(tie=1)), PointsError, "tie points need two lines"),
-    (lambda: true_ground(UNMADE, UNMADE), ValueError, "points are of kind map or tie, not 'other'"),
     (
         lambda: optics_of(Ns(name="th1", image_of={}.get), ["nadir"], 1e-3, {}),
         ValueError,

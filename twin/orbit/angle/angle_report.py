@@ -15,13 +15,11 @@ from scipy.stats import chi2
 
 from analysis.arrays import ARCSEC
 from scenes.specs.orbit.setup import MeasuredAngleSetup
-from scenes.specs.perturbation import perturbation_text
-from scenes.yaml.units import ANGLE, LENGTH, format_quantity
 from twin.framework import svg
 from twin.framework.artefact import FAR, Cell, SvgFigure, Table, fixed
-from twin.framework.report import Report, Section, answer
+from twin.framework.report import Report, Section, answer, inputs
 from twin.orbit.angle.angle_run import UNLIKELY, AngleRun, PassAngles, Scatter, SimulatedAngleRun, values_of
-from twin.orbit.flight.sensor import SPEED_OF_LIGHT, LightEffects
+from twin.orbit.flight.sensor import SPEED_OF_LIGHT
 
 METHOD_NAMES = {
     "printed": "planes, eq. 5 as printed",
@@ -88,7 +86,8 @@ def _simulated_verdict(run: SimulatedAngleRun) -> tuple[list[str], tuple[str, ..
     tls, along = run.estimate.angles["tls"], run.estimate.along
     error = np.where(narrow, along.values - values_of(flight.along_track), tls.values - values_of(flight.dihedral))
     sigma = np.where(narrow, along.sigma, tls.sigma)
-    lead = [f"Planes minus resection: {listed([f'{fixed(v / ARCSEC, 3)} arcsec' for v in run.difference])}."]
+    both = zip(run.difference / ARCSEC, run.difference_sigma / ARCSEC, strict=True)
+    lead = [f"Planes minus resection: {listed([f'{fixed(v, 3)} ± {spread:.3f} arcsec' for v, spread in both])}."]
     for name, true in flight.trace.items():
         at = run.names.index(name)
         lead.append(
@@ -106,41 +105,13 @@ def _simulated_verdict(run: SimulatedAngleRun) -> tuple[list[str], tuple[str, ..
 
 def _facts(run: AngleRun) -> tuple[tuple[str, str], ...]:
     setup, test = run.setup, run.setup.test
-    on = ", ".join(LightEffects.of(test.effects).names)
-    state = f"{'' if test.effects.corrected else 'not '}corrected by the analysis"
-    between = [f"{sign} between {a} and {b}" for sign, (a, b) in _named_pairs(run.passes[0])]
-    if isinstance(setup, MeasuredAngleSetup):
-        camera, tracker, gps = setup.camera, setup.test.errors.star_tracker, setup.test.errors.gps
-        name, described = camera.name, camera.description
-        particular: tuple[tuple[str, str], ...] = (
-            ("Passes", ", ".join(result.name for result in run.passes)),
-            ("Moment, from the epoch", ", ".join(f"{result.name} {result.time:.4g} s" for result in run.passes)),
-            ("Noise of the attitude, 1σ", ", ".join(format_quantity(v, ANGLE) for v in tracker.noise)),
-            ("Noise of the orbit, 1σ", ", ".join(format_quantity(v, LENGTH) for v in gps.noise)),
-        )
-    else:
-        name, described = setup.camera_name, (setup.camera or setup.instrument).description  # type: ignore[union-attr]
-        simulated, plain = setup.test, setup.test.plain()
-        errors, terrain, passing = plain["errors"], plain["terrain"], plain["orbit"].get("passing")
-        orbit = f"epoch {simulated.orbit.epoch}"
-        if passing is not None:
-            at = f"latitude {passing['latitude']}, longitude {passing['longitude']}"
-            orbit = f"{passing['direction']} pass {passing['altitude']} above {at}, {orbit}"
-        strips, datum = simulated.strips, ", ".join(errors["datum"])
-        particular = (
-            ("Changed since the laboratory", perturbation_text(simulated.perturb) or "nothing"),
-            ("Orbit", orbit),
-            ("Exposure", f"{simulated.time:g} s from the epoch"),
-            ("Points", f"{strips.points} on each strip, pixels {strips.first:g} to {strips.last:g}"),
-            ("Terrain", f"{terrain['height']} ± {terrain['relief']}"),
-            ("Errors, σ of a coordinate", f"station {errors['station']}, points {errors['points']}"),
-            ("Common shift of the points", f"{datum} east, north, up" if any(simulated.errors.datum) else "none"),
-        )
+    camera = setup.camera if isinstance(setup, MeasuredAngleSetup) else setup.camera or setup.instrument
+    assert camera is not None
     return (
-        ("Camera", f"{name}, {described}"),
-        ("Angles", "; ".join(between)),
-        *particular,
-        ("Effects on the light", f"{on} {state}" if on else "none"),
+        ("Camera", f"{camera.name}, {camera.description}"),
+        ("Angles", "; ".join(f"{sign} between {a} and {b}" for sign, (a, b) in _named_pairs(run.passes[0]))),
+        ("Moments, from the epoch", ", ".join(f"{result.name} {result.time:.4g} s" for result in run.passes)),
+        *inputs(test, "perturb", "orbit", "strips", "terrain", "errors", "effects"),
         ("Description", test.description),
     )
 
@@ -159,8 +130,8 @@ def _methods(run: AngleRun) -> Table:
         for k, name in enumerate(greek_names(result.pairs)):
             # the sigma along the track holds only for looks mostly along the track
             mostly = abs(sides[0]["along_track"][k]) > 0.99 * sides[0]["look"][k]
-            kinds = [(METHOD_NAMES[m], "dihedral", a.values, a.sigma, a.folded[k]) for m, a in estimate.angles.items()]
-            kinds += [
+            kinds: list[tuple[str, str, np.ndarray, np.ndarray | None, bool]] = [
+                *((METHOD_NAMES[m], "dihedral", a.values, a.sigma, a.folded[k]) for m, a in estimate.angles.items()),
                 (sighted, "look", estimate.look, along.sigma if mostly else None, False),
                 (sighted, "along_track", along.values, along.sigma, False),
                 ("resection", "along_track", resection.values, resection.sigma, False),
@@ -260,15 +231,6 @@ def _scatter(run: SimulatedAngleRun) -> Section:
         rows,
         (None, None, 4, 4, 4, 4, 3),
     )
-    both = Table(
-        "difference",
-        "Planes minus resection",
-        "Dihedral angle of tls planes minus the absolute angle of the resection; below 5°, the signed angles along the "
-        "track. Spread: standard deviation of the difference over the passes.",
-        ("angle", "difference [arcsec]", "spread [arcsec]"),
-        list(zip(names, *((v / ARCSEC).tolist() for v in (run.difference, run.difference_sigma)), strict=True)),
-        (None, 3, 3),
-    )
     caption = "Histogram, with the normal distribution of the predicted sigma."
     if len(names) > 1:
         caption = (
@@ -276,7 +238,7 @@ def _scatter(run: SimulatedAngleRun) -> Section:
         )
     drawing = svg.drawn("angle-scatter", _scatter_figure, run)
     figure = SvgFigure("scatter-passes", "Angles of all passes", caption, drawing)
-    return Section("Planes and resection", (), (both, table, figure))
+    return Section("Planes and resection", (), (table, figure))
 
 
 def _heads(run: SimulatedAngleRun) -> list[str]:
