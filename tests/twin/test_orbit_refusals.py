@@ -502,7 +502,7 @@ def test_line_images_with_too_few_points_are_told(monkeypatch: pytest.MonkeyPatc
     for part, made in FEW.items():
         monkeypatch.setattr(loop_run, part, made)
     known = dict.fromkeys(PAIR.pair)
-    flight, flown = Ns(lines=[known], calibrated=known), Ns(true=None, measured=None, earth=Earth())
+    flight, flown = Ns(lines=[known], calibrated=known), (Ns(orbit=Ns(earth=Earth())),) * 2
     with pytest.raises(BenchError, match=r"^line images: only 7 of 20 points were matched$") as caught:
         loop_run.imaged_pair(PAIR, flight, 0, known, known, known, flown, np.random.SeedSequence(1))
     assert caught.value.key == ("mechanisms", "images")
