@@ -73,7 +73,7 @@ def test_a_map_of_known_covariances() -> None:
     """RMS of a horizontal axis, the circle and the interval of 90 %, and nothing where nothing is seen."""
     constant, random = (np.array([np.diag(v)] * 2) for v in ([4.0, 8.0, 100.0], [1.0, 3.0, 25.0]))
     place = np.array([0.1, np.nan])
-    found = AccuracyMap(place, place, place, place, 300.0, constant, random, 0.0 * random, (1, 2))
+    found = AccuracyMap(place, place, place, place, 300.0, constant, random, 0.0 * random)
     assert found.horizontal() == pytest.approx((np.sqrt(6.0), np.sqrt(2.0)))
     assert found.le90 == pytest.approx([1.6448536 * np.sqrt(125.0), np.nan], nan_ok=True)
     even = replace(found, constant=np.array([np.diag([4.0, 4.0, 9.0])] * 2), random=0.0 * random)

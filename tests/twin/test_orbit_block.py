@@ -15,7 +15,6 @@ from twin.orbit.block.block_run import ALL, TIES_ALONE, run_adjustment
 from twin.orbit.block.measured_block import change_covariance, measured_block
 from twin.orbit.calibration.calibration_run import source_of
 from twin.orbit.calibration.campaign_adjustment import simultaneous
-from twin.orbit.measured.pass_measurements import GroundPoints
 
 FILE = SCENES / "orbit" / "adjust.yaml"
 
@@ -114,21 +113,6 @@ def test_scenes_that_share_no_ground_are_an_error_with_a_key(tmp_path):
     alone = setup(tmp_path, *one, ("longitude: 117.4 deg, ", "longitude: 120 deg, "))
     with pytest.raises(BenchError, match=r"only 0 of .* candidate points of the area are seen by two scenes"):
         run_adjustment(alone, None, 1)
-
-
-def test_ground_points_that_are_none_are_refused():
-    """Shapes, names, roles, coordinates and covariances."""
-    good = [np.array(["a", "b"], object), np.zeros((2, 3)), np.eye(3), "control"]
-    GroundPoints.of(*good)
-    for k, wrong, words in (
-        (1, np.zeros((2, 2)), "2 names and coordinates"),
-        (0, ["a", "a"], "a name occurs twice"),
-        (3, "boss", "roles are"),
-        (1, np.full((2, 3), np.nan), "is not finite"),
-        (2, -np.eye(3), "a covariance is not symmetric and positive semidefinite"),
-    ):
-        with pytest.raises(ValueError, match=words):
-            GroundPoints.of(*(wrong if j == k else one for j, one in enumerate(good)))
 
 
 def test_covariance_of_changes_holds_all_three_laws():

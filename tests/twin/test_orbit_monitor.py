@@ -225,13 +225,13 @@ def test_smoothed_heights(stated) -> None:
     assert chosen.factor > 1.1
     assert chosen.case.camera_height_rms == stated.cases["smoothed"].camera_height_rms
     assert "the predicted sigma" in " ".join(monitor_report(stated).lead)
-    # an error of some hundredths of its sigma is no agreement
+    # errors far below or beyond their sigma are told as they are
     tiny = replace(chosen, error=0.01 * chosen.sigma)
     large = replace(chosen, error=1.1 * chosen.limit * chosen.sigma)
     for smoothing, words in (
-        (tiny, "is conservative: the errors are 0.01 σ RMS"),
-        (replace(chosen, error=chosen.sigma), "this agrees with the predicted sigma"),
-        (large, "this contradicts the predicted sigma"),
+        (tiny, "the errors are 0.01 σ RMS"),
+        (replace(chosen, error=chosen.sigma), "the errors are 1 σ RMS, 1.0 σ at most"),
+        (large, f"{1.1 * chosen.limit:.1f} σ at most (limit {chosen.limit:.1f} σ)"),
     ):
         run = replace(stated)
         run.__dict__["smoothing"] = {**stated.smoothing, stated.spec.every: smoothing}

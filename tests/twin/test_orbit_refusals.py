@@ -71,7 +71,7 @@ from twin.orbit.flight.earth import Earth
 from twin.orbit.ground.grid import GroundFrame
 from twin.orbit.images.image_points import PointsError, measure_points
 from twin.orbit.images.line_optics import optics_of
-from twin.orbit.images.patch import Patch, PatchError, true_ground
+from twin.orbit.images.patch import Patch, PatchError
 from twin.orbit.images.simulate_run import run_simulation
 from twin.orbit.jitter import jitter_run, sights
 from twin.orbit.jitter.sights import SightsError, sights_of
@@ -332,7 +332,6 @@ STEEP: Any = Ns(
 """Ground that rises by 1.5 m where the look, followed up by 1 m, leads."""
 CASES: list[tuple[Callable[[], object], type[Exception], str]] = [
     (lambda: measure_points(UNMADE, Ns(tie=1)), PointsError, "tie points need two lines"),
-    (lambda: true_ground(UNMADE, UNMADE), ValueError, "points are of kind map or tie, not 'other'"),
     (
         lambda: optics_of(Ns(name="th1", image_of={}.get), ["nadir"], 1e-3, {}),
         ValueError,
@@ -503,7 +502,7 @@ def test_line_images_with_too_few_points_are_told(monkeypatch: pytest.MonkeyPatc
     for part, made in FEW.items():
         monkeypatch.setattr(loop_run, part, made)
     known = dict.fromkeys(PAIR.pair)
-    flight, flown = Ns(lines=[known], calibrated=known), Ns(true=None, measured=None, earth=Earth())
+    flight, flown = Ns(lines=[known], calibrated=known), (Ns(orbit=Ns(earth=Earth())),) * 2
     with pytest.raises(BenchError, match=r"^line images: only 7 of 20 points were matched$") as caught:
         loop_run.imaged_pair(PAIR, flight, 0, known, known, known, flown, np.random.SeedSequence(1))
     assert caught.value.key == ("mechanisms", "images")

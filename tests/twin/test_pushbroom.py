@@ -220,7 +220,7 @@ def test_looks_that_cannot_be_followed_are_refused() -> None:
     """A window at the image's end, looks past the Earth, an attitude that no node follows."""
     flat, inside = Terrain.flat(600.0), Window(40, 6000, 10, 10)
     for sensor, window, words in (
-        (lines()["nadir"].sensor, Window(0, 0, 40, 40), "does not lie"),
+        (lines()["nadir"].sensor, Window(0, 0, 40, 40), "a line lies outside the image"),
         (lost(), Window(64_000, 6000, 40, 40), "a line of sight misses the Earth"),
         (shaken(), inside, "an attitude so rough"),
     ):

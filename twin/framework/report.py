@@ -3,7 +3,7 @@
 import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -12,6 +12,9 @@ from optics.numerics.number_tree import FrozenMap
 from twin.framework.artefact import Artefact, Table, typeset
 from twin.framework.data_files import FrameFacts
 from twin.framework.provenance import SelfCheck
+
+if TYPE_CHECKING:
+    from scenes.yaml.spec import Spec
 
 
 @dataclass(frozen=True, eq=False)
@@ -158,6 +161,28 @@ class Report:
         repeated = sorted({name for name in names if names.count(name) > 1})
         if repeated:
             raise ValueError(f"more than one artefact has the name {', '.join(repeated)}")
+
+
+def inputs(spec: "Spec", *keys: str) -> tuple[tuple[str, str], ...]:
+    """Return sections of an input file as facts of a report: label and text, with the units of the file.
+
+    Parameters
+    ----------
+    spec : Spec
+        Content of the file, or of a part of it.
+    keys : str
+        Keys of the sections; those without a value are omitted.
+    """
+    plain = spec.plain()
+    return tuple((key.replace("_", " ").capitalize(), _input_text(plain[key])) for key in keys if key in plain)
+
+
+def _input_text(value: Any) -> str:
+    if isinstance(value, Mapping):
+        return "; ".join(f"{key.replace('_', ' ')} {_input_text(item)}" for key, item in value.items()) or "none"
+    if isinstance(value, list):
+        return ", ".join(map(_input_text, value))
+    return ("yes" if value else "no") if isinstance(value, bool) else re.sub(r"(?<=\d )um\b", "µm", str(value))
 
 
 def numbers_only(title: str, file: str, error: Exception) -> Report:

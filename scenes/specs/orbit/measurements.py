@@ -675,8 +675,6 @@ class OrbitCheckSpec(FixedTestSpec):
         Uncertainty of camera and platform.
     points : int
         Largest number of points of each line that are used.
-    shown : int
-        Number of points whose computed position is shown for each combination of conventions.
     """
 
     platform: PlatformFilesSpec
@@ -686,7 +684,6 @@ class OrbitCheckSpec(FixedTestSpec):
     effects: LightEffectsSpec = LightEffectsSpec.model_construct()
     uncertainty: UncertaintySpec = UncertaintySpec.model_construct()
     points: Annotated[Whole, Field(ge=4, le=1000)] = 60
-    shown: Annotated[Whole, Field(ge=1, le=20)] = 3
 
 
 class ImageWindowSpec(Spec):

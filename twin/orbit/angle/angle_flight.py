@@ -32,7 +32,6 @@ from twin.framework.procedure import BenchError
 from twin.monitor.truth import trace_truth
 from twin.orbit.flight.earth import Earth, east_north_up
 from twin.orbit.flight.line_camera import LineAngles, LineCamera, line_cameras, line_normal, traced_line_cameras
-from twin.orbit.flight.orbit import propagate
 from twin.orbit.flight.sensor import (
     NO_EFFECTS,
     SPEED_OF_LIGHT,
@@ -441,15 +440,12 @@ def fly(setup: AngleSetup, camera: AngleCamera, seed: np.random.SeedSequence) ->
         No such orbit exists.
     """
     spec = setup.test
-    earth = Earth.from_spec(spec.earth)
-    try:
-        orbit = propagate(spec.orbit, earth)
-    except ValueError as error:
-        raise BenchError(str(error), ("orbit",), "an orbit that exists and stays above the ground") from error
+    trajectory = Trajectory.of_test(spec, seed)
+    earth = trajectory.orbit.earth
     used = [name for name in setup.pixels if any(name in pair for pair in setup.angles.values())]
     share = (np.linspace(spec.strips.first, spec.strips.last, spec.strips.points) + 0.5) / setup.usual_pixels
     pixel = {name: share * setup.pixels[name] - 0.5 for name in used}
-    above = float(earth.geodetic(orbit.itrs(spec.time)[0])[2]) - spec.terrain.height
+    above = float(earth.geodetic(trajectory.position(spec.time))[2]) - spec.terrain.height
     height = {
         name: _terrain(spec, above * _spread(camera.laboratory[name], pixel[name]), np.random.default_rng(stream))
         for name, stream in zip(used, seed.spawn(len(used)), strict=True)
@@ -460,7 +456,7 @@ def fly(setup: AngleSetup, camera: AngleCamera, seed: np.random.SeedSequence) ->
         pixel=FrozenMap(pixel),
         spec=spec,
         earth=earth,
-        trajectory=Trajectory.flown(orbit, spec.attitude, seed),
+        trajectory=trajectory,
         laboratory=camera.laboratory,
         trace=camera.trace,
         height=FrozenMap(height),

@@ -14,15 +14,12 @@ from matplotlib.figure import Figure
 from scipy.stats import chi2
 
 from analysis.arrays import ARCSEC
-from analysis.orbit.planes import AXES
 from scenes.specs.orbit.setup import MeasuredAngleSetup
-from scenes.specs.perturbation import perturbation_text
-from scenes.yaml.units import ANGLE, LENGTH, format_quantity
 from twin.framework import svg
 from twin.framework.artefact import FAR, Cell, SvgFigure, Table, fixed
-from twin.framework.report import Report, Section, answer
+from twin.framework.report import Report, Section, answer, inputs
 from twin.orbit.angle.angle_run import UNLIKELY, AngleRun, PassAngles, Scatter, SimulatedAngleRun, values_of
-from twin.orbit.flight.sensor import SPEED_OF_LIGHT, LightEffects
+from twin.orbit.flight.sensor import SPEED_OF_LIGHT
 
 METHOD_NAMES = {
     "printed": "planes, eq. 5 as printed",
@@ -37,6 +34,8 @@ _FALSE_ALARM = 1e-4
 _GREEK = {"alpha": "α", "beta": "β", "gamma": "γ", "delta": "δ"}
 COLOURS = (svg.BLUE, svg.GREEN, svg.VERMILION, svg.ORANGE, svg.PURPLE, svg.SKY)
 """Colours of the camera's lines in figures, in the order of the lines."""
+_KINDS = ("dihedral", "look", "along_track")
+"""Definitions of an angle between two lines, which are attributes of `LineAngles`."""
 _LEAST_ARC = np.radians(5.0)
 """Smallest angle whose arc is drawn in the figure of the geometry, in radians."""
 
@@ -65,7 +64,7 @@ def angle_report(run: AngleRun) -> Report:
     sections: tuple[Section, ...] = (_planes(run),)
     if isinstance(run, SimulatedAngleRun):
         parts, lead = _simulated_verdict(run)
-        sections += (_geometry(run), _change(run), _scatter(run), _frames(run), _effects(run), _sensitivity(run))
+        sections += (_geometry(run), _change(run), _scatter(run), _effects(run), _sensitivity(run))
     verdict, more = answer(
         f"Since the laboratory calibration {listed(changed)} along the track, from the ground points of {first.name}",
         *parts,
@@ -85,79 +84,34 @@ def _simulated_verdict(run: SimulatedAngleRun) -> tuple[list[str], tuple[str, ..
     """Return the verdict of a simulated test: angles compared with the truth, and planes with the resection."""
     names, flight, narrow = greek_names(run.names), run.flight, run.narrow
     tls, along = run.estimate.angles["tls"], run.estimate.along
-    truth = np.where(narrow, values_of(flight.along_track), values_of(flight.dihedral))
-    angles, sigma = np.where(narrow, along.values, tls.values), np.where(narrow, along.sigma, tls.sigma) / ARCSEC
-    error, difference = (angles - truth) / ARCSEC, run.difference / ARCSEC
-    sentences, lead = [], []
-    for which, by in ((np.flatnonzero(~narrow), "by planes"), (np.flatnonzero(narrow), "along the track, by planes")):
-        if not len(which):
-            continue
-        sentences.append(
-            f"{listed([f'{names[k]} = {np.degrees(angles[k]):.6f}°' for k in which])} with "
-            f"{'a sigma' if len(which) == 1 else 'sigmas'} of {listed([f'{sigma[k]:.2f} arcsec' for k in which])} "
-            f"{by}, {listed([f'{fixed(error[k], 2)} arcsec' for k in which])} from the truth"
-        )
-        lead.append(f"Planes minus resection: {listed([f'{fixed(difference[k], 3)} arcsec' for k in which])}.")
-    if flight.trace:
-        (name, true), change = next(iter(flight.trace.items())), run.change / ARCSEC
+    error = np.where(narrow, along.values - values_of(flight.along_track), tls.values - values_of(flight.dihedral))
+    sigma = np.where(narrow, along.sigma, tls.sigma)
+    both = zip(run.difference / ARCSEC, run.difference_sigma / ARCSEC, strict=True)
+    lead = [f"Planes minus resection: {listed([f'{fixed(v, 3)} ± {spread:.3f} arcsec' for v, spread in both])}."]
+    for name, true in flight.trace.items():
         at = run.names.index(name)
         lead.append(
-            f"By the ground points, {names[at]} has changed by {fixed(change[at], 2)} ± {along.sigma[at] / ARCSEC:.2f} "
-            f"arcsec since the laboratory; the ray trace of the instrument gives {fixed(true / ARCSEC, 3)} arcsec."
+            f"By the ground points, {names[at]} has changed by {fixed(run.change[at] / ARCSEC, 2)} ± "
+            f"{along.sigma[at] / ARCSEC:.2f} arcsec since the laboratory; the ray trace of the instrument gives "
+            f"{fixed(true / ARCSEC, 3)} arcsec."
         )
+    if not np.any(sigma > 0.0):
+        return [], tuple(lead)
     with np.errstate(divide="ignore", invalid="ignore"):
-        worst = float(np.nanmax(np.abs(error) / sigma)) if np.any(sigma > 0.0) else None
-    if worst is not None:
-        verdict = "all angles are within" if worst <= FAR else "not all angles are within"
-        sentences.insert(0, f"{verdict} {FAR:g} σ of the truth (largest error {worst:.1f} σ): see the methods")
-    return sentences, tuple(lead)
+        worst = float(np.nanmax(np.abs(error) / sigma))
+    verdict = "all angles are within" if worst <= FAR else "not all angles are within"
+    return [f"{verdict} {FAR:g} σ of the truth (largest error {worst:.1f} σ): see the methods"], tuple(lead)
 
 
 def _facts(run: AngleRun) -> tuple[tuple[str, str], ...]:
     setup, test = run.setup, run.setup.test
-    on = ", ".join(LightEffects.of(test.effects).names)
-    state = f"{'' if test.effects.corrected else 'not '}corrected by the analysis"
-    between = [f"{sign} between {a} and {b}" for sign, (a, b) in _named_pairs(run.passes[0])]
-    if isinstance(setup, MeasuredAngleSetup):
-        camera, tracker, gps = setup.camera, setup.test.errors.star_tracker, setup.test.errors.gps
-        name, described = camera.name, camera.description
-        particular: tuple[tuple[str, str], ...] = (
-            ("Passes", ", ".join(result.name for result in run.passes)),
-            ("Moment, from the epoch", ", ".join(f"{result.name} {result.time:.4g} s" for result in run.passes)),
-            ("Noise of the attitude, 1σ", ", ".join(format_quantity(v, ANGLE) for v in tracker.noise)),
-            ("Noise of the orbit, 1σ", ", ".join(format_quantity(v, LENGTH) for v in gps.noise)),
-        )
-    else:
-        name, described = setup.camera_name, (setup.camera or setup.instrument).description  # type: ignore[union-attr]
-        simulated = setup.test
-        strips, errors, passing = simulated.strips, simulated.errors, simulated.orbit.passing
-        station, points, height, relief, *datum = (
-            format_quantity(v, LENGTH)
-            for v in (
-                *(errors.station, errors.points, simulated.terrain.height, simulated.terrain.relief),
-                *errors.datum,
-            )
-        )
-        orbit = f"epoch {simulated.orbit.epoch}"
-        if passing is not None:
-            orbit = (
-                f"{passing.direction} pass {passing.altitude / 1e3:g} km above "
-                f"{np.degrees(passing.latitude):.4g}° N {np.degrees(passing.longitude):.4g}° E, {orbit}"
-            )
-        particular = (
-            ("Changed since the laboratory", perturbation_text(simulated.perturb) or "nothing"),
-            ("Orbit", orbit),
-            ("Exposure", f"{simulated.time:g} s from the epoch"),
-            ("Points", f"{strips.points} on each strip, pixels {strips.first:g} to {strips.last:g}"),
-            ("Terrain", f"{height} ± {relief}"),
-            ("Errors, σ of a coordinate", f"station {station}, points {points}"),
-            ("Common shift of the points", f"{', '.join(datum)} east, north, up" if any(errors.datum) else "none"),
-        )
+    camera = setup.camera if isinstance(setup, MeasuredAngleSetup) else setup.camera or setup.instrument
+    assert camera is not None
     return (
-        ("Camera", f"{name}, {described}"),
-        ("Angles", "; ".join(between)),
-        *particular,
-        ("Effects on the light", f"{on} {state}" if on else "none"),
+        ("Camera", f"{camera.name}, {camera.description}"),
+        ("Angles", "; ".join(f"{sign} between {a} and {b}" for sign, (a, b) in _named_pairs(run.passes[0]))),
+        ("Moments, from the epoch", ", ".join(f"{result.name} {result.time:.4g} s" for result in run.passes)),
+        *inputs(test, "perturb", "orbit", "strips", "terrain", "errors", "effects"),
         ("Description", test.description),
     )
 
@@ -167,34 +121,26 @@ def _named_pairs(result: PassAngles) -> Iterable[tuple[str, tuple[str, str]]]:
 
 
 def _methods(run: AngleRun) -> Table:
-    flight = run.flight if isinstance(run, SimulatedAngleRun) else None
-    truth = () if flight is None else tuple(values_of(a) for a in (flight.dihedral, flight.look, flight.along_track))
+    truth = (run.flight,) if isinstance(run, SimulatedAngleRun) else ()
     rows: list[tuple[Cell, ...]] = []
     for result in run.passes:
-        estimate, along, resection, lab = (
-            result.estimate,
-            result.estimate.along,
-            result.estimate.resection_angles,
-            result.laboratory,
-        )
-        laboratory = tuple(values_of(angles) for angles in (lab.dihedral, lab.look, lab.along_track))
+        estimate, along, resection = result.estimate, result.estimate.along, result.estimate.resection_angles
+        sides = [{kind: values_of(getattr(of, kind)) for kind in _KINDS} for of in (result.laboratory, *truth)]
+        sighted = "lines of sight in the tls planes"
         for k, name in enumerate(greek_names(result.pairs)):
             # the sigma along the track holds only for looks mostly along the track
-            mostly = abs(laboratory[2][k]) > 0.99 * laboratory[1][k]
-            sighted = "lines of sight in the tls planes"
-            kinds: list[tuple[str, str, np.ndarray, np.ndarray | None, int]] = [
-                *(
-                    (METHOD_NAMES[method], "dihedral" + " (folded)" * bool(a.folded[k]), a.values, a.sigma, 0)
-                    for method, a in estimate.angles.items()
-                ),
-                (sighted, "look", estimate.look, along.sigma if mostly else None, 1),
-                (sighted, "along track", along.values, along.sigma, 2),
-                ("resection", "along track", resection.values, resection.sigma, 2),
+            mostly = abs(sides[0]["along_track"][k]) > 0.99 * sides[0]["look"][k]
+            kinds: list[tuple[str, str, np.ndarray, np.ndarray | None, bool]] = [
+                *((METHOD_NAMES[m], "dihedral", a.values, a.sigma, a.folded[k]) for m, a in estimate.angles.items()),
+                (sighted, "look", estimate.look, along.sigma if mostly else None, False),
+                (sighted, "along_track", along.values, along.sigma, False),
+                ("resection", "along_track", resection.values, resection.sigma, False),
             ]
-            for method, kind, value, sigma, which in kinds:
-                differences = (float((value[k] - side[which][k]) / ARCSEC) for side in (laboratory, truth) if side)
+            for method, kind, value, sigma, folded in kinds:
+                differences = (float((value[k] - side[kind][k]) / ARCSEC) for side in sides)
                 spread = None if sigma is None else float(sigma[k] / ARCSEC)
-                rows.append((result.name, name, method, kind, float(np.degrees(value[k])), spread, *differences))
+                words = kind.replace("_", " ") + " (folded)" * bool(folded)
+                rows.append((result.name, name, method, words, float(np.degrees(value[k])), spread, *differences))
     heads = ("pass", "", "method", "angle", "deg", "σ [arcsec]", "− laboratory [arcsec]", "− truth [arcsec]")
     width = len(heads) - (not truth)
     return Table(
@@ -285,15 +231,6 @@ def _scatter(run: SimulatedAngleRun) -> Section:
         rows,
         (None, None, 4, 4, 4, 4, 3),
     )
-    both = Table(
-        "difference",
-        "Planes minus resection",
-        "Dihedral angle of tls planes minus the absolute angle of the resection; below 5°, the signed angles along the "
-        "track. Spread: standard deviation of the difference over the passes.",
-        ("angle", "difference [arcsec]", "spread [arcsec]"),
-        list(zip(names, *((v / ARCSEC).tolist() for v in (run.difference, run.difference_sigma)), strict=True)),
-        (None, 3, 3),
-    )
     caption = "Histogram, with the normal distribution of the predicted sigma."
     if len(names) > 1:
         caption = (
@@ -301,37 +238,7 @@ def _scatter(run: SimulatedAngleRun) -> Section:
         )
     drawing = svg.drawn("angle-scatter", _scatter_figure, run)
     figure = SvgFigure("scatter-passes", "Angles of all passes", caption, drawing)
-    return Section("Planes and resection", (), (both, table, figure))
-
-
-def _frames(run: SimulatedAngleRun) -> Section:
-    reference = run.estimate.angles["tls"].values
-    rows: list[tuple[Cell, ...]] = []
-    worst = spread = 0.0
-    for row in run.frames:
-        difference = (row.values - reference) / ARCSEC
-        finite = bool(np.all(np.isfinite(difference)))
-        largest = float(np.max(np.abs(difference)))
-        worst = max(worst, largest if row.warned and finite else 0.0)
-        spread = max(spread, largest if row.method == "tls" else 0.0)
-        remark = "fit warns of its bias" if row.warned else ""
-        rows.append((row.frame, row.method, *_cells(difference), row.least_normal_z, remark if finite else "singular"))
-    failure = f"has errors up to {f'{worst / 3600.0:.3g}°' if worst > 360.0 else f'{worst:.3g} arcsec'}"
-    text = (
-        "In the frame of a line that looks down, its plane is vertical and the printed form "
-        f"{failure if worst else 'is singular'}. Total least squares does not depend on the frame: its "
-        f"angles agree to {spread:.1g} arcsec.",
-    )
-    table = Table(
-        "frames",
-        "The three forms in four frames",
-        "Angles minus those of total least squares in the Earth-fixed frame; smallest absolute z component of the unit "
-        "normals, 0 for a vertical plane.",
-        ("frame", "form", *_heads(run), "least |normal z|", "warning"),
-        rows,
-        (None, None, *[6] * len(run.names), 6, None),
-    )
-    return Section("Forms of the plane and frames", text, (table,))
+    return Section("Planes and resection", (), (table, figure))
 
 
 def _heads(run: SimulatedAngleRun) -> list[str]:
@@ -361,40 +268,20 @@ def _effects(run: SimulatedAngleRun) -> Section:
 
 
 def _sensitivity(run: SimulatedAngleRun) -> Section:
-    figures = []
-    for name, shows in _panels(run).items():
-        moved = "The station" if name == "station" else f"Points, {greek_names([name.removesuffix('-points')])[0]}"
-        drawing = svg.drawn(f"angle-{name}", _sensitivity_figure, run, shows)
-        caption = "Resection, which does not change, minus planes."
-        figures.append(SvgFigure(f"sensitivity-{name}", moved, caption, drawing))
     rows: list[tuple[Cell, ...]] = []
     for entry in (row.to_dict() for row in run.table):
-        changes = (entry[f"{angle}_arcsec_per_10m"] for angle in run.names)
-        rows.append((_moved(entry["what"]), entry["axis"], *changes))
+        moved = "station" if entry["what"] == "station" else f"{entry['what'].replace('_', ' ')} points"
+        rows.append((moved, entry["axis"], *(entry[f"{angle}_arcsec_per_10m"] for angle in run.names)))
     table = Table(
         "sensitivity",
         "Change of the angles for 10 m",
-        "Change of the dihedral angles when the station, or all points of one strip, move by 10 m along an Earth-fixed "
-        "axis.",
+        "Change of the dihedral angles, to first order, when the station, or all points of a strip, move by 10 m along "
+        "an Earth-fixed axis.",
         ("moved", "axis", *_heads(run)),
         rows,
         (None, None, *[4] * len(run.names)),
     )
-    return Section("Errors of the station and of the points", (), (*figures, table))
-
-
-def _moved(what: str) -> str:
-    return "station" if what == "station" else f"{what.replace('_', ' ')} points"
-
-
-def _panels(run: SimulatedAngleRun) -> dict[str, list[tuple[str, str]]]:
-    """Return the panels of each sensitivity figure: (quantity with an error, angle).
-
-    The figures correspond to Figs. 3 to 5 of paper 000 (Liu and Huang 2014).
-    """
-    pairs = run.flight.pairs
-    out = {"station": [("station", name) for name in pairs]}
-    return out | {f"{name}-points": [(line, name) for line in pair] for name, pair in pairs.items()}
+    return Section("Errors of the station and of the points", (), (table,))
 
 
 def _geometry_figure(run: SimulatedAngleRun) -> Figure:
@@ -430,27 +317,6 @@ def _geometry_figure(run: SimulatedAngleRun) -> Figure:
     above.set(title=f"From above: strips of {points} points, Y stretched", ylabel="Y, right [km]")
     above.legend(loc="upper center", ncols=3, markerscale=2.0)
     above.margins(y=0.35)
-    return figure
-
-
-def _sensitivity_figure(run: SimulatedAngleRun, shows: list[tuple[str, str]]) -> Figure:
-    """Draw the angles of resection minus those of planes against errors of 0 to 10 m of station or ground points."""
-    rows = {(row.what, row.axis): row for row in run.table}
-    figure = svg.new_figure(3.2 * ((len(shows) + 1) // 2))
-    grid = figure.subplots((len(shows) + 1) // 2, min(len(shows), 2), sharey=True, squeeze=False)
-    for axes in grid.ravel()[len(shows) :]:
-        axes.set_axis_off()
-    for axes, (what, angle) in zip(grid.ravel(), shows, strict=False):
-        k = run.names.index(angle)
-        for axis, colour in zip(AXES, COLOURS, strict=False):
-            row = rows[what, axis]
-            shown = (-run.difference[k] - row.change[k]) / ARCSEC
-            axes.plot(row.amount, shown, "o-", color=colour, ms=3, lw=1.2, label=axis)
-        axes.set(title=f"{greek_names([angle])[0]} over the error of the {_moved(what)}", xlabel="m")
-        axes.legend(loc="best", ncols=3)
-        svg.gridded(axes)
-    for axes in grid[:, 0]:
-        axes.set_ylabel("resection − planes [arcsec]")
     return figure
 
 

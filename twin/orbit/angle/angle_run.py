@@ -1,4 +1,4 @@
-"""Test of intersection angles by planes and by resection, in several frames and over many passes.
+"""Test of intersection angles by planes and by resection, over many passes.
 
 The simulated truth is used only to compare estimates with it. The method of planes assumes one common projection
 centre, but the line cameras of a satellite are metres apart, and the image of a mirror camera's line is curved. The
@@ -84,34 +84,6 @@ class Estimate:
     along: AlongTrackAngles
     resection: Resection
     resection_angles: AlongTrackAngles
-
-
-@dataclass(frozen=True, eq=False)
-class FrameRow:
-    """Angles that one method of fitting planes gives in one coordinate frame.
-
-    Attributes
-    ----------
-    frame : str
-        Name of the frame.
-    method : Method
-        Method of fitting the planes.
-    values : (m,) ndarray for m angles
-        Angles, in radians; NaN where a plane is singular for the method.
-    sigma : (m,) ndarray
-        Standard deviations predicted by the method, in radians.
-    least_normal_z : float
-        Smallest absolute z component of the unit normals; 0 for a vertical plane.
-    warned : bool
-        True where the fit warns that its angles are biased because a plane is nearly vertical.
-    """
-
-    frame: str
-    method: Method
-    values: np.ndarray
-    sigma: np.ndarray
-    least_normal_z: float
-    warned: bool
 
 
 @dataclass(frozen=True, eq=False)
@@ -254,8 +226,6 @@ class SimulatedAngleRun(AngleRun):
     ----------
     flight : AnglePass
         True geometry at the moment of the angles.
-    frames : tuple of FrameRow
-        Angles by every plane-fitting method in every coordinate frame.
     effects : tuple of EffectRow
         Errors of the angles due to each effect on the light alone and to all together, for points without random
         errors.
@@ -273,7 +243,6 @@ class SimulatedAngleRun(AngleRun):
 
     setup: AngleSetup
     flight: AnglePass
-    frames: tuple[FrameRow, ...]
     effects: tuple[EffectRow, ...]
     planes: Scatter
     resection: Scatter
@@ -384,7 +353,6 @@ def run_angle(setup: AngleSetup, backend: Backend | None, seed: int, advance: Ad
             seed=seed,
             passes=(result,),
             flight=flight,
-            frames=frame_rows(flight, common),
             effects=effect_rows(flight),
             planes=first,
             resection=second,
@@ -465,7 +433,7 @@ def estimate_angles(measurement: Measurement) -> Estimate:
     common = reduce_to_station(measurement, section)
     planes: dict[Method, tuple[PlaneFit, ...]] = {}
     with warnings.catch_warnings():
-        # the table of frames in the report has these warnings
+        # printed forms are biased where a plane is nearly vertical; the differences of the methods show it
         warnings.simplefilter("ignore", NearVerticalWarning)
         for method in METHODS:
             planes[method] = tuple(fit_plane(common.station, strip, method) for strip in common.strips.values())
@@ -473,41 +441,6 @@ def estimate_angles(measurement: Measurement) -> Estimate:
     return Estimate(
         planes, angles, *line_of_sight_angles(measurement, section), section, _resected_angles(measurement, section)
     )
-
-
-def frame_rows(flight: AnglePass, common: Measurement) -> tuple[FrameRow, ...]:
-    """Estimate the angles by every plane-fitting method in every coordinate frame.
-
-    Parameters
-    ----------
-    flight : AnglePass
-        Simulated pass, which defines the frames: Earth-fixed, local level, orbital, and that of the reference line.
-    common : Measurement
-        Measurement with all projection centres at the station, from `reduce_to_station`.
-    """
-    frames = {
-        "Earth-fixed": (np.eye(3), np.zeros(3)),
-        "local level": (flight.local, flight.middle_point),
-        "orbital": (flight.orbital, flight.station),
-        f"{flight.reference} line": (flight.line_axes, flight.station),
-    }
-    count = len(flight.pairs)
-    rows = []
-    for frame, (axes, origin) in frames.items():
-        moved = common.in_frame(axes, origin)
-        for method in METHODS:
-            with warnings.catch_warnings(record=True) as caught:
-                warnings.simplefilter("always", NearVerticalWarning)
-                try:
-                    fits = [fit_plane(moved.station, strip, method) for strip in moved.strips.values()]
-                    angles = angles_between(fits, moved.which)
-                    values, sigma = angles.values, angles.sigma
-                    least_normal_z = min(abs(float(fit.normal[2])) for fit in fits)
-                except PlaneError:
-                    values, sigma, least_normal_z = np.full(count, np.nan), np.full(count, np.nan), 0.0
-            warned = any(issubclass(w.category, NearVerticalWarning) for w in caught)
-            rows.append(FrameRow(frame, method, values, sigma, least_normal_z, warned))
-    return tuple(rows)
 
 
 def effect_rows(flight: AnglePass) -> tuple[EffectRow, ...]:
@@ -551,7 +484,7 @@ def _degrees(names: Iterable[str], values: Iterable[float]) -> ByAngle:
     return _by_angle([f"{name}_deg" for name in names], np.degrees(list(values)))
 
 
-def _with_sigmas(names: Iterable[str], angles: PlaneAngles | AlongTrackAngles | FrameRow) -> ByAngle:
+def _with_sigmas(names: Iterable[str], angles: PlaneAngles | AlongTrackAngles) -> ByAngle:
     """Return the angles in degrees and their sigmas in arcseconds, with keys that name angle and unit."""
     names = tuple(names)
     return _degrees(names, angles.values) | _by_angle([f"{n}_arcsec_sigma" for n in names], angles.sigma / ARCSEC)
@@ -619,11 +552,6 @@ PASSES: Record[SimulatedAngleRun] = Record(
 )
 
 
-def _frame(names: Iterable[str], row: FrameRow) -> dict[str, Any]:
-    normal = {"least_normal_z": row.least_normal_z, "near_vertical": row.warned}
-    return {"frame": row.frame, "method": row.method, **_with_sigmas(names, row), **normal}
-
-
 def _by_planes(run: SimulatedAngleRun) -> dict[str, ByAngle]:
     return {name: _with_sigmas(run.names, angles) for name, angles in run.estimate.angles.items()}
 
@@ -656,7 +584,6 @@ ANGLE: Record[Any] = Record(
     ),
     Quantity("sensitivity", lambda run: [row.to_dict() for row in run.table], "changes of the angles by errors"),
     Quantity("effects", lambda run: run.effects, "each effect alone and all together", record=EFFECT),
-    Quantity("frames", lambda run: [_frame(run.names, row) for row in run.frames], "every form in every frame"),
     Quantity("scatter", lambda run: run, "passes with errors drawn anew", record=PASSES),
     Quantity("height_m_per_arcsec", lambda run: run.height, "height error by 1 arcsec", converted=False),
     Quantity("measured", lambda run: {p.name: p for p in run.passes}, "pass -> its angles", record=PASS),

@@ -12,7 +12,7 @@ A simulated test can be written as such measurements, a folder of tables with a 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -26,7 +26,6 @@ from scenes.specs.orbit.angle import LEAST_POINTS, usual_angles
 from scenes.specs.orbit.setup import AnyAngle, MeasuredAngleSetup
 from scenes.yaml.errors import names_text, nearest
 from scenes.yaml.units import MOMENT, format_quantity
-from scenes.yaml.yaml_file import dump_yaml
 from twin.framework.procedure import Advance, BenchError, silent
 from twin.orbit.angle.angle_flight import LEAST_SIGMA, Measurement, without_effects
 from twin.orbit.angle.angle_run import AngleRun, PassAngles, SimulatedAngleRun, estimate_angles, run_angle
@@ -34,7 +33,7 @@ from twin.orbit.flight.earth import Earth
 from twin.orbit.flight.line_camera import LineAngles, LineCamera, LineTimes, line_cameras
 from twin.orbit.flight.platform_table import PlatformTable, TabulatedTrajectory
 from twin.orbit.flight.sensor import EARTH_RATE, NO_EFFECTS, LightEffects, Sensor
-from twin.orbit.measured.measurement_tables import CAMERA_FILE, campaign_files, read_measurements
+from twin.orbit.measured.measurement_tables import read_measurements, tested_files
 from twin.orbit.measured.pass_measurements import GroundPoints, ImagePoints, PassMeasurements
 
 if TYPE_CHECKING:
@@ -253,8 +252,18 @@ def angle_exported(run: AngleRun) -> dict[str, str]:
     if run.setup.camera is None:
         text = "the lines of an instrument are traced; no payload file has the directions of their pixels"
         raise test.error(text, ("camera",), found=str(test.camera), allowed="a payload to export measurements of")
-    files = campaign_files([_measurements(run)], run.setup.camera.plain())
-    return files | {TEST_FILE: dump_yaml(_test(run))}
+    spec = run.flight.spec
+    plain = spec.plain()
+    return tested_files(
+        [_measurements(run)],
+        run.setup.camera.plain(),
+        spec,
+        TEST_FILE,
+        angles={name: list(pair) for name, pair in run.flight.pairs.items()},
+        time=format_quantity(spec.time, MOMENT),
+        effects=plain["effects"],
+        errors={"gps": {"noise": [plain["errors"]["station"]] * 3}, "star_tracker": {"noise": ["0 arcsec"] * 3}},
+    )
 
 
 def _measurements(run: SimulatedAngleRun) -> PassMeasurements:
@@ -291,19 +300,3 @@ def _measurements(run: SimulatedAngleRun) -> PassMeasurements:
         )
         first += len(pixel)
     return PassMeasurements(spec.name, platform, dict.fromkeys(flight.lines, line_times), ground, images)
-
-
-def _test(run: SimulatedAngleRun) -> dict[str, Any]:
-    """Return the content of a test file for the exported measurements, with the simulation's angles and sigmas."""
-    spec = run.flight.spec
-    plain = spec.plain()
-    return {
-        "name": spec.name,
-        "description": spec.description,
-        "camera": f"./{CAMERA_FILE}",
-        "data": ".",
-        "angles": {name: list(pair) for name, pair in run.flight.pairs.items()},
-        "time": format_quantity(spec.time, MOMENT),
-        "effects": plain["effects"],
-        "errors": {"gps": {"noise": [plain["errors"]["station"]] * 3}, "star_tracker": {"noise": ["0 arcsec"] * 3}},
-    }

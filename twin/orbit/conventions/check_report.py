@@ -13,15 +13,12 @@ import numpy as np
 
 from twin.framework.artefact import Cell, Table
 from twin.framework.record import Quantity, Record
-from twin.framework.report import Report, Section, answer
+from twin.framework.report import Report, Section, answer, inputs
 from twin.orbit.conventions.check_run import DECIDED, Check, TriedReading, ValueTest
 from twin.orbit.conventions.pass_readings import TESTED_CONVENTIONS, Changes, Fit, changed
-from twin.orbit.flight.earth import Earth, east_north_up
 
 CheckedReading = tuple[Check, TriedReading]
 """A check with one of the interpretations of the files that it tried."""
-PlacedReading = tuple[Check, Changes]
-"""A check with one interpretation of the files, given by its changes from the specified one."""
 
 
 def changes_text(changes: Changes) -> str:
@@ -45,6 +42,8 @@ READING: Record[CheckedReading] = Record(
     Quantity("possible", lambda o: o[1].fit is not None, "true if the points can have been imaged under this reading"),
     Quantity("why_impossible", lambda of: of[1].why or None, "reason why they cannot"),
     Quantity("rms_m", _of_fit(lambda fit: fit.rms), "root mean square residual in plan", "rms", 1),
+    Quantity("mean_east_m", _of_fit(lambda fit: fit.residual[:, 0].mean()), "mean residual to the east"),
+    Quantity("mean_north_m", _of_fit(lambda fit: fit.residual[:, 1].mean()), "mean residual to the north"),
     Quantity("rms_px", _of_fit(lambda fit: fit.rms_pixels), "rms residual along the lines' own axes", "rms", 1),
     Quantity("chi_square", _of_fit(lambda fit: fit.chi_square), "of the residuals under their covariance"),
     Quantity("degrees_of_freedom", _of_fit(lambda fit: fit.freedom), "number of residuals"),
@@ -77,41 +76,6 @@ CONVENTION: Record[tuple[ValueTest, ...]] = Record(
 )
 
 
-def positions_of(run: Check, changes: Changes) -> list[dict[str, Any]]:
-    """Return the ground positions of the first image points under one interpretation of the files.
-
-    The list has one entry per point: longitude, latitude, and the distances from the given ground point, east and north
-    in metres.
-    """
-    positions = run.positions[changes]
-    if isinstance(positions, str):
-        return []
-    rows, known = [], run.readings.ground.points
-    for camera, at in positions.items():
-        raw = run.first_points[camera]
-        lon, lat, _ = Earth().geodetic(at)
-        here = known.itrs[raw]
-        a, b, _ = Earth().geodetic(here)
-        level = np.einsum("nij,nj->ni", east_north_up(a, b), at - here)
-        for k, point in enumerate(raw):
-            position = {"longitude_deg": float(np.degrees(lon[k])), "latitude_deg": float(np.degrees(lat[k]))}
-            off = {"east_m": float(level[k, 0]), "north_m": float(level[k, 1])}
-            rows.append({"point": str(known.ids[point]), "camera": camera, **position, **off})
-    return rows
-
-
-POSITION: Record[PlacedReading] = Record(
-    "Ground positions of the first image points under a reading, east and north of their ground points.",
-    Quantity("changes", lambda of: dict(of[1]), "conventions that differ from the stated ones, with their values"),
-    Quantity(
-        "why_impossible",
-        lambda of: at if isinstance(at := of[0].positions[of[1]], str) else None,
-        "reason why the points have no ground position",
-    ),
-    Quantity("points", lambda of: positions_of(*of), "one entry for each point"),
-)
-
-
 def _best(run: Check) -> dict[str, Any]:
     """Return the value of each convention in the best interpretation of the files."""
     reading = changed(run.specified, run.best.changes)
@@ -141,7 +105,6 @@ CHECK: Record[Check] = Record(
         "readings, the likeliest first",
         record=READING,
     ),
-    Quantity("places", lambda run: [(run, reading) for reading in run.positions], "ground positions", record=POSITION),
 )
 
 
@@ -160,10 +123,10 @@ def check_report(run: Check) -> Report:
     return Report(
         "Conventions of a pass",
         verdict,
-        (*more, *_lead(run)),
+        (*more, *(f"Equally likely: {changes_text(changes)}." for changes in run.equally_likely)),
         _facts(run),
         _ranking(run),
-        (_conventions(run), _positions_section(run)),
+        (_conventions(run),),
         warnings=_warnings(run),
         code=code,
     )
@@ -207,46 +170,24 @@ def _metres(value: float) -> str:
     return f"{value / 1e3:.4g} km" if value >= 1e4 else f"{value:.3g} m"
 
 
-def _lead(run: Check) -> tuple[str, ...]:
-    """Return sentences on wrong and undetermined conventions."""
-    lines = [f"Equally likely: {changes_text(changes)}." for changes in run.equally_likely]
-    for name, answers in run.answers.items():
-        convention = TESTED_CONVENTIONS[name]
-        specified = next(test for test in answers if test.specified)
-        best = next(test for test in answers if test.best)
-        if run.verdict == "another" and not specified.possible:
-            lines.append(f"{convention.title}: {convention.text(best.value)}, not {convention.text(specified.value)}.")
-        elif _undetermined(answers):
-            others = [test for test in answers if test.possible and not test.best]
-            moved = max(test.moved or 0.0 for test in others)
-            texts = ", ".join(convention.text(test.value) for test in (best, *others))
-            lines.append(
-                f"{convention.title}: {texts} fit equally; they differ by {_metres(moved)}, within uncertainty."
-            )
-    return tuple(lines)
-
-
 def _facts(run: Check) -> tuple[tuple[str, str], ...]:
     """Return the input quantities listed in the report."""
-    size, images = run.setup.test.uncertainty, run.readings.images
     return (
         ("Camera", run.setup.camera.name),
-        ("Image points", ", ".join(f"{name} {len(raw.line)}" for name, raw in images.items())),
-        ("Uncertainty of the attitude", f"{np.degrees(size.attitude) * 3600.0:.4g} arcsec about each axis"),
-        ("Uncertainty of the orbit", f"{size.position:.4g} m"),
-        ("Uncertainty of the lines", f"{size.interior:.4g} px, {1e6 * size.scale:.4g} ppm in principal distance"),
-        ("Uncertainty of the line times", f"{1e3 * size.time:.4g} ms"),
+        ("Image points", ", ".join(f"{name} {len(raw.line)}" for name, raw in run.readings.images.items())),
+        *inputs(run.setup.test, "uncertainty"),
     )
 
 
 def _row(tried: TriedReading, run: Check) -> tuple[Cell, ...]:
     """Return the table row of one interpretation of the files."""
     if tried.fit is None:
-        return changes_text(tried.changes), None, None, None, None, tried.why
+        return changes_text(tried.changes), *[None] * 6, tried.why
     excess = run.excess(tried)
     verdict = "best" if tried is run.best else "equally likely" if excess < DECIDED else "excluded"
-    ratio = tried.fit.chi_square / tried.fit.freedom
-    return changes_text(tried.changes), tried.fit.rms, tried.fit.rms_pixels, ratio, max(excess, 0.0), verdict
+    mean = tried.fit.residual.mean(axis=0).tolist()
+    sizes = tried.fit.rms, *mean, tried.fit.rms_pixels, tried.fit.chi_square / tried.fit.freedom, max(excess, 0.0)
+    return changes_text(tried.changes), *sizes, verdict
 
 
 def _ranking(run: Check) -> Table:
@@ -262,9 +203,9 @@ def _ranking(run: Check) -> Table:
         f"Readings with one changed convention; check.json has those fitted of {run.count} tried. Residuals in plan; "
         "chi-square per degree of freedom, including the uncertainty of camera and platform; cost: minus twice the "
         "log likelihood ratio to the best reading.",
-        ("reading", "rms [m]", "rms [px]", "chi-square", "cost", "verdict"),
+        ("reading", "rms [m]", "mean east [m]", "mean north [m]", "rms [px]", "chi-square", "cost", "verdict"),
         [_row(tried, run) for tried in (*first, *rest)],
-        (None, 1, 1, 2, 1, None),
+        (None, 1, 1, 1, 1, 2, 1, None),
     )
 
 
@@ -292,27 +233,6 @@ def _conventions(run: Check) -> Section:
         (None, None, None, 1, 1, None),
     )
     return Section("Test of each convention", text, (table,))
-
-
-def _positions_section(run: Check) -> Section:
-    """Return the report section on the ground positions of the first points."""
-    rows: list[tuple[Cell, ...]] = []
-    for changes, positions in run.positions.items():
-        if isinstance(positions, str):
-            rows.append((changes_text(changes), "", "", None, None, None, None, positions))
-        for k, row in enumerate(positions_of(run, changes)):
-            numbers = [row[key] for key in ("longitude_deg", "latitude_deg", "east_m", "north_m")]
-            rows.append((changes_text(changes) if k == 0 else "", row["point"], row["camera"], *numbers, ""))
-    table = Table(
-        "places",
-        "Ground positions of the first points",
-        "Image points followed to the heights of their ground points; east and north of these.",
-        ("reading", "point", "line", "longitude [deg]", "latitude [deg]", "east [m]", "north [m]", "problem"),
-        rows,
-        (None, None, None, 6, 6, 1, 1, None),
-    )
-    text = ("The stated reading, with one convention changed at a time.",)
-    return Section("Ground positions of the first points", text, (table,))
 
 
 def _warnings(run: Check) -> tuple[str, ...]:

@@ -132,11 +132,6 @@ class Check:
         least 1.
     answers : dict of str to tuple of ValueTest
         Tested values of each convention.
-    first_points : dict of str to ndarray
-        Indices of the ground points whose positions are listed, by line.
-    positions : dict
-        Ground positions of the first points of each line, ITRS, metres, by changes of one convention; a text says why
-        there are none.
     count : int
         Number of interpretations that were tried.
     wrong : dict of str to tuple of str
@@ -151,8 +146,6 @@ class Check:
     verdict: Verdict
     factor: float
     answers: dict[str, tuple[ValueTest, ...]]
-    first_points: dict[str, np.ndarray]
-    positions: dict[pass_readings.Changes, dict[str, np.ndarray] | str]
     count: int
     wrong: dict[str, tuple[str, ...]]
 
@@ -210,13 +203,9 @@ def run_check(setup: CheckSetup, backend: Backend | None, seed: int, advance: Ad
     verdict: Verdict = "none" if ratio > _FITS else "another" if best.changes else "confirmed"
     factor = max(float(ratio), 1.0) if np.isfinite(ratio) else 1.0
     answers = {name: _answers(bench, best, name, values, factor) for name, values in others.items()}
-    positions = {item: _first_positions(bench, item, setup.test.shown) for item in _shown(others, best)}
     tried.sort(key=lambda item: (item.cost, len(item.changes)))
     advance("readings", 3, 3)
-    first = {name: raw.point[: setup.test.shown] for name, raw in bench.readings.images.items()}
-    return Check(
-        setup, readings, specified, tuple(tried), best, verdict, factor, answers, first, positions, count, wrong
-    )
+    return Check(setup, readings, specified, tuple(tried), best, verdict, factor, answers, count, wrong)
 
 
 def _bench(
@@ -324,24 +313,6 @@ def _answers(
             why = str(error)
         answers.append(ValueTest(value, value == specified_value, value == best_value, excess, moved, why))
     return tuple(answers)
-
-
-def _shown(others: dict[str, tuple[Any, ...]], best: TriedReading) -> list[pass_readings.Changes]:
-    """Return the interpretations whose ground positions are listed: specified, best, and those with one change."""
-    singles = [((name, value),) for name, values in others.items() for value in values]
-    return list(dict.fromkeys([(), best.changes, *singles]))
-
-
-def _first_positions(
-    bench: pass_readings.PassBench, changes: pass_readings.Changes, count: int
-) -> dict[str, np.ndarray] | str:
-    """Return the ground positions of the first points of each line, or why there are none."""
-    try:
-        return {
-            name: at[:count] for name, at in bench.positions(pass_readings.changed(bench.specified, changes)).items()
-        }
-    except pass_readings.ImpossibleError as error:
-        return str(error)
 
 
 def exported(run: Check) -> dict[str, str]:

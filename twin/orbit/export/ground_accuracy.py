@@ -115,8 +115,6 @@ class AccuracyMap:
     heights : (N, 3, 3) ndarray
         Covariance due to errors of the heights that points of one line have from another source, which also move them
         in plan, in m^2.
-    shape : tuple of int
-        Shape of the grid.
     """
 
     line: Array
@@ -127,7 +125,6 @@ class AccuracyMap:
     constant: Array
     random: Array
     heights: Array
-    shape: tuple[int, int]
 
     @property
     def covariance(self) -> Array:
@@ -244,7 +241,7 @@ def single_accuracy(
     tilt = np.concatenate([derivatives.height, np.ones((len(line), 1))], axis=1)
     heights = uncertainty.height**2 * tilt[:, :, None] * tilt[:, None, :]
     random[:, :2, :2] = _propagate(derivatives.image, uncertainty.image)
-    return AccuracyMap(line, pixel, longitude, latitude, height, constant, random, heights, _GRID)
+    return AccuracyMap(line, pixel, longitude, latitude, height, constant, random, heights)
 
 
 def intersected_accuracy(
@@ -311,8 +308,7 @@ def intersected_accuracy(
         constant[inside] += _propagate(inverse[inside] @ interior, uncertainty.interior)
         random[inside] += _propagate(inverse[inside] @ weighted, uncertainty.image)
     mask = np.where(good, 0.0, np.nan)
-    none = np.zeros_like(random)
-    return AccuracyMap(line, pixel, longitude + mask, latitude + mask, height, constant, random, none, _GRID)
+    return AccuracyMap(line, pixel, longitude + mask, latitude + mask, height, constant, random, np.zeros_like(random))
 
 
 def _ground_positions(sensor: Sensor, line: Array, pixel: Array, height: float) -> tuple[Array, Array, Array]:

@@ -27,9 +27,10 @@ from scipy.interpolate import CubicSpline
 from scipy.signal import lfilter
 
 from optics.geometry.pose import rotation_matrix
+from twin.framework.procedure import BenchError
 from twin.framework.random_streams import stream
 from twin.orbit.flight.earth import Earth, curvature_radii, east_north_up
-from twin.orbit.flight.orbit import Orbit
+from twin.orbit.flight.orbit import Orbit, propagate
 from twin.sensors.line_ccd import Collection
 
 if TYPE_CHECKING:
@@ -362,15 +363,7 @@ def _draw_errors(
         Seed of all random numbers.
     terms : sequence of str
         Names, of `TERMS`, of the errors that are on; the others are zero.
-
-    Raises
-    ------
-    ValueError
-        A term is unknown.
     """
-    unknown = sorted(set(terms) - set(TERMS))
-    if unknown:
-        raise ValueError(f"unknown error term: {', '.join(unknown)}; allowed: {', '.join(TERMS)}")
     streams = dict(zip(TERMS, np.random.SeedSequence(seed).spawn(len(TERMS)), strict=True))
     gps, star = spec.gps, spec.star_tracker
 
@@ -463,6 +456,28 @@ class Trajectory:
         jitter = None if spec.jitter is None else Jitter.of(spec.jitter, stream(seed, JITTER_STREAM, *number))
         return cls(orbit, Attitude.from_spec(spec), jitter=jitter)
 
+    @classmethod
+    def of_test(cls, spec: Any, seed: int | np.random.SeedSequence) -> Trajectory:
+        """Return the true trajectory that a test's file describes.
+
+        Parameters
+        ----------
+        spec : Spec
+            Content of the file, with the sections `earth`, `orbit` and `attitude`.
+        seed : int or SeedSequence
+            Seed of the random part of the jitter, which has its own stream.
+
+        Raises
+        ------
+        BenchError
+            No such orbit exists.
+        """
+        try:
+            orbit = propagate(spec.orbit, Earth.from_spec(spec.earth))
+        except ValueError as error:
+            raise BenchError(str(error), ("orbit",), "an orbit that exists and stays above the ground") from error
+        return cls.flown(orbit, spec.attitude, seed)
+
     @property
     def first(self) -> float:
         """Start of the span, seconds."""
@@ -514,11 +529,6 @@ class Trajectory:
             Seed of all random numbers.
         terms : sequence of str
             Names of the errors that are on, of `twin.orbit.flight.trajectory.TERMS`.
-
-        Raises
-        ------
-        ValueError
-            A term is unknown.
         """
         errors, jitter = _draw_errors(spec, self.first, self.last, seed, terms), self.jitter
         if isinstance(jitter, Jitter):

@@ -400,8 +400,6 @@ def true_ground(patch: Patch, points: MatchedPoints) -> np.ndarray:
         east, north = patch.control.error(points.east, points.north)
         east, north = points.east - east, points.north - north
         return patch.frame.itrs(east, north, patch.terrain.height(east, north))
-    if points.kind != "tie":
-        raise ValueError(f"points are of kind map or tie, not {points.kind!r}")
     source = points.source
     assert source is not None
     position = points.lines[source].position

@@ -323,15 +323,8 @@ def look_map(sensor: Sensor, frame: GroundFrame, terrain: Terrain, window: Windo
     ValueError
         The window with its margin lies partly outside the image.
     """
-    if not window.fits(sensor):
-        raise UnphysicalError(
-            f"a window of {window.lines} lines from {window.first_line} and {window.pixels} pixels from "
-            f"{window.first_pixel} does not lie {BORDER} inside the image of {sensor.lines} lines and "
-            f"{sensor.camera.pixels} pixels"
-        )
-    border = BORDER
-    lines = window.first_line - border, window.first_line + window.lines - 1 + border
-    pixels = window.first_pixel - border, window.first_pixel + window.pixels - 1 + border
+    lines = window.first_line - BORDER, window.first_line + window.lines - 1 + BORDER
+    pixels = window.first_pixel - BORDER, window.first_pixel + window.pixels - 1 + BORDER
     return LookMap.prepare(sensor, frame, terrain, lines, pixels)
 
 

@@ -7,10 +7,10 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
+import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
@@ -18,16 +18,16 @@ from matplotlib.lines import Line2D
 from matplotlib.patheffects import Normal, Stroke
 
 from scenes.specs.orbit.scene import ImagePointsSpec
-from scenes.yaml.units import ANGLE, LENGTH, format_quantity
+from scenes.yaml.units import LENGTH, format_quantity
 from twin.framework import svg
-from twin.framework.artefact import Artefact, Cell, Data, PngFigure, SvgFigure, Table, rounded_down
-from twin.framework.data_files import FrameFacts, MapGeoreference, csv_table
+from twin.framework.artefact import Artefact, Cell, CsvFile, Data, PngFigure, SvgFigure, Table, rounded_down
+from twin.framework.data_files import FrameFacts, MapGeoreference
 from twin.framework.reference_frames import described
-from twin.framework.report import Report, Section, answer
+from twin.framework.report import Report, Section, answer, inputs
 from twin.orbit.ground.orthophoto import Raster
 from twin.orbit.images import simulate_run
 from twin.orbit.images.image_points import CONSENSUS, ImagedGround, LineFrame, MatchedPoints, PatchPoints, status_text
-from twin.orbit.images.patch import WRONG, LineImage, Patch, judged
+from twin.orbit.images.patch import WRONG, Patch, judged
 
 if TYPE_CHECKING:
     from scenes.specs.orbit.scene import InteriorChangeSpec
@@ -48,59 +48,25 @@ def pixel_axes(axes: Axes) -> None:
         label.set_verticalalignment("center")
 
 
-HEADS = (
-    "sort",
-    "point",
-    "line_name",
-    "longitude_deg",
-    "latitude_deg",
-    "height_m",
-    "x_itrs_m",
-    "y_itrs_m",
-    "z_itrs_m",
-    "predicted_line",
-    "predicted_pixel",
-    "line",
-    "pixel",
-    "line_sigma",
-    "pixel_sigma",
-    "correlation_of_sigmas",
-    "template_correlation",
-    "accepted",
-    "status",
-)
-"""Column headings of the listing of measured points."""
-
-
-@dataclass(frozen=True, eq=False)
-class PointListing(Data):
-    """CSV file of measured points, one row per point and line with the columns of `HEADS`, linked in the report."""
-
-    kind: ClassVar[str] = "csv"
-
-    def content(self) -> bytes:
-        """Return the rows as text of the CSV file, with all their digits; missing values are empty."""
-        return csv_table([HEADS, *self.data])
-
-
-def listing(patch: ImagedGround, points: PatchPoints) -> list[list[Any]]:
-    """Return the rows of the listing of points, one for each point and line, with the columns of `HEADS`."""
-    rows: list[list[Any]] = []
+def listing(patch: ImagedGround, points: PatchPoints) -> str:
+    """Return the text of a CSV file of measured points, one row for each point and line; missing values are empty."""
+    parts = []
     for sort, group in points.sorts.items():
-        degrees = np.degrees(patch.frame.geographic(group.east, group.north)).T
+        longitude, latitude = np.degrees(patch.frame.geographic(group.east, group.north))
+        kind, number = np.where(group.check, "check", sort), np.arange(len(group.ground))
+        ground = {"longitude_deg": longitude, "latitude_deg": latitude, "height_m": group.height}
+        ground |= dict(zip(("x_itrs_m", "y_itrs_m", "z_itrs_m"), group.ground.T, strict=True))
         for name, line in group.lines.items():
-            image, expected = line.image, line.predicted + np.array(line.first)
             sigma = np.sqrt(np.diagonal(line.covariance, axis1=1, axis2=2))
             with np.errstate(invalid="ignore", divide="ignore"):
                 together = line.covariance[:, 0, 1] / np.prod(sigma, axis=1)
-            for k in range(len(group.ground)):
-                kind = "check" if group.check[k] else sort
-                numbers = (*expected[k], *image[k], *sigma[k], together[k], line.correlation[k])
-                shown = [float(v) if np.isfinite(v) else None for v in numbers]
-                code = int(line.status[k])
-                ground = [*map(float, degrees[k]), float(group.height[k]), *map(float, group.ground[k])]
-                rows.append([kind, k, name, *ground, *shown, int(line.accepted[k]), status_text(code)])
-    return rows
+            image = np.concatenate([line.predicted + np.array(line.first), line.image, sigma], axis=1)
+            heads = ("predicted_line", "predicted_pixel", "line", "pixel", "line_sigma", "pixel_sigma")
+            measured = dict(zip(heads, np.where(np.isfinite(image), image, np.nan).T, strict=True))
+            measured |= {"correlation_of_sigmas": together, "template_correlation": line.correlation}
+            status = {"accepted": line.accepted.astype(int), "status": [status_text(c) for c in line.status.tolist()]}
+            parts.append(pd.DataFrame({"sort": kind, "point": number, "line_name": name} | ground | measured | status))
+    return pd.concat(parts).to_csv(index=False, lineterminator="\n")
 
 
 T = TypeVar("T")
@@ -147,7 +113,7 @@ def point_artefacts(patch: ImagedGround, points: PatchPoints, *tables: Table) ->
         for sort, group in points.sorts.items()
     ]
     caption = "Each point in each line: ground coordinates, image coordinates, sigmas of the fit, status."
-    listed = PointListing("points", "Points", caption, listing(patch, points))
+    listed = CsvFile("points", "Points", caption, listing(patch, points))
     return *tables, *figures, _lost_table(points), listed
 
 
@@ -218,11 +184,9 @@ def points_png(patch: ImagedGround, points: MatchedPoints) -> bytes:
 def _panel(axes: Axes, name: str, image: LineFrame, points: MatchedPoints) -> None:
     """Draw one line's frame with its points and their displacements."""
     line = points.lines[name]
-    low, high = np.percentile(image.frame, (0.5, 99.5))
-    row, column = line.first
+    _show_image(axes, name, image, alpha=0.75)
     rows, columns = image.frame.shape
-    ends = (column - 0.5, column + columns - 0.5, row + rows - 0.5, row - 0.5)
-    axes.imshow(image.frame, cmap="gray", vmin=low, vmax=high, extent=ends, interpolation="antialiased", alpha=0.75)
+    ends = *axes.get_xlim(), *axes.get_ylim()
     at, to = line.predicted + np.array(line.first), line.image
     # Adding zero removes a minus before zero.
     middle = np.round(line.median_shift, 1) + 0.0
@@ -244,7 +208,6 @@ def _panel(axes: Axes, name: str, image: LineFrame, points: MatchedPoints) -> No
         xlim=ends[:2],
         ylim=ends[2:],
     )
-    pixel_axes(axes)
 
 
 _PARTS = {"lens": svg.BLUE, "pixel": svg.GREEN, "diffusion": svg.ORANGE, "step": svg.SKY, "stages": svg.VERMILION}
@@ -317,13 +280,13 @@ _NAMES = {
 }
 
 
-def _show_image(axes: Axes, name: str, image: LineImage) -> None:
+def _show_image(axes: Axes, name: str, image: LineFrame, alpha: float = 1.0) -> None:
     """Show a line's image between its 0.5% and 99.5% grey values."""
     low, high = np.percentile(image.frame, (0.5, 99.5))
     window = image.window
     first, left = window.first_line - 0.5, window.first_pixel - 0.5
     ends = (left, left + window.pixels, first + window.lines, first)
-    axes.imshow(image.frame, cmap="gray", vmin=low, vmax=high, extent=ends, interpolation="antialiased")
+    axes.imshow(image.frame, cmap="gray", vmin=low, vmax=high, extent=ends, interpolation="antialiased", alpha=alpha)
     axes.set(title=name)
     pixel_axes(axes)
 
@@ -333,13 +296,9 @@ def _show_raster(axes: Axes, raster: Raster, colours: str) -> AxesImage:
     low, high = np.percentile(raster.values, (0.5, 99.5))
     rows, columns = raster.values.shape
     half = 0.5 * raster.spacing
-    ends = (
-        raster.west - half,
-        raster.west + columns * raster.spacing - half,
-        raster.north - rows * raster.spacing + half,
-        raster.north + half,
-    )
-    extent = 1e-3 * ends[0], 1e-3 * ends[1], 1e-3 * ends[2], 1e-3 * ends[3]
+    ends = (-half, columns * raster.spacing - half, half - rows * raster.spacing, half)
+    corner = (raster.west, raster.west, raster.north, raster.north)
+    extent: Any = tuple(1e-3 * (a + b) for a, b in zip(corner, ends, strict=True))
     shown = axes.imshow(raster.values, cmap=colours, vmin=low, vmax=high, extent=extent, interpolation="antialiased")
     axes.set(xlabel="east [km]")
     return shown
@@ -419,13 +378,11 @@ def simulation_report(run: simulate_run.Simulation) -> Report:
     longitude, latitude = np.degrees(run.position)
     images = run.patch.images
     low = min(images, key=lambda name: min(images[name].nyquist))
-    full = [name for name, image in images.items() if image.saturated]
     verdict, more = answer(
         f"The pass has {len(images)} images of {patch.lines} lines and {patch.pixels} pixels near "
         f"{latitude:.3f}° N, {longitude:.3f}° E, "
         "with orthophoto, elevation model, the laboratory's camera and the measured orbit and attitude",
         f"the modulation is lowest in {low}, {min(images[low].nyquist):.3f} at half a cycle per sample: see Sharpness",
-        f"pixels are saturated in {', '.join(full)}" if full else "",
     )
     files = {name: image.frame[None] for name, image in images.items()}
     files |= {"orthophoto": run.patch.control.orthophoto.values[None], "dem": run.patch.control.dem.values[None]}
@@ -471,18 +428,11 @@ def changes_text(perturb: Mapping[str, InteriorChangeSpec]) -> str:
 def _facts(setup: SimulateSetup) -> tuple[tuple[str, str], ...]:
     """Return the input quantities listed in the report."""
     test, camera = setup.test, setup.camera
-    terrain, light = test.ground.terrain, test.ground.light
-    relief = "original relief" if terrain.relief is None else f"relief {format_quantity(terrain.relief, LENGTH)} rms"
-    kind = "Jacksboro fault, 3 arcsec, shifted" if terrain.kind == "real" else f"fractal, exponent {terrain.exponent:g}"
-    sun = f"elevation {format_quantity(light.elevation, ANGLE)}, azimuth {format_quantity(light.azimuth, ANGLE)}"
-    bias = ", ".join(format_quantity(v, ANGLE) for v in test.errors.star_tracker.bias)
     return (
         ("Camera", f"{camera.name}, {camera.description}"),
         ("Changed since the laboratory", changes_text(test.perturb)),
-        ("Bias of the star trackers", f"[{bias}]"),
-        ("Terrain", f"{kind}; height {format_quantity(terrain.height, LENGTH)}, {relief}"),
-        ("Ground", f"cells of {test.ground.texture.spacing:g} m, reflectance {test.ground.texture.mean:g}"),
-        ("Sun", sun),
+        *inputs(test.errors.star_tracker, "bias"),
+        *inputs(test.ground, "terrain", "texture", "light"),
         ("Samples", f"{test.oversampling} along each side of a pixel"),
         ("Description", test.description),
     )

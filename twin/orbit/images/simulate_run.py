@@ -25,14 +25,12 @@ from optics.numerics.number_tree import FrozenMap
 from scenes.specs.orbit.scene import OrbitSimulateSpec
 from scenes.specs.orbit.three_line_camera import ThreeLineCameraSpec
 from scenes.yaml.errors import KeyPath
-from scenes.yaml.yaml_file import dump_yaml
 from twin.framework.procedure import Advance, BenchError, silent
 from twin.framework.random_streams import stream
 from twin.framework.record import Quantity, Record, plain_data
 from twin.framework.reference_frames import described
 from twin.orbit.flight.earth import Earth
 from twin.orbit.flight.line_camera import LineCamera, LineTimes, changed_payload, line_cameras
-from twin.orbit.flight.orbit import propagate
 from twin.orbit.flight.platform_table import PlatformTable, continuous_quaternions
 from twin.orbit.flight.sensor import LightEffects, Sensor
 from twin.orbit.flight.trajectory import Trajectory, readings
@@ -40,7 +38,7 @@ from twin.orbit.ground.orthophoto import Raster
 from twin.orbit.images import image_points
 from twin.orbit.images import patch as patch_images
 from twin.orbit.images.line_optics import optics_of
-from twin.orbit.measured.measurement_tables import CAMERA_FILE, TEST_FILE, campaign_files
+from twin.orbit.measured.measurement_tables import TEST_FILE, tested_files
 from twin.orbit.measured.pass_measurements import GroundPoints, ImagePoints, PassMeasurements, point_names
 
 if TYPE_CHECKING:
@@ -133,11 +131,8 @@ def fly_simulation(setup: SimulateSetup, seed: int) -> SimulatedFlight:
         The orbit is impossible.
     """
     spec, root = setup.test, np.random.SeedSequence(seed)
-    earth = Earth.from_spec(spec.earth)
-    try:
-        trajectory = Trajectory.flown(propagate(spec.orbit, earth), spec.attitude, root)
-    except ValueError as error:
-        raise BenchError(str(error), ("orbit",), "an orbit that the satellite can fly") from error
+    trajectory = Trajectory.of_test(spec, root)
+    earth = trajectory.orbit.earth
     measured = trajectory.with_errors(spec.errors, int(np.random.default_rng(stream(root, 0)).integers(2**31)))
     truth = changed_payload(spec, setup.camera)
     true, known = line_cameras(truth), line_cameras(setup.camera)
@@ -478,16 +473,15 @@ def simulation_exported(run: Simulation) -> dict[str, str]:
     points = GroundPoints.of(point_names(role), ground, covariance, role.astype(object))
     measured = PassMeasurements(spec.name, platform, dict.fromkeys(known.lines, times), points, images)
     gps, tracker = plain["errors"]["gps"], plain["errors"]["star_tracker"]
-    test = {
-        "name": spec.name,
-        "description": spec.description,
-        "camera": f"./{CAMERA_FILE}",
-        "data": ".",
-        "schemes": [[spec.name]],
-        "effects": {**plain["effects"], "corrected": True},
-        "errors": {
+    return tested_files(
+        [measured],
+        run.laboratory.plain(),
+        spec,
+        TEST_FILE,
+        schemes=[[spec.name]],
+        effects={**plain["effects"], "corrected": True},
+        errors={
             "gps": {key: gps[key] for key in ("noise", "drift", "interval")},
             "star_tracker": {key: tracker[key] for key in ("noise", "slow", "interval")},
         },
-    }
-    return campaign_files([measured], run.laboratory.plain()) | {TEST_FILE: dump_yaml(test)}
+    )

@@ -13,8 +13,8 @@ from analysis.statistics import robust_sigma
 from twin.framework import svg
 from twin.framework.artefact import Cell, CsvFile, SvgFigure, Table, decimals_for, fixed, significant
 from twin.framework.data_files import csv_table
-from twin.framework.report import Report, Section, answer
-from twin.orbit.jitter.jitter_run import MULTIPLE, JitterRun, Oscillation, PassJitter, blind_multiples, transfers
+from twin.framework.report import Report, Section, answer, inputs
+from twin.orbit.jitter.jitter_run import JitterRun, Oscillation, PassJitter, transfers
 
 _MOST, _SIGMAS = 4000, 5.0
 """Largest number of points drawn in a figure of disparities, and half range of its vertical axis in robust standard
@@ -35,15 +35,9 @@ def jitter_report(run: JitterRun) -> Report:
     sections = []
     for name, jitter in run.passes.items():
         suffix, head = ("", "") if len(run.passes) == 1 else (f"-{name.lower()}", f" of {name}")
-        sections += [_spectrum(jitter, suffix, head), _blind(jitter, suffix, head), _course(jitter, suffix, head)]
-    search = run.setup.test.search
-    facts = (
-        ("Camera", run.setup.camera.name),
-        ("Frequencies", f"{search.lowest:g} to {search.highest:g} Hz"),
-        ("Axes", ", ".join(search.axes)),
-        ("False-alarm rate", f"{search.false_alarm:g} over all frequencies"),
-        ("Description", run.setup.test.description),
-    )
+        sections += [_spectrum(jitter, suffix, head), _course(jitter, suffix, head)]
+    camera, test = run.setup.camera.name, run.setup.test
+    facts = (("Camera", camera), *inputs(test, "search"), ("Description", test.description))
     return Report(
         "Jitter of the attitude", *_verdict(run), facts, _summary(run), tuple(sections), warnings=_warnings(run)
     )
@@ -71,7 +65,7 @@ def _verdict(run: JitterRun) -> tuple[str, tuple[str, ...]]:
         f"{more}, the largest at {frequency} ± {sigma} Hz: {sizes}",
         f"the false-alarm rate is {search.false_alarm:g} over all frequencies of the search",
         "; ".join(text for line in oscillations for text in _doubts(line)),
-        "see Blind frequencies for those that the lines do not observe",
+        "see the spectrum for frequencies that the lines do not observe",
     )
 
 
@@ -113,12 +107,16 @@ def _summary(run: JitterRun) -> Table:
 
 def _spectrum(jitter: PassJitter, suffix: str, head: str) -> Section:
     result, sights, axes = jitter.result, jitter.sights, jitter.setup.test.search.axes
+    gaps = "; ".join(f"{a} to {b} {1e3 * gap:.4g} ms" for (a, b), (_, gap, _) in sights.gaps.items())
+    blind = ", ".join(f"{a:.3g} to {b:.3g} Hz" for a, b in result.before.intervals())
     text = (
         f"{sights.points} points were seen by two or more of {', '.join(sights.lines)}, over "
         f"{sights.observations.span:.3g} s. {result.used.mean():.1%} of the observations were used; the others were "
         "rejected as wrong matches. The remaining noise is that of the points' covariances times "
         f"{_factors(jitter)}; its highest power has p = {significant(jitter.next_p_value, 2)}. Aliases of "
         f"the detected oscillations were searched up to {result.beyond:.4g} Hz.",
+        f"Between the sightings of a point pass: {gaps}. A pair of lines alone is blind at multiples of the inverse. "
+        f"No oscillation is sought where all lines together are blind: {blind or 'at no frequency of the search'}.",
     )
     before, after = result.before, result.after
     in_arcsec = np.stack([before.amplitude, after.amplitude, before.sigma, result.detectable], axis=-1) / ARCSEC
@@ -166,23 +164,6 @@ def _spectrum(jitter: PassJitter, suffix: str, head: str) -> Section:
 
 def _factors(jitter: PassJitter) -> str:
     return ", ".join(f"{factor:.2g} in {line}" for line, factor in jitter.noise_factors.items())
-
-
-def _blind(jitter: PassJitter, suffix: str, head: str) -> Section:
-    table = MULTIPLE.table(
-        f"blind{suffix}",
-        "Frequencies at which a pair of lines alone is blind",
-        "A whole number of periods lies between their sightings. Response: of all lines together, of the worst axis, "
-        "relative to its maximum.",
-        [MULTIPLE(of) | {"blind": "blind" if of.blind else "observed"} for of in blind_multiples(jitter)],
-    )
-    intervals = ", ".join(f"{a:.3g} to {b:.3g} Hz" for a, b in jitter.result.before.intervals())
-    text = (
-        f"All lines together are blind at {intervals}; no oscillation is sought there."
-        if intervals
-        else "All lines together are blind at no frequency of the search.",
-    )
-    return Section(f"Blind frequencies{head}", text, (table,))
 
 
 def _course(jitter: PassJitter, suffix: str, head: str) -> Section:

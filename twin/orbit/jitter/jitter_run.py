@@ -13,18 +13,15 @@ from optics.numerics.backend import one_blas_thread
 from optics.numerics.number_tree import FrozenMap
 from scenes.specs.orbit.jitter_search import AXES, OrbitJitterSpec
 from scenes.specs.orbit.setup import AnyJitter, JitterSetup, MeasuredJitterSetup
-from scenes.yaml.yaml_file import dump_yaml
 from twin.framework.procedure import Advance, BenchError, silent
 from twin.framework.random_streams import stream
 from twin.framework.record import Quantity, Record
-from twin.orbit.flight.earth import Earth
 from twin.orbit.flight.line_camera import LineTimes, line_cameras
-from twin.orbit.flight.orbit import propagate
 from twin.orbit.flight.platform_table import PlatformTable
 from twin.orbit.flight.sensor import NO_EFFECTS, LightEffects, Sensor
 from twin.orbit.flight.trajectory import Jitter, Trajectory
 from twin.orbit.jitter.sights import Sights, SightsError, sights_of
-from twin.orbit.measured.measurement_tables import CAMERA_FILE, campaign_files, read_measurements
+from twin.orbit.measured.measurement_tables import read_measurements, tested_files
 from twin.orbit.measured.pass_measurements import GroundPoints, ImagePoints, PassMeasurements
 from twin.sensors.line_ccd import Collection, Motion
 
@@ -230,11 +227,7 @@ def fly_strip(setup: JitterSetup, seed: int) -> tuple[PassMeasurements, Jitter |
     """
     spec: OrbitJitterSpec = setup.test
     root = np.random.SeedSequence(seed)
-    earth, wanted = Earth.from_spec(spec.earth), spec.points
-    try:
-        trajectory = Trajectory.flown(propagate(spec.orbit, earth), spec.attitude, root)
-    except ValueError as error:
-        raise BenchError(str(error), ("orbit",), "an orbit that the satellite can fly") from error
+    trajectory, wanted = Trajectory.of_test(spec, root), spec.points
     rng_point, rng_noise, rng_wrong, rng_error = (np.random.default_rng(stream(root, k)) for k in range(4))
     measured = trajectory.with_errors(spec.errors, int(rng_error.integers(2**31)))
     platform = PlatformTable.sampled(measured, spec.errors.gps.interval, spec.errors.star_tracker.interval)
@@ -242,7 +235,9 @@ def fly_strip(setup: JitterSetup, seed: int) -> tuple[PassMeasurements, Jitter |
     times = LineTimes.even(trajectory.first + 0.5 * spec.line_time, spec.line_time, count)
     names = spec.lines or tuple(setup.camera.lines)
     cameras, effects = line_cameras(setup.camera), LightEffects.of(spec.effects)
-    sensors = {name: Sensor.of_lines(cameras[name], trajectory, earth, times, effects) for name in names}
+    sensors = {
+        name: Sensor.of_lines(cameras[name], trajectory, trajectory.orbit.earth, times, effects) for name in names
+    }
     many = int(np.ceil(_SPARE * wanted.count))
     first = sensors[names[0]]
     delay = wanted.duration * (rng_point.uniform(size=many) - 0.5)
@@ -282,64 +277,15 @@ def exported(run: JitterRun) -> dict[str, str]:
     """Return a folder of measurements with a test file that reads them back, path -> text."""
     spec = run.setup.test
     plain = spec.plain()
-    files = campaign_files([jitter.measurements for jitter in run.passes.values()], run.setup.camera.plain())
-    test = {
-        "name": spec.name,
-        "description": spec.description,
-        "camera": f"./{CAMERA_FILE}",
-        "data": ".",
-        "effects": {**plain["effects"], "corrected": True} if run.simulated else plain["effects"],
+    return tested_files(
+        [jitter.measurements for jitter in run.passes.values()],
+        run.setup.camera.plain(),
+        spec,
+        TEST_FILE,
+        effects={**plain["effects"], "corrected": True} if run.simulated else plain["effects"],
         **({"lines": list(spec.lines)} if spec.lines else {}),
-        "search": plain["search"],
-    }
-    return files | {TEST_FILE: dump_yaml(test)}
-
-
-@dataclass(frozen=True, eq=False)
-class BlindMultiple:
-    """Frequency k / dt that a pair of lines, which see a point a time dt apart, cannot observe by itself.
-
-    Attributes
-    ----------
-    first : str
-        Line that sees a point first.
-    second : str
-        Line that sees it second.
-    gap : float
-        Time between their sightings, in seconds.
-    order : int
-        Multiple k.
-    frequency : float
-        Frequency k / dt, in hertz.
-    response : float
-        Sensitivity of the observations of all lines together to an oscillation of this frequency, relative to the
-        largest over the searched frequencies, 0 to 1, for the body axis with the lowest value.
-    blind : bool
-        True if all lines together cannot observe this frequency.
-    """
-
-    first: str
-    second: str
-    gap: float
-    order: int
-    frequency: float
-    response: float
-    blind: bool
-
-
-def blind_multiples(jitter: PassJitter) -> list[BlindMultiple]:
-    """Return the searched frequencies k / dt that a pair of lines, seeing a point dt apart, cannot observe."""
-    before, multiples = jitter.result.before, []
-    share = np.min(before.response / np.max(before.response, axis=0), axis=1)
-    for (first, second), (_, gap, _) in jitter.sights.gaps.items():
-        for order in range(1, int(before.frequency[-1] * abs(gap)) + 1):
-            frequency = order / abs(gap)
-            if frequency < before.frequency[0]:
-                continue
-            k = int(np.argmin(np.abs(before.frequency - frequency)))
-            response = float(share[k]), bool(before.blind[k])
-            multiples.append(BlindMultiple(first, second, gap, order, frequency, *response))
-    return multiples
+        search=plain["search"],
+    )
 
 
 def transfers(jitter: PassJitter) -> dict[str, dict[str, float]]:
@@ -381,16 +327,6 @@ LINE: Record[Oscillation] = Record(
     Quantity("true_frequency_hz", lambda of: of.truth and of.truth[0], "true frequency", where_known=True),
     Quantity("true_amplitude_arcsec", _true_amplitudes, "axis -> true amplitude", where_known=True),
 )
-MULTIPLE: Record[BlindMultiple] = Record(
-    "A frequency at which a pair of lines alone is blind: a whole number of periods lies between their sightings.",
-    Quantity("first", lambda m: m.first, "line that sees a point first", "first"),
-    Quantity("second", lambda m: m.second, "line that sees it second", "second"),
-    Quantity("gap_ms", lambda m: m.gap, "time between their sightings", "gap", 2),
-    Quantity("periods", lambda m: m.order, "number of periods in the gap", "periods"),
-    Quantity("frequency_hz", lambda m: m.frequency, "periods over gap", "frequency [Hz]", 3),
-    Quantity("response", lambda m: m.response, "of all lines together, relative to their maximum", "response", 3),
-    Quantity("blind", lambda m: m.blind, "true if all lines together are blind there", "by all lines"),
-)
 
 
 def _gaps(jitter: PassJitter) -> dict[str, float]:
@@ -417,7 +353,6 @@ PASS: Record[PassJitter] = Record(
     Quantity("next_p_value", lambda jitter: jitter.next_p_value, "p-value of the highest remaining power"),
     Quantity("detectable_arcsec", _detectable, "axis -> least detectable amplitude, median over frequencies"),
     Quantity("blind_hz", lambda jitter: jitter.result.before.intervals(), "first and last of blind frequencies"),
-    Quantity("blind_multiples", blind_multiples, "blind frequencies of every pair alone", record=MULTIPLE),
     Quantity("mtf_at_nyquist", lambda j: transfers(j) or None, "line -> transfer, rms of phases", where_known=True),
 )
 JITTER: Record[JitterRun] = Record(

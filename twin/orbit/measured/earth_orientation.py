@@ -24,6 +24,7 @@ from typing import Any
 
 import erfa
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from analysis.arrays import ARCSEC
 from optics.numerics.array_math import in_span
@@ -408,7 +409,9 @@ class TableRotation:
         It uses Greenwich mean sidereal time of 1982 and polar motion (Vallado et al., AIAA 2006-6753, appendix C).
         """
         ut1, pole, _ = self.orientation_parameters(seconds)
-        return np.asarray(erfa.pom00(pole[..., 0], pole[..., 1], 0.0) @ _about_z(erfa.gmst82(self.julian, ut1)))
+        return np.asarray(
+            erfa.pom00(pole[..., 0], pole[..., 1], 0.0) @ erfa.rz(erfa.gmst82(self.julian, ut1), np.eye(3))
+        )
 
     def _polar(self, t: np.ndarray, pole: np.ndarray) -> np.ndarray:
         """Return polar motion, the rotation TIRS -> ITRS, (..., 3, 3)."""
@@ -427,17 +430,7 @@ def angular_velocity(matrix: Any, seconds: np.ndarray) -> np.ndarray:
         Times, seconds.
     """
     rotation = matrix(seconds + _RATE_STEP) @ np.swapaxes(matrix(seconds - _RATE_STEP), -1, -2)
-    # The matrix is a rotation by a small angle, whose sine and angle differ by a relative 1e-12.
-    lower = np.stack(
-        [
-            rotation[..., 1, 2] - rotation[..., 2, 1],
-            rotation[..., 2, 0] - rotation[..., 0, 2],
-            rotation[..., 0, 1] - rotation[..., 1, 0],
-        ],
-        axis=-1,
-    )
-    sine = 0.5 * np.linalg.norm(lower, axis=-1, keepdims=True)
-    return np.asarray(0.5 * lower * (np.arcsin(sine) / np.maximum(sine, 1e-300)) / (2.0 * _RATE_STEP))
+    return np.asarray(-Rotation.from_matrix(rotation).as_rotvec() / (2.0 * _RATE_STEP))
 
 
 def constant_orientation(epoch: str, ut1_utc: float, pole: tuple[float, float]) -> EarthOrientation:
@@ -548,10 +541,3 @@ def _checked(
                                "pole within 2 arcsec, days of 1972 to 2099"))  # fmt: skip
     ahead = np.array([tai_minus_utc(int(np.floor(day))) for day in mjd])
     return EarthOrientation(file, mjd, ut1_utc - ahead, pole, offsets)
-
-
-def _about_z(angle: np.ndarray) -> np.ndarray:
-    """Return the matrix that rotates axes about Z by an angle, (..., 3, 3)."""
-    c, s, zero = np.cos(angle), np.sin(angle), np.zeros_like(angle)
-    rows = np.stack([c, s, zero, -s, c, zero, zero, zero, zero + 1.0], axis=-1)
-    return np.asarray(rows.reshape(*np.shape(angle), 3, 3))

@@ -22,6 +22,7 @@ from scenes.specs.orbit.setup import DATA_FILE
 from scenes.specs.orbit.three_line_camera import ThreeLineCameraSpec
 from scenes.yaml.csv_table import Column, Table, read_table
 from scenes.yaml.errors import InputError, Issue, names_text, nearest, shown
+from scenes.yaml.spec import TitledSpec
 from scenes.yaml.units import LENGTH, SPEED, TIME
 from scenes.yaml.yaml_file import dump_yaml
 from twin.framework.procedure import Advance, silent
@@ -428,6 +429,28 @@ def campaign_files(passes: Sequence[PassMeasurements], camera: Mapping[str, Any]
     return files
 
 
+def tested_files(
+    passes: Sequence[PassMeasurements], camera: Mapping[str, Any], spec: TitledSpec, file: str, **keys: Any
+) -> dict[str, str]:
+    """Return the files of a folder of measurements with a test file that reads them back, path -> text.
+
+    Parameters
+    ----------
+    passes : sequence of PassMeasurements
+        Passes with different names.
+    camera : mapping
+        Content of the payload's file, plain data.
+    spec : TitledSpec
+        Test from which the measurements come; the test file gets its name and description.
+    file : str
+        Name of the test file.
+    keys : Any
+        Further keys of the test file, plain data.
+    """
+    test = {"name": spec.name, "description": spec.description, "camera": f"./{CAMERA_FILE}", "data": ".", **keys}
+    return campaign_files(passes, camera) | {file: dump_yaml(test)}
+
+
 def _pass_tables(measured: PassMeasurements) -> dict[str, str]:
     """Return the text of each table of a pass, by the table's key, with all digits of its numbers."""
     platform = measured.platform
@@ -435,11 +458,12 @@ def _pass_tables(measured: PassMeasurements) -> dict[str, str]:
     if platform.velocity is not None:
         orbit |= _columns(("vx [m/s]", "vy [m/s]", "vz [m/s]"), platform.velocity)
     attitude = {"time [s]": platform.attitude_time, **_columns(("q1", "q2", "q3", "q4"), platform.quaternion)}
-    lines: dict[str, Any] = {"camera": [], "line": [], "time [s]": []}
-    for name, times in measured.line_times.items():
-        lines["camera"] += [name] * len(times.line)
-        lines["line"] += times.line.tolist()
-        lines["time [s]"] += times.time.tolist()
+    times = measured.line_times
+    lines = {
+        "camera": np.repeat(list(times), [len(of.line) for of in times.values()]),
+        "line": np.concatenate([of.line for of in times.values()]),
+        "time [s]": np.concatenate([of.time for of in times.values()]),
+    }
     known = measured.ground.role != "tie"
     tables = {
         "orbit": csv_text(orbit),
@@ -473,25 +497,18 @@ def _ground(points: GroundPoints) -> dict[str, Any]:
 
 def _images(images: Mapping[str, ImagePoints], ground: GroundPoints, chosen: np.ndarray) -> dict[str, Any]:
     """Return the columns of a table of image points, of the ground points that the mask `chosen` selects."""
-    heads = ("point", "camera", "line", "pixel", "line_sigma", "pixel_sigma", "correlation")
-    columns: dict[str, Any] = {head: [] for head in heads}
-    for name, row in images.items():
-        selected = row.taken(chosen[row.point])
-        a, b = np.sqrt(selected.covariance[:, 0, 0]), np.sqrt(selected.covariance[:, 1, 1])
-        values = (
-            ground.ids[selected.point],
-            [name] * len(a),
-            selected.line,
-            selected.pixel,
-            a,
-            b,
-            selected.covariance[:, 0, 1] / a / b,
-        )
-        for head, value in zip(heads, values, strict=True):
-            columns[head] += np.asarray(value, dtype=object).tolist()
-    if not any(columns["correlation"]):
-        del columns["correlation"]
-    return columns
+    parts = {name: row.taken(chosen[row.point]) for name, row in images.items()}
+    rows = ImagePoints.joined(list(parts.values()))
+    sigma = np.sqrt(np.diagonal(rows.covariance, axis1=1, axis2=2))
+    columns: dict[str, Any] = {
+        "point": ground.ids[rows.point],
+        "camera": np.repeat(list(parts), [len(row.point) for row in parts.values()]),
+        "line": rows.line,
+        "pixel": rows.pixel,
+        **_columns(("line_sigma", "pixel_sigma"), sigma),
+    }
+    correlation = rows.covariance[:, 0, 1] / sigma[:, 0] / sigma[:, 1]
+    return columns | ({"correlation": correlation} if np.any(correlation) else {})
 
 
 def _columns(names: Sequence[str], values: np.ndarray) -> dict[str, np.ndarray]:

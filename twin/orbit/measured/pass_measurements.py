@@ -47,7 +47,7 @@ class GroundPoints:
 
     @classmethod
     def of(cls, ids: ArrayLike, itrs: ArrayLike, covariance: ArrayLike, role: ArrayLike) -> GroundPoints:
-        """Make ground points from arrays, with checks.
+        """Make ground points from arrays.
 
         Parameters
         ----------
@@ -59,30 +59,11 @@ class GroundPoints:
             (n, 3, 3), or one (3, 3) for all, m^2.
         role : array_like
             (n,), or one for all.
-
-        Raises
-        ------
-        ValueError
-            Shapes do not match, a name occurs twice, a role is unknown, coordinates of control or check points are not
-            finite, or a covariance is not symmetric and positive semidefinite.
         """
-        names, coordinates = np.array(ids, dtype=object), np.array(itrs, np.float64)
-        n = len(names)
-        if names.ndim != 1 or coordinates.shape != (n, 3):
-            raise ValueError(f"ground points: {n} names and coordinates {coordinates.shape}, not ({n}, 3)")
-        if len(set(names.tolist())) != n:
-            raise ValueError("ground points: a name occurs twice")
-        spread = np.array(np.broadcast_to(np.asarray(covariance, np.float64), (n, 3, 3)))
-        sorts = np.array(np.broadcast_to(np.asarray(role, dtype=object), (n,)))
-        if not set(sorts.tolist()) <= set(ROLES):
-            raise ValueError(f"ground points: roles are {', '.join(ROLES)}")
-        known = sorts != "tie"
-        if not (np.all(np.isfinite(coordinates[known])) and np.all(np.isfinite(spread))):
-            raise ValueError("ground points: a coordinate or covariance is not finite")
-        scale = np.trace(spread, axis1=1, axis2=2)[:, None]
-        if np.any(np.linalg.eigvalsh(spread) < -1e-9 * scale) or not np.allclose(spread, spread.swapaxes(1, 2)):
-            raise ValueError("ground points: a covariance is not symmetric and positive semidefinite")
-        return cls(names, coordinates, spread, sorts)
+        names = np.array(ids, dtype=object)
+        spread = np.array(np.broadcast_to(np.asarray(covariance, np.float64), (len(names), 3, 3)))
+        sorts = np.array(np.broadcast_to(np.asarray(role, dtype=object), (len(names),)))
+        return cls(names, np.array(itrs, np.float64), spread, sorts)
 
     def __len__(self) -> int:
         return len(self.ids)
@@ -121,7 +102,7 @@ class ImagePoints:
 
     @classmethod
     def of(cls, point: ArrayLike, line: ArrayLike, pixel: ArrayLike, covariance: ArrayLike) -> ImagePoints:
-        """Make image points from arrays, with checks.
+        """Make image points from arrays.
 
         Parameters
         ----------
@@ -133,19 +114,10 @@ class ImagePoints:
             Pixel coordinates.
         covariance : array_like
             (n, 2, 2), or one (2, 2) for all, pixels squared.
-
-        Raises
-        ------
-        ValueError
-            Shapes do not match or values are not finite.
         """
-        which, at, along = np.array(point, np.intp), np.array(line, np.float64), np.array(pixel, np.float64)
-        if which.ndim != 1 or at.shape != which.shape or along.shape != which.shape:
-            raise ValueError("image points: point, line and pixel must be rows of one length")
+        which = np.array(point, np.intp)
         spread = np.array(np.broadcast_to(np.asarray(covariance, np.float64), (len(which), 2, 2)))
-        if not all(np.all(np.isfinite(v)) for v in (at, along, spread)):
-            raise ValueError("image points: a value is not finite; leave out what was not measured")
-        return cls(which, at, along, spread)
+        return cls(which, np.array(line, np.float64), np.array(pixel, np.float64), spread)
 
     def taken(self, keep: ArrayLike) -> ImagePoints:
         """Return the image points that a mask or an array of indices selects."""

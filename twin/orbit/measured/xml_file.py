@@ -62,13 +62,8 @@ def numbers(file: str, cells: Sequence[Sequence[str]], lines: Sequence[int], hea
     try:
         values = np.array([list(map(float, row)) for row in cells], dtype=np.float64).reshape(len(cells), width)
     except ValueError:
-        values = np.full((len(cells), width), np.nan)
-        for k, row in enumerate(cells):
-            for j, text in enumerate(row):
-                if not _is_number(text):
-                    raise InputError(
-                        Issue("not a number", file, lines[k], (heads[j],), shown(text), "a number")
-                    ) from None
+        k, j = next((k, j) for k, row in enumerate(cells) for j, text in enumerate(row) if not _is_number(text))
+        raise InputError(Issue("not a number", file, lines[k], (heads[j],), shown(cells[k][j]), "a number")) from None
     wrong = {"not a finite number": ~np.isfinite(values), "implausibly large": np.abs(values) > LARGEST_NUMBER}
     for problem, bad in wrong.items():
         for k, j in np.argwhere(bad)[:1].tolist():
@@ -151,7 +146,7 @@ class Element:
         """
         elements = self.all(*tags)
         if len(elements) > 1:
-            self._wrong("occurs more than once", tags, elements[1].line, f"{len(elements)} of them", "one")
+            elements[1].wrong(f"{tags[-1]} occurs more than once", f"{len(elements)} of them", "one")
         return elements[0] if elements else None
 
     def single(self, *tags: str) -> Element:
@@ -247,10 +242,6 @@ class Element:
     def wrong(self, problem: str, found: str | None = None, allowed: str | None = None) -> NoReturn:
         """Raise an InputError about this element that names file, line and path."""
         raise InputError(Issue(problem, self.file, self.line, self.path, found, allowed))
-
-    def _wrong(self, problem: str, tags: tuple[str, ...], line: int, found: str, allowed: str) -> NoReturn:
-        """Raise InputError about an element at a path below this one."""
-        raise InputError(Issue(f"{tags[-1]} {problem}", self.file, line, (*self.path, *tags), found, allowed))
 
 
 class _Builder:

@@ -37,6 +37,7 @@ from twin.monitor.image_quality import image_quality
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.orbit.flight.line_camera import LineCamera, calibrated_line, corrected_line
 from twin.orbit.flight.sensor import NO_EFFECTS, Sensor
+from twin.orbit.flight.trajectory import Trajectory
 from twin.orbit.images.image_points import POINTS_REMEDY, PointsError, tie_points
 from twin.orbit.images.line_optics import LineOptics
 from twin.orbit.images.patch import PatchError, fly_patch, imaged_lines
@@ -91,7 +92,7 @@ def imaged_pair(
     nominal: Mapping[str, LineCamera],
     changes: Mapping[str, np.ndarray],
     foci: Mapping[str, float],
-    flown: pair_flight.OrbitAndAttitude,
+    flown: tuple[Trajectory, Trajectory],
     seed: np.random.SeedSequence,
 ) -> ImagedPair:
     """Render a pair of line images, match points in them, and intersect the points to ground coordinates.
@@ -110,7 +111,7 @@ def imaged_pair(
         Camera -> (4,) change that the processing corrects.
     foci : Mapping[str, float]
         Camera -> its defocus, in metres.
-    flown : OrbitAndAttitude
+    flown : tuple of Trajectory
         True and measured orbit and attitude.
     seed : np.random.SeedSequence
         Seed of ground and frames.
@@ -123,11 +124,11 @@ def imaged_pair(
     spec, pair, images = setup.test, setup.pair, setup.test.loop.images
     assert images is not None
     time, lines, calibrated = spec.times[moment], flight.lines[moment], flight.calibrated
+    earth = flown[0].orbit.earth
     begin, count = time - pair_flight.HALF_SPAN, int(2.0 * pair_flight.HALF_SPAN / spec.line_time)
 
     def sensor(line: LineCamera, measured: bool) -> Sensor:
-        trajectory = flown.measured if measured else flown.true
-        return Sensor(line, trajectory, flown.earth, spec.line_time, begin, count, NO_EFFECTS)
+        return Sensor(line, flown[measured], earth, spec.line_time, begin, count, NO_EFFECTS)
 
     true = {name: sensor(lines[name], False) for name in pair}
     users = {name: sensor(corrected_line(nominal[name], calibrated[name], changes[name]), True) for name in pair}
@@ -136,7 +137,7 @@ def imaged_pair(
     height = images.ground.terrain.height
     at = pair_flight.second_view([true[name] for name in pair], time, middle, height)
     point = true[pair[1]].ground(np.array([(at - begin) / spec.line_time]), np.array([middle]), height)
-    longitude, latitude, _ = flown.earth.geodetic(point[0])
+    longitude, latitude, _ = earth.geodetic(point[0])
     recording = imaged_lines(true, users, optics, stream(seed, 0))
     try:
         position, size = (float(longitude), float(latitude)), (images.side, images.side)

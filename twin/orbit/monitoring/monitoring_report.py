@@ -26,7 +26,7 @@ from scenes.yaml.errors import names_text
 from twin.framework import svg
 from twin.framework.artefact import SYMBOLS, CsvFile, SvgFigure, Table, significant, unit_for_reports
 from twin.framework.data_files import csv_table
-from twin.framework.report import Report, Section, answer
+from twin.framework.report import Report, Section, answer, inputs
 from twin.monitor.time_series import jump_text
 from twin.orbit.monitoring import monitoring_numbers as numbers
 from twin.orbit.monitoring.loop_run import LoopRun, height_rms
@@ -48,11 +48,6 @@ _DRAWN_PART = 5e-3
 _COLOURS = (svg.BLUE, svg.VERMILION, svg.GREEN, svg.PURPLE, svg.ORANGE, svg.SKY)
 _BESIDE = {"loc": "upper left", "bbox_to_anchor": (1.0, 1.0)}
 """Position of a legend beside the axes, where it does not hide curves."""
-_CONSERVATIVE = 0.5
-"""RMS of errors over their predicted sigmas below which the report calls the sigma conservative.
-
-Errors of one course are correlated, but rarely fall below half of a right sigma at all times.
-"""
 _BODIES, _MOTIONS = 3, 3
 """Largest numbers of bodies, and of motions of each, that the report names for an unobservable mode."""
 _LEAST = 1e-6
@@ -269,25 +264,14 @@ def _facts(run: MonitorRun | LoopRun) -> tuple[tuple[str, str], ...]:
     setup, test, errors, on = run.setup, run.setup.test, run.setup.test.errors, run.setup.test.errors.switched_on
     span = f"{moment(test.times[0])} to {moment(test.times[-1])} in steps of {moment(test.step)}"
     prior = setup.disturbances.name if setup.disturbances else "none: sigmas contain the noise alone"
-    particular = (
-        ("Readings", f"{len(test.times)}, rendered and recovered"),
-        ("Motions", "of the course" if test.course is not None else "drawn by the disturbances' laws in time"),
-        ("Lines of sight", "exact, by ray trace; points are drawn, or matched where line images are rendered"),
-    )
-    if isinstance(run, MonitorRun):
-        applied = ("Applied", ", ".join(test.apply))
-        particular = (
-            ("Reference", moment(test.reference_time)),
-            applied,
-            ("Calibration at the reference", "assumed exact"),
-        )
+    keys = ("reference", "apply") if isinstance(run, MonitorRun) else ()
     return (
         ("Instrument", f"{setup.instrument.name}, {setup.instrument.description}"),
         ("Pair", f"{setup.pair[0]} against {setup.pair[1]}"),
         ("Course", f"{span}, from {test.orbit.epoch}"),
-        *particular,
+        ("Motions", "of the course" if test.course is not None else "drawn by the disturbances' laws in time"),
         ("Disturbances", prior),
-        ("Check points", f"{test.ground.points} at each time, both views from the state at that time"),
+        *inputs(test, *keys, "ground"),
         ("Image points", f"σ {errors.image:g} px, drawn" if on else "exact"),
         ("Monitor's frames", "with noise" if on and errors.monitor else "without noise"),
         ("Effects on the light", "assumed corrected"),
@@ -301,27 +285,12 @@ def _verdict(run: MonitorRun) -> tuple[str, tuple[str, ...]]:
     gain = none.height_rms - chosen.height_rms
     others = floor.height_rms**2 > 0.5 * chosen.height_rms**2
     limit = "images, orbit and attitude" if others else _largest_part(run)
-    verdict, more = answer(
+    return answer(
         f"Monitoring every {moment(spec.every)} changes the height error from {none.height_rms:.2f} m to "
         f"{chosen.height_rms:.2f} m RMS{'' if gain > 0.0 else ', which is no gain'}",
         f"with the true cameras {floor.height_rms:.2f} m would remain: most of the error comes from {limit}",
-        f"the intersection angle changes by {np.ptp(run.angle_change) / ARCSEC:.2g} arcsec: see the errors over the "
-        "course",
         _gain(run),
     )
-    alone = (
-        f"Height error by the cameras alone: {none.camera_height_rms:.2f} m without monitoring, "
-        f"{chosen.camera_height_rms:.2f} m with this interval, {cases['monitored'].camera_height_rms:.2f} m monitored "
-        f"at every time. One arcsecond of the angle is {abs(run.conversion.of_angle):.1f} m of height."
-    )
-    return verdict, (*more, alone)
-
-
-def _times(factor: float, less: str) -> str:
-    """Return a text on the factor by which an error is smaller or larger."""
-    if factor >= 1.0:
-        return f"{factor:.2f} times {less}"
-    return f"{1.0 / factor:.2f} times {'more' if less == 'less' else 'larger'}"
 
 
 def _gain(run: MonitorRun) -> str:
@@ -329,19 +298,11 @@ def _gain(run: MonitorRun) -> str:
     if not run.smoothing:
         return ""
     chosen = run.smoothed
-    sigma, size = f"{rms(chosen.sigma):.2g} m", rms(chosen.ratios)
-    if not chosen.agrees:
-        fits = (
-            f"this contradicts the predicted sigma of {sigma}: the largest error is {chosen.largest_ratio:.1f} σ, "
-            f"limit {chosen.limit:.1f} σ"
-        )
-    elif size < _CONSERVATIVE:
-        fits = f"the predicted sigma of {sigma} is conservative: the errors are {size:.2g} σ RMS"
-    else:
-        fits = f"this agrees with the predicted sigma of {sigma}: the errors are {size:.2g} σ RMS"
     return (
         f"smoothing the same measurements changes the height error by the cameras to "
-        f"{chosen.case.camera_height_rms:.2g} m, {_times(chosen.factor, 'less')} than linear interpolation; {fits}"
+        f"{chosen.case.camera_height_rms:.2g} m, from {chosen.interpolated.camera_height_rms:.2g} m by linear "
+        f"interpolation; the predicted sigma is {rms(chosen.sigma):.2g} m, the errors are {rms(chosen.ratios):.2g} σ "
+        f"RMS, {chosen.largest_ratio:.1f} σ at most (limit {chosen.limit:.1f} σ)"
     )
 
 
@@ -404,8 +365,6 @@ def _height(run: MonitorRun) -> Section:
 
 
 def _smoothed(run: MonitorRun) -> Section:
-    spec, prior = run.spec, run.setup.disturbances
-    assert prior is not None
     chosen = run.smoothed
     consistency = chosen.consistency
     table = numbers.SMOOTHED.table(
@@ -417,8 +376,6 @@ def _smoothed(run: MonitorRun) -> Section:
         numbers.SMOOTHED.headed,
     )
     text = (
-        f"Smoothing all measurements, one every {moment(spec.every)}, under the prior {prior.name} makes the "
-        f"cameras' height error {_times(chosen.factor, 'smaller')} than linear interpolation between them.",
         f"Measured shifts {'agree' if consistency.agrees else 'do not agree'} with the prior: chi-square "
         f"{consistency.chi_square:.4g} for {consistency.degrees} degrees of freedom, limit {consistency.limit:.4g}.",
     )
@@ -530,14 +487,10 @@ def _loop_verdict(run: LoopRun) -> tuple[str, tuple[str, ...]]:
     prefix = "" if run.margins_hold else f"the loop is {'barely stable' if run.stable else 'unstable'}; "
     if run.worse:
         prefix += f"the loop makes {names_text(list(run.worse))} worse; "
-    angle = rms(run.closed.true(run.closed.angle)) / ARCSEC, rms(run.open.true(run.open.angle)) / ARCSEC
     return answer(
         f"{prefix}with the loop closed the height error by the cameras is {significant(closed, 2)} m RMS over the "
         f"orbit, with the loop open {significant(opened, 2)} m; the posterior's sigma is {significant(sigma, 2)} m",
         f"unobservable motions cause {significant(unobservable, 2)} m, which no gain can remove, and {_margin(run)}",
-        f"the error of the angle between the lines of sight is {significant(angle[0], 2)} arcsec RMS, with the loop "
-        f"open {significant(angle[1], 2)} arcsec",
-        _focus_words(run),
     )
 
 
@@ -546,17 +499,6 @@ def _margin(run: LoopRun) -> str:
         return "no correction is active"
     phase = f", the smallest phase margin {run.phase_deg:.0f} deg" if math.isfinite(run.phase_deg) else ""
     return f"the gain margin of all loops together is {significant(run.margin, 3)}{phase}"
-
-
-def _focus_words(run: LoopRun) -> str:
-    """Return a sentence on the share of the prior sigma of focus that no reading of the spots can reduce."""
-    shares, model_prior = [], run.model.prior
-    for name, unobservable in zip(run.pair, run.unobservable_sigma[1:], strict=True):
-        effect = model_prior.parameters[run.model.row(name, "defocus")]
-        prior = math.sqrt(float(effect @ model_prior.correlation @ effect))
-        if prior > 0.0:
-            shares.append(f"{float(unobservable.max()) / prior:.1%} ({name})")
-    return f"the spots cannot reduce {' and '.join(shares)} of the prior sigma of focus" if shares else ""
 
 
 def _loop_summary(run: LoopRun) -> Table:

@@ -22,9 +22,7 @@ from scenes.specs.course import moment
 from twin.framework.procedure import Advance, BenchError
 from twin.framework.random_streams import stream
 from twin.monitor.monitor_experiment import MonitorExperiment
-from twin.orbit.flight.earth import Earth
 from twin.orbit.flight.line_camera import LineCamera, calibrated_line, traced_line_cameras
-from twin.orbit.flight.orbit import propagate
 from twin.orbit.flight.sensor import NO_EFFECTS, Platform, Sensor
 from twin.orbit.flight.trajectory import Trajectory
 
@@ -290,61 +288,38 @@ def view_check_points(
     BenchError
         No such orbit exists, or too few points are seen by both lines.
     """
-    orbit_and_attitude, views = fly(spec, seed), []
+    flown, views = fly(spec, seed), []
     for k, line in enumerate(lines):
-        views.append(_view(spec, spec.times[k], [line[name] for name in pair], orbit_and_attitude, stream(seed, k + 1)))
+        views.append(_view(spec, spec.times[k], [line[name] for name in pair], flown, stream(seed, k + 1)))
         advance("ground", k + 1, len(lines))
     return tuple(views)
 
 
-@dataclass(frozen=True, eq=False)
-class OrbitAndAttitude:
-    """Orbit and attitude of a simulated satellite, as they are and as they are measured.
-
-    Attributes
-    ----------
-    earth : Earth
-        Rotation and ellipsoid of the Earth.
-    true : Trajectory
-        True orbit and attitude.
-    measured : Trajectory
-        Orbit and attitude as the satellite measures them.
-    """
-
-    earth: Earth
-    true: Trajectory
-    measured: Trajectory
-
-
-def fly(spec: OrbitMonitorSpec, seed: np.random.SeedSequence) -> OrbitAndAttitude:
-    """Simulate the true and measured orbit and attitude of a test, reproducibly for a given seed.
+def fly(spec: OrbitMonitorSpec, seed: np.random.SeedSequence) -> tuple[Trajectory, Trajectory]:
+    """Simulate the orbit and attitude of a test, reproducibly for a given seed: true, and as the satellite measures.
 
     Raises
     ------
     BenchError
         No such orbit exists.
     """
-    earth = Earth.from_spec(spec.earth)
-    try:
-        true = Trajectory.flown(propagate(spec.orbit, earth), spec.attitude, seed)
-    except ValueError as error:
-        raise BenchError(str(error), ("orbit",), "an orbit that exists") from error
-    measured = true
-    if spec.errors.switched_on:
-        measured = true.with_errors(spec.errors, int(np.random.default_rng(stream(seed, 0)).integers(2**31)))
-    return OrbitAndAttitude(earth, true, measured)
+    true = Trajectory.of_test(spec, seed)
+    if not spec.errors.switched_on:
+        return true, true
+    return true, true.with_errors(spec.errors, int(np.random.default_rng(stream(seed, 0)).integers(2**31)))
 
 
 def _view(
     spec: OrbitMonitorSpec,
     time: float,
     cameras: Sequence[LineCamera],
-    orbit_and_attitude: OrbitAndAttitude,
+    flown: tuple[Trajectory, Trajectory],
     seed: np.random.SeedSequence,
 ) -> View:
     """Draw the check points of one time, and compute their exact and measured image points."""
     random_ground, random_image = (np.random.default_rng(stream(seed, k)) for k in range(2))
-    true, earth = orbit_and_attitude.true, orbit_and_attitude.earth
+    true, measured = flown
+    earth = true.orbit.earth
     ground = spec.ground
     begin, lines = time - HALF_SPAN, int(2.0 * HALF_SPAN / spec.line_time)
     try:
@@ -374,7 +349,7 @@ def _view(
     for sensor, (row, column) in zip(sensors, seen, strict=True):
         exact.append(sightings(sensor, true, row[good], column[good]))
         offsets = noise * random_image.standard_normal((2, len(good)))
-        noisy.append(sightings(sensor, orbit_and_attitude.measured, row[good] + offsets[0], column[good] + offsets[1]))
+        noisy.append(sightings(sensor, measured, row[good] + offsets[0], column[good] + offsets[1]))
     return View(points[good], (exact[0], exact[1]), (noisy[0], noisy[1]))
 
 
