@@ -28,7 +28,6 @@ def small(**changes) -> CalibrationSetup:
         "fields": type(test.fields)({name: test.fields[name] for name in FIELDS}),
         "schemes": ((FIELDS[0],), FIELDS),
         "points": test.points.model_copy(update={"control": 24, "check": 20}),
-        "repeats": 0,
         **changes,
     }
     return WHOLE.model_copy(update={"test": test.model_copy(update=update)})

@@ -1,6 +1,6 @@
 """In-orbit calibration over fields: recovery, statistics, schemes, drifting cameras, strips of tie points."""
 
-from dataclasses import astuple, replace
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -11,19 +11,22 @@ from scipy.stats import chi2
 
 from analysis.arrays import ARCSEC
 from analysis.orbit.calibration_parameters import CalibrationError, Noise
+from analysis.orbit.forward_intersection import check_errors, intersect
 from analysis.orbit.three_line_model import misclosure
 from optics.numerics.number_tree import FrozenMap
 from scenes.specs.load import ORBIT, SCENES
 from scenes.specs.orbit.angle import LINES, EffectsSpec
+from scenes.specs.orbit.calibration import CameraDriftSpec
 from scenes.specs.orbit.flight import ThermalDriftSpec
 from scenes.specs.orbit.setup import CalibrationSetup
 from tests.twin.strip_prediction import predicted
+from twin.framework.random_streams import stream
 from twin.orbit.calibration import campaign_adjustment
 from twin.orbit.calibration.calibration_numbers import CALIBRATION
 from twin.orbit.calibration.calibration_report import calibration_report
 from twin.orbit.calibration.calibration_run import run_calibration, true_values
 from twin.orbit.calibration.campaign import Campaign, PassData, image_sigma, interior_names, line_model
-from twin.orbit.calibration.campaign_adjustment import GAUGE, fit_latitude, rate_priors, simultaneous
+from twin.orbit.calibration.campaign_adjustment import GAUGE, calibrated_alone, fit_latitude, rate_priors, simultaneous
 from twin.orbit.calibration.flown_campaign import fly_fields
 from twin.orbit.calibration.influences import unexpected_changes
 from twin.orbit.calibration.schemes import (
@@ -31,8 +34,9 @@ from twin.orbit.calibration.schemes import (
     adjust_field_with_readings,
     adjust_pass_strip,
     adjust_with_readings,
-    fly_with_drift,
-    height_per_arcsec,
+    laboratory_errors,
+    scheme_errors,
+    values_of,
     with_monitor,
 )
 from twin.orbit.calibration.schemes import check_point_errors as at_checks
@@ -42,8 +46,7 @@ from twin.orbit.flight.sensor import NO_EFFECTS
 from twin.orbit.measured.pass_measurements import ImagePoints
 
 EXAMPLE = SCENES / ORBIT / "calibrate.yaml"
-WHOLE = CalibrationSetup.read(EXAMPLE)
-SETUP = WHOLE.model_copy(update={"test": WHOLE.test.model_copy(update={"repeats": 2})})
+SETUP = CalibrationSetup.read(EXAMPLE)
 NO_LIGHT = EffectsSpec(light_time=False, aberration=False, refraction=False)
 INNER = interior_names(LINES)
 FIELDS = tuple(SETUP.test.fields)
@@ -205,19 +208,34 @@ def test_covariances_of_line_and_pixel_keep_their_sign_in_the_focal_plane() -> N
 @pytest.mark.second
 def test_light_that_is_left_in_goes_into_the_parameters(full) -> None:
     """Aberration turns the camera's view by v/c, 5.2 arcsec about the pitch axis, which the bias takes up."""
-    clean, *alone, everything = full.light
-    assert [row.left for row in alone] == [("light_time",), ("aberration",), ("refraction",)]
-    assert max(abs(v) for v in clean.shift.values()) == 0.0
-    aberration = alone[1]
-    assert np.abs(aberration.shift["Beijing pitch"]) == pytest.approx(7612.0 / 299792458.0, rel=0.03)
+    every = full.campaign.independent
+    clean = every.without_effects(every.effects)
+    base = simultaneous(clean)
+    left = {
+        name: every.without_effects(replace(every.effects, **dict.fromkeys(names, False)))
+        for name, names in (("aberration", ["aberration"]), ("refraction", ["refraction"]))
+    }
+    left["all"] = every.without_effects(NO_EFFECTS)
+    turned = simultaneous(left["aberration"])
+    turn = turned.value("Beijing pitch") - base.value("Beijing pitch")
+    assert np.abs(turn) == pytest.approx(7612.0 / 299792458.0, rel=0.03)
     # refraction tilts the outer lines' rays alike: heights before calibration, 1.5 m over tan 25 deg
-    assert alone[2].before.height_rms - clean.before.height_rms == pytest.approx(
-        1.5 / np.tan(np.radians(25.0)), rel=0.25
-    )
+    before = [values_of(laboratory_errors(one), "height_rms").mean() for one in (left["refraction"], clean)]
+    assert before[0] - before[1] == pytest.approx(1.5 / np.tan(np.radians(25.0)), rel=0.25)
     # of the sigma of x, 0.33 um with what is not known of the drift of the bias
-    assert abs(everything.most(INNER)[1]) > 5.0
-    for row in full.light:
-        assert astuple(row.after) == pytest.approx(astuple(clean.after), rel=0.01)
+    everything, sigma = simultaneous(left["all"]), full.together.sigma
+    changes = [(everything.value(n) - base.value(n)) / sigma[n] for n in INNER if sigma[n] > 0.0]
+    assert np.abs(changes).max() > 5.0
+    after = [errors_of_own_parameters(one) for one in (clean, *left.values())]
+    for errors in after:
+        assert errors == pytest.approx(after[0], rel=0.01)
+
+
+def errors_of_own_parameters(campaign: Campaign) -> tuple[float, float]:
+    """Return the means of the fields' RMS errors in plan and in height, each field with its own parameters, metres."""
+    alone = {one.name: calibrated_alone(campaign, one) for one in campaign.passes}
+    errors = list(scheme_errors(campaign, alone).values())[-1]
+    return values_of(errors, "plan_rms").mean(), values_of(errors, "height_rms").mean()
 
 
 # Biases against latitude
@@ -250,20 +268,23 @@ def test_latitude_fit_is_as_good_as_it_says() -> None:
 def test_a_wrong_datum_is_taken_up_and_told(full) -> None:
     """100 m in plan are 100 m over 500 km = 41 arcsec of roll and pitch; in height 100/500 000 of f. The offsets, held
     by 0.3 m, take up nothing."""
-    for row in full.datum[:3]:
-        plan = np.hypot(*row.shift[:2])
-        assert np.hypot(*row.bias[:2]) == pytest.approx(plan / 500e3, rel=0.02, abs=1e-6)
-        assert np.abs(row.offset).max() < 0.2
-    assert full.datum[2].interior["nadir f"] == pytest.approx(-100.0 / 500e3 * 0.65, rel=0.02)
-    # lines 10 ms late see the ground of 70 m before, which is pitch; 7.06 km/s, and 2 % of that by the turning Earth
-    late = full.datum[3]
-    assert late.late == 0.01
-    assert np.hypot(*late.bias[:2]) == pytest.approx(70.6 / 500e3, rel=0.05)
+    right = fly_fields(setup_with(), np.random.SeedSequence(1)).independent
+    base = simultaneous(right)
+    for shift in ((100.0, 0.0, 0.0), (0.0, 100.0, 0.0), (0.0, 0.0, 100.0)):
+        wrong = fly_fields(setup_with(datum=shift), np.random.SeedSequence(1)).independent
+        found = simultaneous(wrong)
+        change = dict(zip(found.names, found.values - base.values, strict=True))
+        turn, offset = (
+            np.mean([[change[f"{name} {part}"] for part in parts] for name in FIELDS], axis=0)
+            for parts in (("roll", "pitch"), ("offset along", "offset across", "offset down"))
+        )
+        assert np.hypot(*turn) == pytest.approx(np.hypot(*shift[:2]) / 500e3, rel=0.02, abs=1e-6)
+        assert np.abs(offset).max() < 0.2
+    assert change["nadir f"] == pytest.approx(-100.0 / 500e3 * 0.65, rel=0.02)
     # 100 m of height are far beyond the interior's sigmas, and long before a warning
-    assert full.datum[2].most_sigmas[1] > 20.0
-    assert full.datum[2].warned > 100.0
-    assert full.datum[0].after.plan_rms == pytest.approx(100.0, rel=0.02)
-    assert full.datum[2].after.height_rms == pytest.approx(100.0, rel=0.03)
+    assert max(abs(change[n]) / base.sigma[n] for n in INNER if base.sigma[n] > 0.0) > 20.0
+    assert unexpected_changes(wrong, found) == ()
+    assert errors_of_own_parameters(wrong)[1] == pytest.approx(100.0, rel=0.03)
     assert full.unexpected_changes == ()
     campaign = fly_fields(setup_with(datum=(400.0, 0.0, 0.0)), np.random.SeedSequence(1))
     found = unexpected_changes(campaign, simultaneous(campaign.independent))
@@ -341,15 +362,29 @@ KEPT = ("Beijing", "Anhui", "Xinjiang")
 SEED = np.random.SeedSequence(3)
 
 
-def monitored_with(exact: bool = False) -> CalibrationSetup:
-    """Three fields of the example; exact: no noise, and no bias that changes from field to field or in a pass."""
+def drifting(drift: bool = True) -> Campaign:
+    """Three fields of the example without effects on the light, without noise, and without a bias that changes from
+    field to field or in a pass."""
     test = MONITORED.test
-    update: dict[str, object] = {"fields": FrozenMap({k: test.fields[k] for k in KEPT}), "schemes": (KEPT[:1], KEPT)}
-    if exact:
-        tracker = test.errors.star_tracker.model_copy(update={"thermal": ThermalDriftSpec()})
-        errors = {"switched_on": False, "season": (0.0, 0.0, 0.0), "star_tracker": tracker}
-        update["errors"] = test.errors.model_copy(update=errors)
-    return MONITORED.model_copy(update={"test": test.model_copy(update=update)})
+    tracker = test.errors.star_tracker.model_copy(update={"thermal": ThermalDriftSpec()})
+    errors = {"switched_on": False, "season": (0.0, 0.0, 0.0), "star_tracker": tracker}
+    update = {
+        "fields": FrozenMap({k: test.fields[k] for k in KEPT}),
+        "schemes": (KEPT[:1], KEPT),
+        "errors": test.errors.model_copy(update=errors),
+        "effects": NO_LIGHT,
+        "drift": test.drift if drift else FrozenMap({"forward": CameraDriftSpec()}),
+    }
+    setup = MONITORED.model_copy(update={"test": test.model_copy(update=update)})
+    return fly_fields(setup, stream(SEED)).independent
+
+
+def height_per_arcsec(campaign: Campaign) -> float:
+    """Mean height error of the first field, metres, for 1 arcsec of d_alpha of the forward line."""
+    one, cameras = campaign.passes[0], dict(campaign.truth)
+    turned = {**cameras, "forward": cameras["forward"].drifted(np.array([ARCSEC, 0.0, 0.0, 0.0]))}
+    ground = [intersect(one.check, seen, campaign.noise, bias=one.bias).ground for seen in (cameras, turned)]
+    return float(check_errors(ground[1], ground[0]).error[:, 2].mean())
 
 
 def test_the_drifted_camera_is_the_one_of_the_analysis() -> None:
@@ -364,7 +399,7 @@ def test_the_drifted_camera_is_the_one_of_the_analysis() -> None:
 @pytest.mark.second
 def test_exact_readings_return_everything() -> None:
     """Places of the sensor are solved to 1e-12 m; 1e-6 of the drift is 20 pm, and 1e-6 of 1 um is as good."""
-    campaign = fly_with_drift(monitored_with(exact=True), 1.0, SEED)
+    campaign = drifting()
     found = adjust_with_readings(campaign)
     for one in campaign.passes:
         assert np.abs(one.truth.drift["forward"]).max() > 0.1 * ARCSEC
@@ -386,10 +421,8 @@ def test_drift_without_a_monitor_shifts_heights_as_its_angle_says() -> None:
     """By hand, over a flat Earth: 1 arcsec of one outer line is H / sin(2 look) per radian, 3.2 m; the curved Earth
     takes 7% off. Heights of a field differ by its d_alpha, forward less backward, against the mean of all, to the same
     few per cent of metres per arcsec over latitudes, and d_beta, d_gamma and d_f act at the ends of the line."""
-    setup = monitored_with(exact=True)
-    campaign = fly_with_drift(setup, 1.0, SEED)
-    metres = height_per_arcsec(fly_with_drift(setup, 0.0, SEED))
-    by_hand = setup.test.altitude / np.sin(np.radians(50.0)) * ARCSEC
+    campaign, metres = drifting(), height_per_arcsec(drifting(drift=False))
+    by_hand = MONITORED.test.altitude / np.sin(np.radians(50.0)) * ARCSEC
     assert abs(metres) == pytest.approx(by_hand, rel=0.1)
     found = simultaneous(campaign)
     angle = np.array([(p.truth.drift["forward"] - p.truth.drift["backward"])[0] / ARCSEC for p in campaign.passes])
@@ -403,7 +436,7 @@ def test_drift_without_a_monitor_shifts_heights_as_its_angle_says() -> None:
 def test_a_constant_error_of_the_monitor_goes_into_the_interior() -> None:
     """1 arcsec of the forward line in all readings is 3.15 um of x, f times it, and no error of heights. In the reading
     of one tested pass alone it is that pass's error, metres per arcsec."""
-    campaign = fly_with_drift(monitored_with(exact=True), 1.0, SEED)
+    campaign = drifting()
     wrong = np.array([ARCSEC, 0.0, 0.0, 0.0])
 
     def off(one):

@@ -90,7 +90,6 @@ LEAST_PATCHES = 2
 
 FieldLength = Annotated[float, Quantity(DISTANCE, smallest="1 km", largest="500 km")]
 Count = Annotated[Whole, Field(le=5000)]
-Repeats = Annotated[Whole, Field(ge=0, le=1000)]
 
 
 class FieldSpec(Spec):
@@ -330,9 +329,6 @@ class OrbitCalibrationSpec(TitledSpec):
         Prior standard deviations of the changes due to the launch.
     limits : MapLimitsSpec
         Largest RMS errors for the verdict.
-    repeats : int
-        Number of further campaigns over the same fields with new random numbers, which show the scatter between
-        campaigns.
     seed : int
         Seed of all random numbers.
     """
@@ -355,16 +351,12 @@ class OrbitCalibrationSpec(TitledSpec):
     strip: StripSpec | None = None
     launch: LaunchSpec = LaunchSpec.model_construct()
     limits: MapLimitsSpec = MapLimitsSpec.model_construct()
-    repeats: Repeats = 0
     seed: Seed = 0
 
     @model_validator(mode="after")
     def _has_points(self) -> "OrbitCalibrationSpec":
         problem = "points must be given in exactly one way"
         require_one(self, ("points", "images"), problem, "`points:` or `images:`", ("points",))
-        if self.images is not None and self.repeats:
-            problem = "campaigns from images cannot be repeated"
-            raise Problem(problem, str(self.repeats), "0", within=("repeats",))
         return self
 
     @model_validator(mode="after")

@@ -10,7 +10,7 @@ import numpy as np
 from analysis.arrays import Array
 from analysis.calibration.adjustment import FALSE_ALARM, Adjustment
 from analysis.calibration.strip_adjustment import Datum
-from analysis.orbit.calibration_parameters import OFFSET, RATE, Combination
+from analysis.orbit.calibration_parameters import RATE, Combination
 from analysis.orbit.forward_intersection import CheckErrors
 from analysis.orbit.three_line_model import BIAS
 from twin.framework.record import Quantity, Record
@@ -18,7 +18,7 @@ from twin.orbit.calibration import schemes
 from twin.orbit.calibration.calibration_run import CalibrationRun, FieldResult, Unknown, unit, unknowns
 from twin.orbit.calibration.campaign import Campaign, FieldImages, FieldPass, Screening, interior_names
 from twin.orbit.calibration.campaign_adjustment import LatitudeFit, ground_sample, intersection_fit
-from twin.orbit.calibration.influences import AttitudeDrift, ChipStep, DatumRow, LightRow, UnexpectedChange
+from twin.orbit.calibration.influences import AttitudeDrift, ChipStep, UnexpectedChange
 from twin.orbit.images.patch import LineComparison
 from twin.orbit.images.simulate_run import MATCH_COUNTS
 
@@ -26,8 +26,8 @@ from twin.orbit.images.simulate_run import MATCH_COUNTS
 
 ERRORS: Record[CheckErrors | schemes.FieldErrors] = Record(
     "RMS errors at check points, in metres.",
-    Quantity("plan_rms_m", lambda e: e.plan_rms, "RMS error in plan, east and north together"),
-    Quantity("height_rms_m", lambda e: e.height_rms, "RMS error in height"),
+    Quantity("plan_rms_m", lambda e: e.plan_rms, "RMS error in plan, east and north together", "plan", 2),
+    Quantity("height_rms_m", lambda e: e.height_rms, "RMS error in height", "height", 2),
 )
 MEANS: Record[schemes.SchemeMeans] = Record(
     "RMS errors over the fields, for each scheme of averaged parameters.",
@@ -36,61 +36,27 @@ MEANS: Record[schemes.SchemeMeans] = Record(
     Quantity("height_mean_m", lambda means: means.height, "mean over the fields in height"),
     Quantity("height_spread_m", lambda means: means.height_spread, "standard deviation over the fields in height"),
 )
-REPEATED: Record[tuple[Array, Array, float]] = Record(
-    "Errors of a scheme over the repeated campaigns.",
-    Quantity("plan_rms_m", lambda r: r[0].mean(axis=1), "mean of the fields' RMS in plan, campaign by campaign"),
-    Quantity("plan_spread_m", lambda r: r[0].std(axis=1), "standard deviation over the fields in plan"),
-    Quantity("height_rms_m", lambda r: r[1].mean(axis=1), "mean of the fields' RMS in height, campaign by campaign"),
-    Quantity("height_spread_m", lambda r: r[1].std(axis=1), "standard deviation over the fields in height"),
-    Quantity("share_within_limits", lambda r: r[2], "share of the campaigns in which every field meets the limits"),
-)
-
-
-def _repeats(run: CalibrationRun) -> schemes.Repeats:
-    assert run.repeats is not None
-    return run.repeats
-
-
-def _repeated(run: CalibrationRun) -> dict[str, tuple[Array, Array, float]]:
-    repeats, limits = _repeats(run), run.setup.test.limits
-    met = repeats.met(limits.plan, limits.height).tolist()
-    return {name: (repeats.plan[:, k], repeats.height[:, k], met[k]) for k, name in enumerate(repeats.schemes)}
-
-
-CAMPAIGNS: Record[CalibrationRun] = Record(
-    "Campaigns repeated with all errors drawn anew.",
-    Quantity("count", lambda run: len(_repeats(run).plan), "number of campaigns"),
-    Quantity("schemes", _repeated, "errors by scheme", record=REPEATED),
-)
 TREATMENT: Record[schemes.Treatment] = Record(
     "Errors of drifting cameras, adjusted with the monitor's readings or without.",
     Quantity("all_fields", lambda t: t.together, "errors with all fields adjusted at once", record=ERRORS),
     Quantity("p_value", lambda t: t.p_value, "probability of a chi-square at least as large in that adjustment"),
     Quantity("schemes", lambda t: t.schemes, "errors without ground control, by scheme", record=ERRORS),
 )
-CAMERA_DRIFT: Record[tuple[schemes.Monitoring, schemes.DriftSize]] = Record(
-    "Errors for one size of the cameras' drift from field to field.",
-    Quantity("factor", lambda d: d[1].factor, "size of the drift relative to that of the file"),
-    Quantity("d_alpha_rad_sigma", lambda d: d[1].factor * d[0].angle, "standard deviation of Δα of an outer line"),
-    Quantity("without_monitor", lambda d: d[1].without, "adjusted as if no camera drifted", record=TREATMENT),
-    Quantity("with_monitor", lambda d: d[1].monitored, "adjusted with the monitor's readings", record=TREATMENT),
-)
 MONITORING: Record[schemes.Monitoring] = Record(
     "Cameras that drift from field to field, with and without the on-board monitor.",
-    Quantity("d_alpha_rad_sigma", lambda m: m.angle, "standard deviation of Δα of an outer line in the file"),
-    Quantity("height_for_1_arcsec_m", lambda m: m.metres, "height change for 1 arcsec of Δα of the forward line"),
     Quantity("noise_counts_as", lambda m: "independent", "model of the noise of orbit and attitude"),
-    Quantity("sizes", lambda m: [(m, size) for size in m.sizes], "errors by size of the drift", record=CAMERA_DRIFT),
+    Quantity("without_monitor", lambda m: m.without, "adjusted as if no camera drifted", record=TREATMENT),
+    Quantity("with_monitor", lambda m: m.monitored, "adjusted with the monitor's readings", record=TREATMENT),
 )
 TIES: Record[tuple[Mapping[str, CheckErrors], Mapping[str, CheckErrors]]] = Record(
     "Errors of a scheme without and with tie points, over the check points of all fields.",
-    Quantity("without_ties", lambda e: schemes.FieldErrors.pooled(e[0].values()), record=ERRORS),
-    Quantity("with_ties", lambda e: schemes.FieldErrors.pooled(e[1].values()), record=ERRORS),
+    Quantity("without_ties", lambda e: schemes.FieldErrors.pooled(e[0].values()), head="without ties", record=ERRORS),
+    Quantity("with_ties", lambda e: schemes.FieldErrors.pooled(e[1].values()), head="with ties", record=ERRORS),
 )
 DATUM_SIGMA: Record[Datum] = Record(
     "Uncertainty of a rotation of the whole pass.",
-    Quantity("sigma_before", lambda d: d.before, "standard deviation from the readings alone"),
-    Quantity("sigma_after", lambda d: d.after, "standard deviation with the tie points"),
+    Quantity("sigma_before", lambda d: d.before, "standard deviation from the readings alone", shown="arcsec"),
+    Quantity("sigma_after", lambda d: d.after, "standard deviation with the tie points", shown="arcsec"),
     Quantity("unit", lambda d: "rad/s" if "rate" in d.name else "rad", "unit of both sigmas"),
 )
 
@@ -357,9 +323,9 @@ STEPWISE: Record[CalibrationRun] = Record(
 )
 BIAS_OF_FIELD: Record[tuple[float, float, float | None]] = Record(
     "Attitude bias of a field calibrated by itself.",
-    Quantity("value", lambda bias: bias[0], "estimated value"),
-    Quantity("sigma", lambda bias: bias[1], "standard deviation"),
-    Quantity("truth", lambda bias: bias[2], "true value, where a simulation knows it"),
+    Quantity("value", lambda bias: bias[0], "estimated value", "bias", 3, shown="arcsec"),
+    Quantity("sigma", lambda bias: bias[1], "standard deviation", "σ", 3, shown="arcsec"),
+    Quantity("truth", lambda bias: bias[2], "true value, where a simulation knows it", "truth", 3, shown="arcsec"),
     Quantity("unit", lambda bias: "rad", "unit of value, sigma and truth"),
 )
 INTERIOR_OF_FIELD: Record[tuple[float, float]] = Record(
@@ -451,44 +417,6 @@ REPEATABILITY: Record[schemes.Repeatability] = Record(
 
 # --- errors that the fit hardly shows --------------------------------------------------------------------
 
-CHANGE: Record[tuple[str, float]] = Record(
-    "Change of a parameter.",
-    Quantity("value", lambda change: change[1], "change"),
-    Quantity("unit", lambda change: unit(change[0]), "unit of the change"),
-)
-LIGHT: Record[LightRow] = Record(
-    "Errors caused by effects on the light that are left in the image points.",
-    Quantity("left_in", lambda row: row.left, "effects that are not corrected"),
-    Quantity("moved_rms_m", lambda row: row.moved, "RMS displacement of image points, x and y, by line camera"),
-    Quantity("before", lambda row: row.before, "with the laboratory's camera, mean of the fields", record=ERRORS),
-    Quantity("after", lambda row: row.after, "with each field's own parameters, mean of the fields", record=ERRORS),
-    Quantity("parameter_change", lambda row: {n: (n, v) for n, v in row.shift.items()}, record=CHANGE),
-    Quantity(
-        "parameter_change_sigmas",
-        lambda row: {n: v / row.sigma[n] for n, v in row.shift.items() if row.sigma[n] > 0.0},
-        "changes in sigmas of the parameter",
-    ),
-    Quantity("p_value", lambda row: row.p_value, "probability of a chi-square at least as large"),
-)
-DATUM: Record[DatumRow] = Record(
-    "Errors caused by a shift of the datum, or by a delay of the lines' clock.",
-    Quantity("shift_east_north_up_m", lambda row: row.shift, "shift of all control points"),
-    Quantity("late_s", lambda row: row.late, "delay of the clock"),
-    Quantity("bias_change_rad", lambda row: dict(zip(BIAS, row.bias, strict=True)), "mean over the fields"),
-    Quantity("interior_change_m", lambda row: row.interior, "by element of the interior orientation"),
-    Quantity("offset_change_m", lambda row: dict(zip(OFFSET, row.offset, strict=True)), "mean over the fields"),
-    Quantity("most", lambda row: row.most_sigmas[0], "element that moves by the most of its sigmas"),
-    Quantity("most_sigmas", lambda row: row.most_sigmas[1], "change of that element in its sigmas"),
-    Quantity(
-        "one_sigma_at",
-        lambda row: row.size / row.most_sigmas[1] if row.most_sigmas[1] else None,
-        "shift or delay that moves it by one sigma, metres or seconds",
-    ),
-    Quantity("warned_from", lambda row: row.warned, "smallest shift or delay that raises a warning; null for never"),
-    Quantity("chi_square_change", lambda row: row.fit, "change of the adjustment's chi-square"),
-    Quantity("p_value", lambda row: row.p_value, "probability of a chi-square at least as large"),
-    Quantity("after", lambda row: row.after, "with each field's own parameters, mean of the fields", record=ERRORS),
-)
 UNEXPECTED_CHANGE: Record[UnexpectedChange] = Record(
     "Estimate that differs from its prior by more than launch and orbit explain.",
     Quantity("name", lambda u: u.name, "name of the unknown"),
@@ -532,11 +460,7 @@ CALIBRATION: Record[CalibrationRun] = Record(
     Quantity("finding", lambda run: run.scheme_means, record=MEANS),
     Quantity("bias_latitude", lambda run: {fit.axis: fit for fit in run.latitude}, record=LATITUDE),
     Quantity("repeatability", lambda run: run.repeatability, record=REPEATABILITY),
-    Quantity("light", lambda run: run.light, record=LIGHT),
-    Quantity("light_corrected", lambda run: bool(run.setup.test.effects.corrected), "true if effects are corrected"),
-    Quantity("datum", lambda run: run.datum, record=DATUM),
     Quantity("unexpected_changes", lambda run: run.unexpected_changes, "largest ratio first", record=UNEXPECTED_CHANGE),
-    Quantity("campaigns", lambda run: None if run.repeats is None else run, record=CAMPAIGNS),
     Quantity("monitoring", lambda run: run.monitoring, record=MONITORING),
     Quantity("strips", lambda run: None if run.strips is None else run, record=STRIPS),
     Quantity("map_limits", lambda run: run, record=MAP_LIMITS),

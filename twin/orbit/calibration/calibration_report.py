@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import astuple
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -13,14 +12,22 @@ from analysis.arrays import ARCSEC
 from scenes.specs.orbit.setup import MeasuredCalibrationSetup
 from scenes.yaml.units import ANGLE, LENGTH, format_quantity
 from twin.framework import svg
-from twin.framework.artefact import Cell, PngFigure, Table, decimals_for
+from twin.framework.artefact import PngFigure, Table, decimals_for
 from twin.framework.report import Report, Section, answer
-from twin.orbit.calibration.calibration_numbers import CALIBRATION, MATCHING, SCREENED
+from twin.orbit.calibration.calibration_numbers import (
+    CALIBRATION,
+    DATUM_SIGMA,
+    ERRORS,
+    MATCHING,
+    MEASURED,
+    SCREENED,
+    TIES,
+)
 from twin.orbit.calibration.calibration_run import CalibrationRun, unit
 from twin.orbit.calibration.calibration_sections import Rows, adjustment_sections, figure_of, prior_dominated
-from twin.orbit.calibration.campaign_adjustment import ground_sample, intersection_fit
+from twin.orbit.calibration.campaign_adjustment import intersection_fit
 from twin.orbit.calibration.influences import UNEXPECTED_SIGMAS, drift_warnings, step_warnings
-from twin.orbit.calibration.schemes import RMS, FieldErrors, Monitoring, SchemeMeans, meets, values_of
+from twin.orbit.calibration.schemes import RMS, FieldErrors, SchemeMeans, meets, values_of
 from twin.orbit.flight.sensor import LightEffects
 from twin.orbit.images.image_points import UNMODELLED_SIGMA
 from twin.orbit.images.patch import WRONG
@@ -28,6 +35,7 @@ from twin.orbit.images.simulate_report import SORTS, changes_text, points_png
 from twin.orbit.measured.pass_measurements import duplicates, listed
 
 if TYPE_CHECKING:
+    from scenes.specs.orbit.calibration import CameraDriftSpec, MonitorReadingSpec
     from scenes.specs.orbit.setup import CalibrationSetup
 
 
@@ -85,11 +93,10 @@ def calibration_report(run: CalibrationRun) -> Report:
 def _sections(run: CalibrationRun, data: Mapping[str, Any]) -> tuple[Section, ...]:
     candidates = (
         _schemes(run),
-        None if run.repeats is None else _repeats(run),
-        _measured(run) if run.truth is None else None,
+        _measured(run, data["measured"]) if run.truth is None else None,
         None if run.campaign.images is None else _images(run, data["images"]),
-        None if run.monitoring is None else _monitoring(run),
-        None if run.strips is None else _strips(run),
+        None if run.monitoring is None else _monitoring(run, data["monitoring"]),
+        None if run.strips is None else _strips(run, data["strips"]),
     )
     return *(section for section in candidates if section is not None), *adjustment_sections(run, data)
 
@@ -302,72 +309,37 @@ def _schemes(run: CalibrationRun) -> Section:
     return Section("Schemes of averaged parameters", text, (figures[0], *tables, figures[1]))
 
 
-def _repeats(run: CalibrationRun) -> Section:
-    assert run.repeats is not None
-    limits, count = run.campaign.spec.limits, len(run.repeats.plan)
-    met = run.repeats.met(limits.plan, limits.height)
-    rows: Rows = []
-    for k, name in enumerate(scheme_names(run)):
-        cells: list[Cell] = [name]
-        for values in (run.repeats.plan[:, k], run.repeats.height[:, k]):
-            mean = values.mean(axis=1)
-            cells += [float(mean.mean()), float(mean.std(ddof=1)) if count > 1 else None]
-            cells += [float(values.std(axis=1).mean())]
-        rows.append((*cells, f"{100.0 * met[k]:.0f}%"))
-    heads = [head for what in ("plan", "height") for head in (f"{what} [m]", "± campaign", "spread of fields")]
-    table = Table(
-        "campaigns",
-        f"{count} campaigns over the same fields",
-        "RMS at check points, metres: mean of the fields, averaged over the campaigns, with its standard deviation "
-        "from campaign to campaign; spread over the fields; share of campaigns in which every field meets 1:50 000. "
-        "Biases, orbits, points and noise are drawn anew; the camera, the fields and the drift with latitude are the "
-        "same.",
-        ("parameters", *heads, "1:50 000"),
-        rows,
-        (None, 2, 2, 2, 2, 2, 2, None),
-    )
-    return Section("Other campaigns", (), (table,))
-
-
-def _measured(run: CalibrationRun) -> Section:
+def _measured(run: CalibrationRun, data: Mapping[str, Any]) -> Section:
     campaign = run.campaign
-    rows: Rows = []
+    points = {
+        name: row | {key: len(row[key]) for key in ("rejected", "rejected_check_points")} for name, row in data.items()
+    }
+    points_of = ("control_points", "tie_points", "check_points", "rejected", "rejected_check_points")
     sizes: Rows = []
     for flight in campaign.passes:
-        rejected, alone = campaign.rejected.get(flight.name), run.fields[flight.name].adjustment
-        fit, errors = intersection_fit(campaign, flight, alone), list(run.schemes.values())[-1][flight.name]
-        factors = {} if rejected is None else {line: f"{factor:.2f}" for line, factor in rejected.factors.items()}
-        alike = len(set(factors.values())) == 1
-        factor = factors.popitem()[1] if alike else ", ".join(f"{line} {v}" for line, v in factors.items())
-        lost = (None, None, None) if rejected is None else (len(rejected.points), len(rejected.check_points), factor)
-        points = (int(flight.is_control.sum()), flight.tie_count, len(flight.check_ground))
-        ratio, check = (v.chi_square / max(v.degrees_of_freedom, 1) for v in (alone, fit))
-        rows.append((flight.name, *points, *lost, ratio, alone.p_value, check))
-        for line in flight.data.sensors:
-            along, across = ground_sample(flight, line)
-            pixel = float(np.sqrt(along * across))
-            both = errors.plan_rms / pixel, errors.height_rms / pixel
-            sizes.append((flight.name, line, along, across, *both, errors.count))
-    heads = ("image points rejected", "check rejected", "factor", "χ²/dof", "p", "check χ²/dof")
+        errors, factors = list(run.schemes.values())[-1][flight.name], data[flight.name]["sigma_factor"] or {}
+        for line, (along, across) in data[flight.name]["gsd_m"].items():
+            both = (v / float(np.sqrt(along * across)) for v in (errors.plan_rms, errors.height_rms))
+            sizes.append((flight.name, line, along, across, *both, factors.get(line)))
     tables = (
-        Table(
+        MEASURED.table(
             "measured-points",
             "Points of every pass",
-            "Rejected: image points by robust weights, and check points whose rays do not intersect. Factor: applied "
-            "to the given sigmas of image points by line, from the remaining residuals. Chi-square over its degrees of "
-            "freedom: of the pass adjusted by itself, and of the rays of its check points with these parameters.",
-            ("pass", "control", "ties", "check", *heads),
-            rows,
-            (None, None, None, None, None, None, None, 2, 3, 2),
+            "Rejected: image points by robust weights, and check points whose rays do not intersect. Chi-square and "
+            "its degrees of freedom: of these rays with the parameters of the pass adjusted by itself.",
+            points,
+            (*points_of, "check_chi_square", "check_degrees_of_freedom"),
+            "pass",
         ),
         Table(
             "measured-pixels",
             "Ground sample distance, and errors of check points in ground pixels",
             "Ground sample distance of the middle of each line, metres; RMS errors of the check points with the pass's "
-            "own parameters, in ground pixels (geometric mean of along and across).",
-            ("pass", "line", "along the track [m]", "across [m]", "plan [px]", "height [px]", "check points"),
+            "own parameters, in ground pixels (geometric mean of along and across). Factor: applied to the given "
+            "sigmas of image points, from the remaining residuals.",
+            ("pass", "line", "along the track [m]", "across [m]", "plan [px]", "height [px]", "factor"),
             sizes,
-            (None, None, 3, 3, 2, 2, None),
+            (None, None, 3, 3, 2, 2, 2),
         ),
     )
     none = () if campaign.rejected else ("No image point was rejected: the file has `screening: none`.",)
@@ -421,16 +393,13 @@ def _images(run: CalibrationRun, data: Mapping[str, Any]) -> Section:
     remaining = " and ".join(str(int(p.control.control.sum())) for p in campaign.passes)
     text = (
         f"In each field {len(spec.patches)} patches of {spec.lines} x {spec.pixels} pixels are rendered by every line. "
-        f"Of {total['found']} matched positions, {total['wrong_found']} are wrong "
-        f"({100.0 * total['wrong_found'] / total['found']:.1f}%), mostly on parcels that look different in the "
-        f"orthophoto. After the thresholds of matching {total['wrong_matched']} of {total['matched']} are wrong, after "
-        f"the test of the neighbours {total['wrong_accepted']} of {total['accepted']}, after the adjustment "
-        f"{total['wrong_left']} of {total['left']} image points and {total['wrong_check_left']} of "
-        f"{total['check_left']} check points. The test of the neighbours rejects "
-        f"{total['right_rejected_by_consensus']} correct positions, the adjustment "
-        f"{total['right_rejected_by_adjustment']}. {remaining} control points remain. Their image points are weighted "
-        f"by the covariances of the matching, with {UNMODELLED_SIGMA:g} px added for errors that the fit does not "
-        "show.",
+        f"Of {total['found']} matched positions, {total['wrong_found']} are wrong, mostly on parcels that look "
+        f"different in the orthophoto; {total['wrong_accepted']} of {total['accepted']} pass the thresholds of "
+        f"matching and the test of the neighbours, {total['wrong_left']} of {total['left']} image points and "
+        f"{total['wrong_check_left']} of {total['check_left']} check points the adjustment, which rejects "
+        f"{total['right_rejected_by_adjustment']} correct positions. {remaining} control points remain. Their image "
+        f"points are weighted by the covariances of the matching, with {UNMODELLED_SIGMA:g} px added for errors that "
+        "the fit does not show.",
     )
     first = campaign.images[0]
     figures = [
@@ -449,73 +418,43 @@ def _images(run: CalibrationRun, data: Mapping[str, Any]) -> Section:
 def monitor_gain(run: CalibrationRun) -> str:
     """Return a sentence on the height error with and without the on-board monitor."""
     assert run.monitoring is not None
-    none, nominal = run.monitoring.at(0.0), run.monitoring.at(1.0)
-    scheme = list(none.without.schemes)[-2]
-    still, blind = none.without.schemes[scheme].height_rms, nominal.without.schemes[scheme].height_rms
+    scheme = list(run.schemes)[-2]
+    without, monitored = (t.schemes[scheme].height_rms for t in (run.monitoring.without, run.monitoring.monitored))
+    return (
+        f"With cameras that drift from field to field, the height error without ground control (scheme {scheme}) is "
+        f"{without:.2f} m RMS; with the on-board monitor's readings, {monitored:.2f} m."
+    )
+
+
+def _monitoring(run: CalibrationRun, data: Mapping[str, Any]) -> Section:
+    monitoring, spec = run.monitoring, run.campaign.simulated
+    assert monitoring is not None
+    assert spec.monitor is not None
+
+    def sizes(of: CameraDriftSpec | MonitorReadingSpec) -> str:
+        angles = ", ".join(format_quantity(v, ANGLE) for v in of.angles)
+        return f"{angles}, Δf {format_quantity(of.principal_distance, LENGTH)}"
+
+    drifts = "; ".join(f"{name} {sizes(drift)}" for name, drift in spec.drift.items())
     text = (
-        f"With cameras that drift by {run.monitoring.angle / ARCSEC:.2g} arcsec (Δα, 1σ) from field to field, the "
-        f"height error without ground control (scheme {scheme}) is {blind:.2f} m RMS, against {still:.2f} m without "
-        "drift"
+        f"Each line camera differs in every field from its reference state, 1σ of Δα, Δβ, Δγ: {drifts}. The monitor "
+        f"reads each camera in each pass with {sizes(spec.monitor)}, 1σ. All fields at once fit with "
+        f"p = {monitoring.without.p_value:.3f}, with the readings {monitoring.monitored.p_value:.3f}; the noise of "
+        "attitude and orbit is treated as independent, which brings both too near to 1.",
     )
-    if nominal.monitored is None:
-        return f"{text}."
-    return f"{text}; with the on-board monitor's readings, {nominal.monitored.schemes[scheme].height_rms:.2f} m."
-
-
-def _monitoring(run: CalibrationRun) -> Section:
-    study, spec = run.monitoring, run.campaign.simulated
-    assert study is not None
-    drifts = "; ".join(
-        f"{name} {', '.join(format_quantity(v, ANGLE) for v in drift.angles)}, "
-        f"Δf {format_quantity(drift.principal_distance, LENGTH)}"
-        for name, drift in spec.drift.items()
-    )
-    text = [
-        f"Each line camera differs in every field from its reference state, 1σ of Δα, Δβ, Δγ: {drifts}. "
-        f"1 arcsec of Δα of the forward line is {abs(study.metres):.2f} m of height."
-    ]
-    if spec.monitor is not None:
-        angles = ", ".join(format_quantity(v, ANGLE) for v in spec.monitor.angles)
-        length = format_quantity(spec.monitor.principal_distance, LENGTH)
-        text.append(f"The monitor reads each camera in each pass with {angles} and Δf {length}, 1σ.")
-    rows: Rows = []
-    for size in study.sizes:
-        cells: list[Cell] = [size.factor, size.factor * study.angle / ARCSEC]
-        for treatment in (size.without, size.monitored):
-            cells += (None,) * 3 if treatment is None else (*astuple(treatment.together), treatment.p_value)
-        rows.append(tuple(cells))
-    none, nominal = study.at(0.0).without, study.at(1.0)
-    cases = {"no drift": none.schemes, "no monitor": nominal.without.schemes}
-    cases["monitor"] = {} if nominal.monitored is None else nominal.monitored.schemes
-    figure = figure_of(
-        run,
-        _drift_figure,
-        "monitor-heights",
-        "Height errors and the drift of the cameras",
-        "Left: one campaign, its drift drawn once and scaled; the dashed line is the mean of many campaigns. "
-        "Right: RMS over all fields.",
-    )
-    by_size = Table(
-        "monitor-sizes",
-        "All fields adjusted at once",
-        "RMS at check points of all fields, metres, each field with its own bias; p-value of the fit, with the noise "
-        "of the readings of attitude and orbit treated as independent (which brings it too near to 1).",
-        ("drift × file's", "σ Δα [arcsec]", "plan", "height", "p", "plan, monitor", "height, monitor", "p, monitor"),
-        rows,
-        (1, 2, 2, 2, 3, 2, 2, 3),
-    )
-    evaluate_schemes = Table(
+    cases = {"without": data["without_monitor"], "with": data["with_monitor"]}
+    rows = {f"all at once, {case}": errors["all_fields"] for case, errors in cases.items()}
+    for scheme in monitoring.without.schemes:
+        rows |= {f"scheme {scheme}, {case}": errors["schemes"][scheme] for case, errors in cases.items()}
+    table = ERRORS.table(
         "monitor-schemes",
-        "Schemes without ground control, with the file's drift",
-        "RMS at check points of all fields, metres; the last scheme lets each field use its own parameters.",
-        ("scheme", *(f"{what}, {case}" for what in ("plan", "height") for case in cases)),
-        [
-            (scheme, *(getattr(case.get(scheme), what, None) for what in RMS for case in cases.values()))
-            for scheme in none.schemes
-        ],
-        (None, 2, 2, 2, 2, 2, 2),
+        "Errors without and with the monitor's readings",
+        "RMS at check points of all fields: all fields adjusted at once, each with its own bias, and schemes without "
+        "ground control, the last of which lets each field use its own parameters.",
+        rows,
+        label="adjustment",
     )
-    return Section("Cameras that drift, and the on-board monitor", tuple(text), (figure, by_size, evaluate_schemes))
+    return Section("Cameras that drift, and the on-board monitor", text, (table,))
 
 
 def strip_gain(run: CalibrationRun) -> str:
@@ -530,114 +469,32 @@ def strip_gain(run: CalibrationRun) -> str:
     )
 
 
-def _strips(run: CalibrationRun) -> Section:
-    strips = run.strips
-    assert strips is not None
-    rows: Rows = []
-    for scheme, fields in strips.schemes.items():
-        old, new = (FieldErrors.pooled(e.values()) for e in (run.schemes[scheme], fields))
-        rows.append((scheme, old.plan_rms, new.plan_rms, old.height_rms, new.height_rms))
-    table = Table(
+def _strips(run: CalibrationRun, data: Mapping[str, Any]) -> Section:
+    table = TIES.flat().table(
         "strips",
         "Check points with and without tie points",
-        "RMS at check points of all fields without ground control, metres. Without ties: calibrated on control points, "
+        "RMS at check points of all fields without ground control. Without ties: calibrated on control points, "
         "intersected with the measured attitude and orbit. With ties: calibrated on control and tie points, "
         "intersected with the adjusted attitude and orbit. In the last scheme each field uses its own parameters.",
-        ("scheme", "plan", "plan, with ties", "height", "height, with ties"),
-        rows,
-        (None, 2, 2, 2, 2),
+        data["schemes"],
+        label="scheme",
     )
-    common = Table(
+    common = DATUM_SIGMA.table(
         "strip-datum",
         f"Rotations of a whole pass, {run.campaign.passes[0].name}",
-        "Sigma from the readings' noise alone and with tie points, in arcseconds, or arcseconds per second for rates. "
-        "A ratio near 1 means that tie points do not determine the rotation.",
-        ("rotation", "before", "after", "ratio"),
-        [(d.name, d.before / ARCSEC, d.after / ARCSEC, d.after / d.before) for d in strips.datum],
-        (None, 4, 4, 3),
+        "Sigma from the readings' noise alone and with tie points; of rates, in a second. Equal sigmas mean that tie "
+        "points do not determine the rotation.",
+        data["datum"],
+        ("sigma_before", "sigma_after"),
+        "rotation",
+        digits=4,
     )
-    tracker = run.campaign.spec.errors.star_tracker
-    slow = max(tracker.slow.noise) / ARCSEC
-    noise = f"{max(tracker.noise) / ARCSEC:g} arcsec from reading to reading"
-    if slow:
-        noise += f" and {slow:g} arcsec that change within {tracker.slow.interval:g} s"
-    counts = ", ".join(f"{k} {n}" for k, n in strips.ties.items())
+    counts = ", ".join(f"{k} {n}" for k, n in data["ties"].items())
     text = (
         f"Every pass is adjusted on points that the lines see in common ({counts}), without ground coordinates. Check "
-        f"points, which are not among them, are then intersected with the adjusted attitude and orbit. The attitude's "
-        f"noise is {noise}.",
+        "points, which are not among them, are then intersected with the adjusted attitude and orbit.",
     )
     return Section("Adjustment of the strips", text, (table, common))
-
-
-def _expected_height(run: CalibrationRun, study: Monitoring, factor: np.ndarray) -> np.ndarray:
-    """Return the expected RMS height error without a monitor, in metres, for n multiples of the file's drift.
-
-    Parameters
-    ----------
-    run : CalibrationRun
-        Results of the calibration.
-    study : Monitoring
-        Comparison of calibrations with and without the monitor.
-    factor : (n,) ndarray
-        Factors by which the file's drift is multiplied.
-
-    Notes
-    -----
-    It is the expectation over many campaigns in which all fields are adjusted at once and the cameras' drift is
-    constant within a field. The parameters absorb the mean over the fields of the outer lines' rotation d_alpha about
-    the camera's Y, so that it is subtracted.
-    """
-    spec = run.campaign.simulated
-    square = sum(drift.angles[0] ** 2 for name, drift in spec.drift.items() if name != "nadir")
-    metres = study.metres * np.sqrt(square * (1.0 - 1.0 / len(spec.fields))) / ARCSEC
-    return np.asarray(np.hypot(study.at(0.0).without.together.height_rms, factor * metres))
-
-
-def _drift_figure(run: CalibrationRun) -> Figure:
-    study = run.monitoring
-    assert study is not None
-    figure = svg.new_figure(4.3)
-    left, right = figure.subplots(1, 2)
-    angle = study.angle / ARCSEC or 1.0
-    size = np.array([s.factor for s in study.sizes])
-    fine = np.linspace(0.0, size[-1], 101)
-    left.plot(
-        fine * angle, _expected_height(run, study, fine), "--", color=svg.GREY, lw=1.0, label="mean of many campaigns"
-    )
-    cases = {"without monitor": (svg.VERMILION, "o"), "with monitor": (svg.BLUE, "s")}
-    monitored = [s.monitored for s in study.sizes if s.monitored is not None]
-    for (label, (colour, marker)), rows in zip(
-        cases.items(), ([s.without for s in study.sizes], monitored), strict=True
-    ):
-        if rows:
-            height = [row.together.height_rms for row in rows]
-            left.plot(size * angle, height, f"{marker}-", color=colour, lw=1.4, ms=5, label=label)
-    unit = "σ of Δα of an outer line [arcsec]" if study.angle else "size of the drift against the file's"
-    left.set(title="All fields adjusted at once", xlabel=unit, ylabel="height RMS at check points [m]")
-    names = list(study.sizes[0].without.schemes)
-    nominal = study.at(1.0)
-    bars: list[tuple[str, str, list[FieldErrors]]] = [
-        ("no drift", svg.GREY, list(study.at(0.0).without.schemes.values())),
-        ("without monitor", svg.VERMILION, list(nominal.without.schemes.values())),
-    ]
-    if nominal.monitored is not None:
-        bars.append(("with monitor", svg.BLUE, list(nominal.monitored.schemes.values())))
-    position, width = np.arange(len(names)), 0.8 / len(bars)
-    for k, (label, colour, values) in enumerate(bars):
-        at = position + (k - 0.5 * (len(bars) - 1)) * width
-        right.bar(at, [v.height_rms for v in values], 0.92 * width, color=colour, label=label)
-    title = "Without ground control, the file's drift"
-    right.set(title=title, xticks=position, xlabel="scheme", ylabel="height RMS at check points [m]")
-    right.set_xticklabels([*names[:-1], f"{names[-1]}\neach its own"])
-    for axes in (left, right):
-        axes.set_ylim(0.0, None)
-        svg.gridded(axes)
-        axes.tick_params(colors=svg.INK)
-    handles, labels = left.get_legend_handles_labels()
-    more, other = right.get_legend_handles_labels()
-    figure.legend([*handles, more[0]], [*labels, other[0]], loc="outside lower center", ncols=4)
-    return figure
 
 
 def _schemes_figure(run: CalibrationRun) -> Figure:

@@ -105,20 +105,14 @@ class CalibrationRun:
         Fits of the biases against latitude: roll, pitch, yaw; empty for too few fields.
     repeatability : tuple of Repeatability
         Scatter of the parameters from field to field; empty for a single field.
-    light : tuple of LightRow
-        Errors that effects on the light cause where they are not corrected.
-    datum : tuple of DatumRow
-        Errors that a wrong datum of the control points, or a late clock, causes.
     unexpected_changes : tuple of UnexpectedChange
         Estimates that differ from their expected values by more than `UNEXPECTED_SIGMAS` sigmas.
     drift : AttitudeDrift
         Drift of the attitude within the passes, tested on the residuals.
     chip_steps : tuple of ChipStep
         Steps between the chips of a line, tested on the residuals.
-    repeats : Repeats or None
-        Campaigns repeated with new random errors; None where the file asks for none.
     monitoring : Monitoring or None
-        Comparison of calibrations with and without the on-board monitor; None for cameras without drift.
+        Comparison of calibrations with and without the on-board monitor; None for cameras without a monitor.
     strips : Strips or None
         Passes adjusted on tie points; None where the file asks for none.
     """
@@ -135,12 +129,9 @@ class CalibrationRun:
     scheme_means: scheme_tests.SchemeMeans | None
     latitude: tuple[campaign_adjustment.LatitudeFit, ...]
     repeatability: tuple[scheme_tests.Repeatability, ...]
-    light: tuple[influences.LightRow, ...]
-    datum: tuple[influences.DatumRow, ...]
     unexpected_changes: tuple[influences.UnexpectedChange, ...]
     drift: influences.AttitudeDrift
     chip_steps: tuple[influences.ChipStep, ...]
-    repeats: scheme_tests.Repeats | None
     monitoring: scheme_tests.Monitoring | None
     strips: scheme_tests.Strips | None
 
@@ -265,9 +256,8 @@ def _require_memory(setup: CalibrationSetup) -> None:
 def _run(setup: AnyCalibration, seed: int, advance: Advance) -> CalibrationRun:
     if not isinstance(setup, MeasuredCalibrationSetup):
         _require_memory(setup)
-    shown, others = np.random.SeedSequence(seed).spawn(2)
-    campaign = source_of(setup, shown, advance)
-    parts = 6 + len(campaign.passes)
+    campaign = source_of(setup, np.random.SeedSequence(seed).spawn(1)[0], advance)
+    parts = 3 + len(campaign.passes)
     advance("calibration", 1, parts)
     latitude = campaign_adjustment.latitude_fits(campaign, campaign_adjustment.simultaneous(campaign))
     rates = campaign_adjustment.rate_priors(campaign, latitude)
@@ -285,10 +275,6 @@ def _run(setup: AnyCalibration, seed: int, advance: Advance) -> CalibrationRun:
     stepwise_result = stepwise([control], cameras, campaign.noise, held=held, tolerance=STEPWISE_TOLERANCE)
     alone = {name: result.adjustment for name, result in fields.items()}
     schemes = scheme_tests.scheme_errors(campaign, alone)
-    advance("calibration", parts - 3, parts)
-    light = influences.light_rows(campaign, together.sigma)
-    advance("calibration", parts - 1, parts)
-    datum = influences.datum_rows(campaign)
     advance("calibration", parts, parts)
     return CalibrationRun(
         setup,
@@ -303,13 +289,10 @@ def _run(setup: AnyCalibration, seed: int, advance: Advance) -> CalibrationRun:
         scheme_tests.SchemeMeans.of(schemes),
         latitude,
         scheme_tests.repeatability(campaign, alone),
-        light,
-        datum,
         influences.unexpected_changes(campaign, together),
         influences.AttitudeDrift.of(campaign, together),
         influences.ChipStep.of(campaign, together),
-        None if isinstance(setup, MeasuredCalibrationSetup) else scheme_tests.repeat_campaigns(setup, others, advance),
-        None if isinstance(setup, MeasuredCalibrationSetup) else scheme_tests.study_monitoring(setup, shown, advance),
+        scheme_tests.Monitoring.of(campaign),
         scheme_tests.adjust_strips(campaign, advance),
     )
 

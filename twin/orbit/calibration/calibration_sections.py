@@ -1,13 +1,12 @@
-"""Sections of a calibration's report on the adjustment: parameters, fields, biases, influences and observability.
+"""Sections of a calibration's report on the adjustment: parameters, fields, biases, datum and observability.
 
-docs/orbit.md explains how averaging, drifting cameras, tie points and effects on the light change the result.
+docs/orbit.md explains how averaging, drifting cameras and tie points change the result.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import astuple
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -18,17 +17,13 @@ from analysis.orbit.calibration_parameters import OFFSET, RATE
 from analysis.orbit.three_line_model import BIAS, misclosure
 from scenes.yaml.units import ANGLE, LENGTH, format_quantity
 from twin.framework import svg
-from twin.framework.artefact import Cell, DecimalNumber, SvgFigure, Table
+from twin.framework.artefact import Cell, SvgFigure, Table
 from twin.framework.report import Section
-from twin.orbit.calibration.calibration_numbers import CHIP_STEP, LATITUDE
+from twin.orbit.calibration.calibration_numbers import BIAS_OF_FIELD, CHIP_STEP, LATITUDE, REPEATABILITY
 from twin.orbit.calibration.calibration_run import STEPWISE_TOLERANCE, CalibrationRun
 from twin.orbit.calibration.campaign import FieldPass
 from twin.orbit.calibration.flown_campaign import true_bias
-from twin.orbit.calibration.influences import UNEXPECTED_SIGMAS, LightRow
-
-if TYPE_CHECKING:
-    pass
-
+from twin.orbit.calibration.influences import UNEXPECTED_SIGMAS
 
 _SCALES = {"rad": (ARCSEC, "arcsec"), "rad/s": (1e-3 * ARCSEC, "mas/s"), "m": (1.0, "m")}
 """Unit of an unknown in result files -> unit of the tables of the report, as its size in SI units and its name."""
@@ -48,7 +43,7 @@ def adjustment_sections(run: CalibrationRun, data: Mapping[str, Any]) -> tuple[S
     data : Mapping[str, Any]
         Content of calibration.json.
     """
-    return (_parameters(run, data), _fields(run), _biases(run, data), _light(run), _datum(run), _rank(run), _data(run))
+    return (_parameters(run, data), _fields(run, data), _biases(run, data), _datum(run), _rank(run), _data(data))
 
 
 def figure_of(
@@ -154,36 +149,6 @@ def _along_figure(run: CalibrationRun) -> Figure:
     return figure
 
 
-def _residual_figure(run: CalibrationRun) -> Figure:
-    """Draw the residuals of the first field's control points in the images of the lines, in pixels."""
-    flight = run.campaign.passes[0]
-    figure = svg.new_figure(3.9)
-    shown = tuple(flight.control.rays)
-    panels = figure.subplots(1, len(shown), sharex=True, squeeze=False)[0]
-    for axes, line in zip(panels, shown, strict=True):
-        residual = _residuals(run, flight, line)
-        images = flight.control_images[line]
-        arrows = axes.quiver(
-            images.pixel,
-            images.line / 1e3,
-            residual[:, 1],
-            residual[:, 0],
-            color=svg.BLUE,
-            width=0.004,
-            scale=14.0,
-            zorder=3,
-        )
-        axes.plot(images.pixel, images.line / 1e3, ".", color=svg.GREY, ms=2)
-        axes.quiverkey(arrows, 0.86, 1.04, 1.0, "1 px", labelpos="E", coordinates="axes")
-        rms = np.sqrt(np.mean(residual**2, axis=0))
-        axes.set_title(f"{line}: x {rms[0]:.2f} px, y {rms[1]:.2f} px", loc="left")
-        axes.set(xlabel="pixel")
-        axes.margins(0.12)
-        svg.gridded(axes)
-    panels[0].set_ylabel("image line, thousands")
-    return figure
-
-
 def _parameters(run: CalibrationRun, data: Mapping[str, Any]) -> Section:
     campaign, names = run.campaign, run.together.names
     interior = np.ravel([campaign.laboratory[line].interior for line in campaign.lines]).tolist()
@@ -192,15 +157,11 @@ def _parameters(run: CalibrationRun, data: Mapping[str, Any]) -> Section:
     rows: Rows = []
     for name, unknown in data["parameters"].items():
         scale, shown = (1e-6, "µm") if name in start else _SCALES[unknown["unit"]]
-        first, held = start.get(name, 0.0), unknown["sigma"] == 0.0
-        cells: list[Cell] = [
-            (unknown["value"] - first) / scale,
-            None if held else unknown["sigma"] / scale,
-            drift.get(name),
-        ]
+        first, sigma = start.get(name, 0.0), unknown["sigma"] or None  # none for held unknowns
+        cells = [(unknown["value"] - first) / scale, sigma and sigma / scale, drift.get(name)]
         if run.truth is not None:
-            z = None if held else (unknown["value"] - unknown["truth"]) / unknown["sigma"]
-            cells += [(unknown["truth"] - first) / scale, z]
+            error = unknown["value"] - unknown["truth"]
+            cells += [(unknown["truth"] - first) / scale, sigma and error / sigma]
         rows.append((name, shown, *cells))
     apart = f"The lines see a field up to {campaign.passes[0].seconds_apart:.0f} s apart, and"
     if any(name in RATE for name in names):
@@ -230,8 +191,6 @@ def _parameters(run: CalibrationRun, data: Mapping[str, Any]) -> Section:
         ("line", "axis", "place_m", "step_m", "sigma_m", "detectable_m"),
         digits=4,
     )
-    title = f"Residuals of the control points in the images, {campaign.passes[0].name}"
-    caption = "Titles: RMS of x and y. The residuals contain noise of the image and of the attitude."
     along = figure_of(
         run,
         _along_figure,
@@ -240,35 +199,21 @@ def _parameters(run: CalibrationRun, data: Mapping[str, Any]) -> Section:
         "A mean that leaves zero over part of a line is an error that the parameters of the interior orientation do "
         "not describe.",
     )
-    return Section(
-        "Parameters", (text,), (along, table, steps, figure_of(run, _residual_figure, "residuals", title, caption))
-    )
+    return Section("Parameters", (text,), (along, table, steps))
 
 
-def _fields(run: CalibrationRun) -> Section:
-    rows: Rows = []
-    for flight in run.campaign.passes:
-        alone = run.fields[flight.name].adjustment
-        bias = alone.bias(flight.name) / ARCSEC
-        errors = [] if flight.known_truth is None else (bias - flight.bias / ARCSEC).tolist()
-        rows.append((flight.name, float(np.degrees(flight.latitude)), *map(float, bias), *errors, alone.p_value))
-    truth = ("Δ roll", "Δ pitch", "Δ yaw") if run.truth is not None else ()
-    table = Table(
+def _fields(run: CalibrationRun, data: Mapping[str, Any]) -> Section:
+    table = BIAS_OF_FIELD.table(
         "fields",
         "Each field by itself",
-        f"Roll, pitch and yaw of the bias, arcseconds{', and minus the truth at the middle' * bool(truth)}. "
-        "Offsets of the orbit are not among these unknowns; roll and pitch absorb them: 0.3 m are 0.1 arcsec.",
-        ("field", "latitude [deg]", *BIAS, *truth, "p of the fit"),
-        rows,
-        (None, 1, *(3,) * (len(BIAS) + len(truth) + 1)),
+        "Biases of the attitude. Offsets of the orbit are not among these unknowns; roll and pitch absorb them: 0.3 m "
+        "are 0.1 arcsec.",
+        {f"{name} {axis}": bias for name, field in data["fields"].items() for axis, bias in field["bias"].items()},
+        ("value", "sigma", "truth") if run.truth is not None else ("value", "sigma"),
+        "field and axis",
     )
     if not run.repeatability:
         return Section("Fields", ("Repeatability needs two fields or more.",), (table,))
-    scatter: Rows = []
-    for r in run.repeatability:
-        scale, shown = (ARCSEC, "arcsec") if r.name in BIAS else (1e-3, "mm")
-        held = r.sigma == 0.0
-        scatter.append((r.name, shown, *(None if held else v / scale for v in (r.scatter, r.sigma)), r.p_value))
     inner = [r for r in run.repeatability if r.name not in BIAS and r.sigma > 0.0]
     worst, largest = (
         max(rows_of_sort, key=lambda r: r.scatter)
@@ -279,17 +224,22 @@ def _fields(run: CalibrationRun) -> Section:
         f"standard deviation, {worst.name}). The biases scatter by up to {largest.scatter / ARCSEC:.2f} arcsec "
         f"({largest.name}).",
     )
-    repeats = Table(
+    repeats = REPEATABILITY.table(
         "repeatability",
         "Repeatability over the fields",
         "Standard deviation over the fields, sigma predicted by a field's adjustment, and p-value of the scatter under "
-        "this sigma. A small p-value for a bias means that it really differs from field to field. Without numbers: "
-        "held (gauge).",
-        ("parameter", "unit", "scatter", "predicted σ", "p"),
-        scatter,
-        (None, None, 4, 4, 3),
+        "this sigma. A small p-value for a bias means that it really differs from field to field. Held (gauge): no p.",
+        [_in_shown_unit(row, "scatter", "sigma") for row in data["repeatability"]],
+        ("name", "unit", "scatter", "sigma", "p_value"),
+        digits=4,
     )
     return Section("Fields", text, (repeats, table))
+
+
+def _in_shown_unit(row: Mapping[str, Any], *keys: str) -> dict[str, Any]:
+    """Return a row of an unknown of the interior or a bias with the numbers of these keys in its unit in reports."""
+    scale, shown = (1e-6, "µm") if row["unit"] == "m" else _SCALES[row["unit"]]
+    return {**row, "unit": shown, **{key: row[key] / scale for key in keys}}
 
 
 def _biases(run: CalibrationRun, data: Mapping[str, Any]) -> Section:
@@ -340,82 +290,7 @@ def _biases(run: CalibrationRun, data: Mapping[str, Any]) -> Section:
     return Section("Biases against latitude", text, (figure, table))
 
 
-def _left(row: LightRow) -> str:
-    if not row.left:
-        return "all corrected"
-    return "all" if len(row.left) > 2 else " and ".join(name.replace("_", " ") for name in row.left)
-
-
-def _light(run: CalibrationRun) -> Section:
-    if len(run.light) < 2:
-        return Section("Effects on the light", ("All effects are switched off.",))
-    lines, pitch = run.campaign.lines, run.campaign.passes[0].data.pitch
-    rows: Rows = []
-    for row in run.light:
-        inner, turned = row.most(run.campaign.inner), row.most(tuple(n for n in row.shift if n.split()[-1] in BIAS))
-        shifts = [f"{who} {by:+.1f} σ" if row.left else "" for who, by in (inner, turned)]
-        name = f"{_left(row)} not corrected" if row.left else _left(row)
-        rows.append((name, *astuple(row.before), *astuple(row.after), *shifts, row.p_value))
-    pixels = Table(
-        "light-pixels",
-        "Displacement of image points",
-        "RMS over the check points, pixels, x along the track and y along the line.",
-        ("effect", *(f"{line} {axis}" for line in lines for axis in "xy")),
-        [
-            (_left(row), *(float(v / pitch[line]) for line in lines for v in row.moved[line]))
-            for row in run.light
-            if row.left
-        ],
-        (None, *(3,) * (2 * len(lines))),
-    )
-    effects = Table(
-        "light",
-        "Effects that are not corrected in the image points",
-        "RMS at check points, mean of the fields, metres: with the laboratory's camera, and with each field's own "
-        "parameters; the unknowns of the simultaneous adjustment that move by the most of their sigmas; p-value of the "
-        "fit, with the noise of the readings treated as independent.",
-        ("case", "plan before", "height before", "plan after", "height after", "interior", "bias", "p of the fit"),
-        rows,
-        (None, 2, 2, 2, 2, None, None, 3),
-    )
-    last_case = run.light[-1]
-    parameter, ratio = last_case.most(run.campaign.inner)
-    text = (
-        "Left uncorrected, they hardly change the errors of a camera that is used as it was calibrated: biases and "
-        f"principal points absorb them, and the mean error in plan changes from {run.light[0].after.plan_rms:.3f} m to "
-        f"{last_case.after.plan_rms:.3f} m. But the parameters are then wrong ({parameter} by "
-        f"{1e6 * last_case.shift[parameter]:+.1f} µm, {abs(ratio):.1f} sigmas), which the residuals need not show.",
-    )
-    return Section("Effects on the light", text, (pixels, effects))
-
-
 def _datum(run: CalibrationRun) -> Section:
-    rows: Rows = []
-    for row in run.datum:
-        (name, change), (sure, sigmas) = row.most, row.most_sigmas
-        where = ", ".join(f"{v:g} m {axis}" for v, axis in zip(row.shift, ("east", "north", "up"), strict=True) if v)
-        where = f"lines {1e3 * row.late:g} ms late" if row.late else where
-        scale, unit = (1e3, "ms") if row.late else (1.0, "m")
-        warned = "never" if row.warned is None else f"{scale * row.warned:.3g} {unit}"
-        sizes = f"{sure} {sigmas:.1f} σ", f"{scale * row.size / max(sigmas, 1e-9):.3g} {unit}", warned
-        moved = [DecimalNumber(v / ARCSEC, 2) for v in row.bias]
-        others = (*map(float, row.offset), row.fit, row.p_value, *astuple(row.after))
-        rows.append((where, *moved, f"{name} {1e6 * change:+.1f} µm", *sizes, *others))
-    table = Table(
-        "datum",
-        "All control points in a wrong datum",
-        "Mean changes of the fields' biases, arcseconds; the element of the interior orientation that changes most; "
-        "the one that changes by the most of its sigmas, the error of the datum that changes it by one sigma, and the "
-        "error that raises a warning of an unexpected change; mean changes of the orbit's offsets, metres; change of "
-        "the chi-square and p-value of the fit; RMS at check points in the right datum, each field with its own "
-        "parameters, metres.",
-        (
-            *("error", *BIAS, "interior", "in sigmas", "one sigma at", "warning from", *OFFSET),
-            *("Δ chi-square", "p of the fit", "plan after [m]", "height after [m]"),
-        ),
-        rows,
-        (*(None,) * 8, 3, 3, 3, 1, 3, 2, 2),
-    )
     launch = run.campaign.spec.launch
     roll, inner = (format_quantity(v, k) for v, k in ((launch.bias[0], ANGLE), (launch.interior, LENGTH)))
     metres = UNEXPECTED_SIGMAS * launch.bias[0] * run.campaign.passes[0].altitude
@@ -426,7 +301,7 @@ def _datum(run: CalibrationRun) -> Section:
         f"above {UNEXPECTED_SIGMAS:g} times these, {metres:.0f} m of shift across the track.",
         f"Unexpected changes in this run: {beyond or 'none'}.",
     )
-    return Section("Datum of the control points", text, (table,))
+    return Section("Datum of the control points", text)
 
 
 def prior_dominated(adjustment: Adjustment) -> dict[str, float]:
@@ -468,19 +343,22 @@ def _rank(run: CalibrationRun) -> Section:
     )
 
 
-def _data(run: CalibrationRun) -> Section:
+def _data(data: Mapping[str, Any]) -> Section:
     rows: Rows = []
-    for name, result in run.fields.items():
-        sizes = ((result.orbit, 1.0), (result.attitude, ARCSEC))
-        cells = [[None] * 3 if difference is None else (difference.rms / unit).tolist() for difference, unit in sizes]
-        rows.append((name, *cells[0], *cells[1]))
+    for name, field in data["fields"].items():
+        orbit, attitude = (
+            field[f"{key}_third_difference_rms_{unit}"] for key, unit in (("orbit", "m"), ("attitude", "rad"))
+        )
+        cells = [*(orbit or [None] * 3), *([v / ARCSEC for v in attitude] if attitude else [None] * 3)]
+        rows.append((name, float(np.degrees(field["latitude_rad"])), field["p_value"], *cells))
     table = Table(
         "third-differences",
-        "RMS of third differences",
-        "Measured positions in the Earth-fixed frame, metres; measured attitude against the orbital frame, arcseconds. "
-        "White noise of sigma 1 gives the square root of 20. Third differences do not contain biases and drifts.",
-        ("field", "x", "y", "z", "roll", "pitch", "yaw"),
+        "Each field by itself, and RMS of third differences",
+        "p-value of the fit of the field. Measured positions in the Earth-fixed frame, metres; measured attitude "
+        "against the orbital frame, arcseconds. White noise of sigma 1 gives the square root of 20. Third differences "
+        "do not contain biases and drifts.",
+        ("field", "latitude [deg]", "p", "x", "y", "z", "roll", "pitch", "yaw"),
         rows,
-        (None, 4, 4, 4, 4, 4, 4),
+        (None, 1, 3, 4, 4, 4, 4, 4, 4),
     )
     return Section("Orbit and attitude data", (), (table,))

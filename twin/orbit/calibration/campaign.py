@@ -29,7 +29,7 @@ from optics.numerics.array_math import UnphysicalError
 from optics.numerics.number_tree import FrozenMap
 from scenes.specs.orbit.flight import OrbitSpec, PassingSpec
 from scenes.specs.orbit.three_line_camera import ThreeLineCameraSpec
-from twin.orbit.flight.earth import Earth, east_north_up
+from twin.orbit.flight.earth import Earth
 from twin.orbit.flight.line_camera import LineTimes, line_cameras, pixel_positions
 from twin.orbit.flight.platform_table import TabulatedTrajectory
 from twin.orbit.flight.sensor import NO_EFFECTS, LightEffects, Platform, Sensor
@@ -44,8 +44,6 @@ if TYPE_CHECKING:
     from twin.orbit.images.image_points import PatchPoints
     from twin.orbit.images.patch import LineComparison, Patch
 
-EFFECTS = ("light_time", "aberration", "refraction")
-"""Names of the effects on the light, which are attributes of `LightEffects`."""
 _DISTORTION_STEPS = 8
 """Number of fixed-point steps that invert the lens distortion; each reduces the error by a factor of the relative
 distortion, 1e-3 or less.
@@ -565,12 +563,6 @@ class FieldPass:
         path = self.measured
         return float(self.data.earth.geodetic(path.position(self.middle))[2])
 
-    def shifted(self, datum: tuple[float, float, float]) -> FieldPass:
-        """Return the pass with control points shifted by `datum`, in metres east, north and up; rays do not change."""
-        lon, lat, _ = self.data.earth.geodetic(self.control_ground.mean(axis=0))
-        ground = self.control_ground + np.array(datum) @ east_north_up(lon, lat)
-        return replace(self, control_ground=ground, control=replace(self.control, ground=ground))
-
     def without_effects(self, removed: LightEffects, noise: Noise) -> FieldPass:
         """Return the pass with its image points corrected for these effects on the light."""
         field = self.control_images, self.control_ground, self.control_covariance, removed, self.is_control
@@ -579,32 +571,6 @@ class FieldPass:
             for images in (self.check_images, self.tie_images)
         )
         return replace(self, control=self.data.control_field(*field), check=check, ties=ties)
-
-    def later(self, seconds: float) -> FieldPass:
-        """Return the pass with rays from the station and attitude `seconds` later, with the image points unchanged.
-
-        Beyond the end of the readings, the motion is extrapolated by point reflection of the motion before the
-        exposure.
-        """
-        path = self.measured
-
-        def moved(rays: Mapping[str, Rays]) -> FrozenMap[str, Rays]:
-            rays_by_line = {}
-            for name, row in rays.items():
-                assert row.time is not None
-                time = row.time + self.data.phase
-                beyond = ~path.covers(time + seconds)
-                there = time + np.where(beyond, -seconds, seconds)
-                station, attitude = path.position(there), path.body_to_itrs(there)
-                if np.any(beyond):  # continued by reflection
-                    at_exposure = path.body_to_itrs(time[beyond])
-                    station[beyond] = 2.0 * path.position(time[beyond]) - station[beyond]
-                    attitude[beyond] = at_exposure @ np.swapaxes(attitude[beyond], 1, 2) @ at_exposure
-                rays_by_line[name] = replace(row, station=station, attitude=attitude)
-            return FrozenMap(rays_by_line)
-
-        control = replace(self.control, rays=moved(self.control.rays))
-        return replace(self, control=control, check=moved(self.check), ties=moved(self.ties))
 
 
 @dataclass(frozen=True, eq=False)
@@ -695,14 +661,6 @@ class Campaign:
             Control coordinates cannot be used, or check points cannot be intersected.
         """
         return replace(self, passes=tuple(p.without_effects(removed, self.noise) for p in self.passes))
-
-    def later(self, seconds: float) -> Campaign:
-        """Return the campaign with all lines exposed `seconds` later, but the same image points."""
-        return replace(self, passes=tuple(p.later(seconds) for p in self.passes))
-
-    def shifted(self, datum: tuple[float, float, float]) -> Campaign:
-        """Return the campaign with all control points shifted by `datum` east, north and up, in metres."""
-        return replace(self, passes=tuple(p.shifted(datum) for p in self.passes))
 
 
 @dataclass(frozen=True)

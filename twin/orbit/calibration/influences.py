@@ -1,15 +1,14 @@
-"""Errors that the fit of a calibration hardly shows, and the changes of the parameters that they cause.
+"""Errors that the fit of a calibration hardly shows, and their tests.
 
-Uncorrected effects on the light and ground coordinates in a wrong datum are absorbed by the parameters; how much these
-change is found by calibrating again from the same measurements. These comparisons treat the noise of attitude and orbit
-as independent, which takes a tenth of the time. A drift of the attitude within the passes and steps between the chips
-of a line are tested on the residuals: the smallest detectable size, and whether they are significant.
+Ground coordinates in a wrong datum are absorbed by the parameters; estimates far from their expected values indicate
+them. A drift of the attitude within the passes and steps between the chips of a line are tested on the residuals: the
+smallest detectable size, and whether they are significant.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import pairwise
 from typing import Self
 
@@ -21,10 +20,7 @@ from analysis.calibration.adjustment import FALSE_ALARM, Adjustment, Rates, Step
 from analysis.orbit.calibration_parameters import OFFSET
 from analysis.orbit.three_line_model import BIAS
 from scenes.specs.orbit.measurements import MeasuredCalibrationSpec
-from twin.orbit.calibration.campaign import EFFECTS, Campaign, DetectedDrift
-from twin.orbit.calibration.campaign_adjustment import calibrated_alone, simultaneous
-from twin.orbit.calibration.schemes import FieldErrors, laboratory_errors, scheme_errors
-from twin.orbit.flight.sensor import NO_EFFECTS
+from twin.orbit.calibration.campaign import Campaign, DetectedDrift
 
 UNEXPECTED_SIGMAS = 4.0
 """Difference of an unknown from its expected value, in units of its expected standard deviation, beyond which it is
@@ -36,107 +32,6 @@ attitude drifts; barely detectable is a drift that the residuals show in half of
 """
 _STEP_ALARM = 1e-4
 """Probability that any of a run's tests of steps between chips raises a false alarm."""
-_TRIAL_TIME = 0.01
-"""Delay of the line times that is tested, in seconds; 70 m on the ground."""
-_TRIAL_SHIFT = 100.0
-"""Shift of the datum that is tested where the file has none, in metres."""
-
-
-@dataclass(frozen=True, eq=False)
-class LightRow:
-    """Results of a calibration with some effects on the light not corrected.
-
-    Attributes
-    ----------
-    left : tuple of str
-        Effects that are not corrected, among `EFFECTS`.
-    moved : Mapping[str, ndarray]
-        Line -> (2,) RMS displacement of the check points' image points due to these effects, x and y in the focal
-        plane, in metres.
-    before : FieldErrors
-        Mean of the fields' RMS errors with the laboratory's camera.
-    after : FieldErrors
-        Mean of the fields' RMS errors, each field with its own parameters.
-    shift : Mapping[str, float]
-        Change of each parameter of the simultaneous adjustment, in metres or radians, relative to the adjustment with
-        all effects corrected.
-    sigma : Mapping[str, float]
-        Standard deviation of each parameter, in the same unit.
-    p_value : float
-        p-value of the adjustment's chi-square.
-    """
-
-    left: tuple[str, ...]
-    moved: Mapping[str, np.ndarray]
-    before: FieldErrors
-    after: FieldErrors
-    shift: Mapping[str, float]
-    sigma: Mapping[str, float]
-    p_value: float
-
-    def most(self, names: tuple[str, ...]) -> tuple[str, float]:
-        """Return the estimated unknown of `names` that changes by the most sigmas, and its change in sigmas."""
-        size = {n: self.shift[n] / self.sigma[n] for n in names if self.sigma[n] > 0.0}
-        worst = max(size, key=lambda n: abs(size[n]))
-        return worst, size[worst]
-
-
-@dataclass(frozen=True, eq=False)
-class DatumRow:
-    """Results of a calibration with a common shift of all control points, or with late line times.
-
-    Attributes
-    ----------
-    shift : tuple of float
-        Shift east, north and up, in metres.
-    bias : (3,) ndarray
-        Mean change of the fields' roll, pitch and yaw, in radians.
-    interior : Mapping[str, float]
-        Change of each element of the interior orientation, in metres.
-    offset : (3,) ndarray
-        Mean change of the orbit's offsets along, across and down, in metres; zero where they are not estimated.
-    fit : float
-        Change of the chi-square of the simultaneous adjustment.
-    p_value : float
-        p-value of the chi-square of the adjustment with the shift.
-    after : FieldErrors
-        Mean of the fields' RMS errors at check points in the right datum, each field with its own parameters.
-    late : float
-        Delay of the line times, in seconds, instead of a shift.
-    sigma : Mapping[str, float]
-        Standard deviation of each element of the interior orientation.
-    warned : float or None
-        Shift, in metres, or delay, in seconds, above which `unexpected_changes` reports it; None where it never does.
-    """
-
-    shift: tuple[float, float, float]
-    bias: np.ndarray
-    interior: Mapping[str, float]
-    offset: np.ndarray
-    fit: float
-    p_value: float
-    after: FieldErrors
-    late: float
-    sigma: Mapping[str, float]
-    warned: float | None
-
-    @property
-    def size(self) -> float:
-        """Size of the tested shift, in metres, or of the tested delay, in seconds."""
-        return abs(self.late) or float(np.linalg.norm(self.shift))
-
-    @property
-    def most_sigmas(self) -> tuple[str, float]:
-        """Element of the interior orientation that changes by the most sigmas, and that change in sigmas."""
-        ratio = {n: abs(v) / self.sigma[n] for n, v in self.interior.items() if self.sigma[n] > 0.0}
-        worst = max(ratio, key=lambda n: ratio[n])
-        return worst, ratio[worst]
-
-    @property
-    def most(self) -> tuple[str, float]:
-        """Element of the interior orientation with the largest change, and this change in metres."""
-        worst = max(self.interior, key=lambda n: abs(self.interior[n]))
-        return worst, self.interior[worst]
 
 
 @dataclass(frozen=True)
@@ -163,102 +58,6 @@ class UnexpectedChange:
         return abs(self.change) / self.expected
 
 
-def light_rows(campaign: Campaign, sigma: Mapping[str, float]) -> tuple[LightRow, ...]:
-    """Calibrate with all effects on the light corrected, with each in turn uncorrected, and with none corrected.
-
-    Only effects that are switched on are considered.
-
-    Parameters
-    ----------
-    campaign : Campaign
-        Measurements of the passes.
-    sigma : Mapping[str, float]
-        Standard deviation of each parameter of the simultaneous adjustment.
-
-    Raises
-    ------
-    CalibrationError
-        An adjustment cannot be solved.
-    """
-    on = [name for name in EFFECTS if getattr(campaign.effects, name)]
-    cases = [(), *((name,) for name in on), *([tuple(on)] if len(on) > 1 else [])]
-    clean = campaign.independent.without_effects(campaign.effects)
-    base = simultaneous(clean)
-    rows = []
-    for left in cases:
-        case, fit = clean, base
-        if left:
-            removed = replace(campaign.effects, **dict.fromkeys(left, False))
-            case = clean.without_effects(removed if len(left) < len(on) else NO_EFFECTS)
-            fit = simultaneous(case)
-        moved, pairs = {}, list(zip(case.passes, clean.passes, strict=True))
-        for line in campaign.lines:
-            square = [(a.check[line].image - b.check[line].image) ** 2 for a, b in pairs if line in b.check]
-            moved[line] = np.sqrt(np.mean(np.concatenate(square), axis=0))
-        shift = dict(zip(fit.names, (fit.values - base.values).tolist(), strict=True))
-        before = FieldErrors.mean(laboratory_errors(case))
-        rows.append(LightRow(left, moved, before, _after(case), shift, sigma, fit.p_value))
-    return tuple(rows)
-
-
-def datum_rows(campaign: Campaign) -> tuple[DatumRow, ...]:
-    """Calibrate with a wrong datum: the file's, or trial shifts of 100 m on each axis and 10 ms late line times.
-
-    The trial errors are used where the file specifies no wrong datum.
-
-    Raises
-    ------
-    CalibrationError
-        An adjustment cannot be solved.
-    """
-    errors = campaign.spec.errors
-    right = campaign.independent
-    shifts = [(_TRIAL_SHIFT, 0.0, 0.0), (0.0, _TRIAL_SHIFT, 0.0), (0.0, 0.0, _TRIAL_SHIFT), (0.0, 0.0, 0.0)]
-    if errors.switched_on and any(errors.datum):
-        east, north, up = errors.datum
-        right, shifts = right.shifted((-east, -north, -up)), [errors.datum]
-    base = simultaneous(right)
-    rows = []
-    for east, north, up in shifts:
-        late = 0.0 if any((east, north, up)) else _TRIAL_TIME
-        wrong = right.later(late) if late else right.shifted((east, north, up))
-        fit = simultaneous(wrong)
-        change = dict(zip(fit.names, fit.values - base.values, strict=True))
-        names = [p.name for p in campaign.passes]
-        rows.append(
-            DatumRow(
-                (float(east), float(north), float(up)),
-                np.array([np.mean([change[f"{n} {axis}"] for n in names]) for axis in BIAS]),
-                {n: float(change[n]) for n in campaign.inner},
-                np.array([np.mean([change.get(f"{n} offset {axis}", 0.0) for n in names]) for axis in OFFSET]),
-                fit.chi_square - base.chi_square,
-                fit.p_value,
-                _after(wrong),
-                late,
-                {n: base.sigma[n] for n in campaign.inner},
-                _warned(campaign, change, late or float(np.linalg.norm((east, north, up)))),
-            )
-        )
-    return tuple(rows)
-
-
-def _warned(campaign: Campaign, change: Mapping[str, float], size: float) -> float | None:
-    """Return the size of a datum or time error, in metres or seconds, above which `unexpected_changes` reports it.
-
-    Parameters
-    ----------
-    campaign : Campaign
-        Measurements of the passes.
-    change : Mapping[str, float]
-        Change of each unknown due to an error of this `size`.
-    size : float
-        Size of the error that was tested, in metres or seconds.
-    """
-    expected = _expected(campaign)
-    ratio = max((abs(change.get(name, 0.0)) / sigma for name, (_, sigma) in expected.items()), default=0.0)
-    return UNEXPECTED_SIGMAS * size / ratio if ratio > 0.0 else None
-
-
 def unexpected_changes(campaign: Campaign, adjustment: Adjustment) -> tuple[UnexpectedChange, ...]:
     """Return the estimates that differ from expectation by over `UNEXPECTED_SIGMAS` sigmas, largest ratio first."""
     expected = _expected(campaign)
@@ -282,12 +81,6 @@ def _expected(campaign: Campaign) -> dict[str, tuple[float, float]]:
             drift = zip(OFFSET, errors.gps.drift, strict=True)
             expected |= {f"{flight.name} offset {axis}": (0.0, s) for axis, s in drift if s > 0.0}
     return expected
-
-
-def _after(campaign: Campaign) -> FieldErrors:
-    """Return the means of the fields' RMS errors at check points, each field with its own parameters."""
-    alone = {p.name: calibrated_alone(campaign, p) for p in campaign.passes}
-    return FieldErrors.mean(list(scheme_errors(campaign, alone).values())[-1])
 
 
 @dataclass(frozen=True)

@@ -1,21 +1,17 @@
 """Errors at check points without ground control, by scheme of averaged parameters, and their dependence on the method.
 
 Schemes (paper 003, section 4.4): the parameters of several fields, each calibrated by itself, are averaged, and tested
-by forward intersection of the check points of all fields, in one campaign and in campaigns repeated with new random
-errors. The gain of averaging depends on how well the parameters repeat from field to field, which `repeatability`
-computes.
+by forward intersection of the check points of all fields. The gain of averaging depends on how well the parameters
+repeat from field to field, which `repeatability` computes.
 
 Strips: passes are adjusted on tie points before their check points are intersected. Slow errors of the attitude over a
 field's control points go into its interior orientation and bias. Adjusting the attitude afterwards with these
 parameters as if they were exact would count that part twice and increase the errors. The calibration whose parameters
 are used therefore includes the tie points of its pass, which separates the two.
 
-Monitoring: the gain of an on-board monitor where the cameras change from field to field (papers 001 and 003) is found
-from campaigns with the same random numbers and drifts of several sizes, adjusted as if nothing drifted and with the
-monitor's readings.
-
-Effects on the light that are corrected are not simulated in these repeated campaigns, and attitude and orbit noise is
-treated as independent: both take most of the time and hardly change the errors at check points.
+Monitoring: where the cameras change from field to field (papers 001 and 003), the campaign is adjusted as if nothing
+drifted, and with the readings of an on-board monitor. Both adjustments treat the noise of attitude and orbit as
+independent, which takes a tenth of the time and hardly changes the errors at check points.
 """
 
 from __future__ import annotations
@@ -29,7 +25,6 @@ from typing import TYPE_CHECKING, TypeVar
 import numpy as np
 from scipy.stats import chi2
 
-from analysis.arrays import ARCSEC
 from analysis.calibration.adjustment import Adjustment, adjust
 from analysis.calibration.strip_adjustment import Datum, StripAdjustment, adjust_strip
 from analysis.orbit.calibration_parameters import CalibrationField, Prior, Unknowns, monitor_priors
@@ -38,14 +33,12 @@ from analysis.orbit.three_line_model import BIAS, LineModel, Rays
 from optics.numerics.backend import one_blas_thread
 from optics.numerics.number_tree import FrozenMap
 from twin.framework.procedure import Advance
-from twin.framework.random_streams import stream
-from twin.orbit.calibration.campaign import EFFECTS, Campaign, FieldPass
+from twin.orbit.calibration.campaign import Campaign, FieldPass
 from twin.orbit.calibration.campaign_adjustment import calibrated_alone, gauge_of, simultaneous
-from twin.orbit.calibration.flown_campaign import fly_fields, reading_sigma
+from twin.orbit.calibration.flown_campaign import reading_sigma
 
 if TYPE_CHECKING:
     from scenes.specs.orbit.calibration import MapLimitsSpec
-    from scenes.specs.orbit.setup import CalibrationSetup
 
 RMS = ("plan_rms", "height_rms")
 """Names of the attributes of `CheckErrors` and `FieldErrors` with the RMS errors in plan and in height."""
@@ -73,11 +66,6 @@ class FieldErrors:
         count = [e.count for e in rows]
         plan, height = (np.average(np.square([getattr(e, what) for e in rows]), weights=count) for what in RMS)
         return cls(float(np.sqrt(plan)), float(np.sqrt(height)))
-
-    @classmethod
-    def mean(cls, errors: Mapping[str, CheckErrors]) -> FieldErrors:
-        """Return the means over the fields of their RMS errors in plan and in height."""
-        return cls(*(float(values_of(errors, what).mean()) for what in RMS))
 
 
 def meets(errors: Mapping[str, CheckErrors], limits: MapLimitsSpec) -> bool:
@@ -128,28 +116,6 @@ _LEAST_SCHEMES = 3
 """Smallest number of schemes for a comparison: two with averaged parameters, and the one in which each field uses its
 own.
 """
-
-
-@dataclass(frozen=True, eq=False)
-class Repeats:
-    """Errors at check points of N campaigns over the same fields, each with new random errors.
-
-    Attributes
-    ----------
-    schemes : tuple of str
-        Names of the schemes; in the last one each field uses its own parameters.
-    plan, height : (N, schemes, fields) ndarray for N campaigns
-        RMS errors at check points, in metres.
-    """
-
-    schemes: tuple[str, ...]
-    plan: np.ndarray
-    height: np.ndarray
-
-    def met(self, plan: float, height: float) -> np.ndarray:
-        """Return each scheme's share of campaigns in which every field is within the limits, given in metres."""
-        good = np.all((self.plan <= plan) & (self.height <= height), axis=2)
-        return np.asarray(good.mean(axis=0))
 
 
 def values_of(errors: Mapping[str, CheckErrors], what: str) -> np.ndarray:
@@ -223,32 +189,6 @@ def check_point_errors(
         Attitude bias (rotations about three axes), radians.
     """
     return check_errors(intersect(flight.check, cameras, campaign.noise, bias=bias).ground, flight.check_ground)
-
-
-def repeat_campaigns(setup: CalibrationSetup, seed: np.random.SeedSequence, advance: Advance) -> Repeats | None:
-    """Simulate and calibrate as many campaigns as the file asks for, and return their errors; None for zero.
-
-    Raises
-    ------
-    CalibrationError
-        An adjustment cannot be solved.
-    """
-    count = setup.test.repeats
-    test = setup.test
-    if test.effects.corrected:
-        # the remainder of a correction, 0.004 px, does not affect the scatter; without effects it is twice as fast
-        none = test.effects.model_copy(update=dict.fromkeys(EFFECTS, False))
-        setup = setup.model_copy(update={"test": test.model_copy(update={"effects": none})})
-    plan, height = [], []
-    names: tuple[str, ...] = ()
-    for k, campaign_seed in enumerate(seed.spawn(count)):
-        campaign = fly_fields(setup, campaign_seed).independent
-        schemes = scheme_errors(campaign, {p.name: calibrated_alone(campaign, p) for p in campaign.passes})
-        names = tuple(schemes)
-        plan.append([values_of(e, "plan_rms") for e in schemes.values()])
-        height.append([values_of(e, "height_rms") for e in schemes.values()])
-        advance("campaigns", k + 1, count)
-    return Repeats(names, np.array(plan), np.array(height)) if count else None
 
 
 def mean_parameters(
@@ -421,10 +361,6 @@ def strip_check_errors(
     return check_errors(intersect(rays, cameras, campaign.noise, bias=bias).ground, flight.check_ground)
 
 
-FACTORS = (0.0, 0.5, 1.0, 2.0, 4.0)
-"""Factors by which the drift that the file specifies is multiplied in the simulations."""
-
-
 @dataclass(frozen=True, eq=False)
 class Treatment:
     """Errors of one campaign, adjusted with the monitor's readings or without.
@@ -445,99 +381,32 @@ class Treatment:
 
 
 @dataclass(frozen=True, eq=False)
-class DriftSize:
-    """Errors for one size of the cameras' drift.
-
-    Attributes
-    ----------
-    factor : float
-        Standard deviations of the drift, divided by those of the file.
-    without : Treatment
-        Errors of the adjustment that assumes no drift.
-    monitored : Treatment or None
-        Errors of the adjustment with the monitor's readings; None without a monitor.
-    """
-
-    factor: float
-    without: Treatment
-    monitored: Treatment | None
-
-
-@dataclass(frozen=True, eq=False)
 class Monitoring:
     """Comparison of calibrations of drifting cameras with and without the on-board monitor.
 
     Attributes
     ----------
-    sizes : tuple of DriftSize
-        Errors for each of the `FACTORS`.
-    angle : float
-        Standard deviation of the rotation d_alpha about the camera's Y in the file, root mean square over the lines
-        that drift, in radians.
-    metres : float
-        Mean change of heights of the first field for 1 arcsec of d_alpha of the forward line, in metres.
+    without : Treatment
+        Errors of the adjustment that assumes no drift.
+    monitored : Treatment
+        Errors of the adjustment with the monitor's readings.
     """
 
-    sizes: tuple[DriftSize, ...]
-    angle: float
-    metres: float
+    without: Treatment
+    monitored: Treatment
 
-    def at(self, factor: float) -> DriftSize:
-        """Return the errors for the cameras' drift of the file times one of the `FACTORS`."""
-        return next(s for s in self.sizes if s.factor == factor)
+    @classmethod
+    def of(cls, campaign: Campaign) -> Monitoring | None:
+        """Adjust a campaign without and with the monitor's readings; return None for a campaign without readings.
 
-
-def study_monitoring(setup: CalibrationSetup, seed: np.random.SeedSequence, advance: Advance) -> Monitoring | None:
-    """Simulate the same campaign with drifts of several sizes; return None for a file without drift.
-
-    Parameters
-    ----------
-    setup : CalibrationSetup
-        Resolved test file and camera.
-    seed : np.random.SeedSequence
-        Seed of the campaign, used unchanged for all sizes.
-    advance : Advance
-        Callback that reports the progress.
-
-    Raises
-    ------
-    CalibrationError
-        A campaign cannot be adjusted.
-    BenchError
-        A campaign cannot be simulated.
-    """
-    if not setup.test.drift:
-        return None
-    sizes = []
-    metres = 0.0
-    for k, factor in enumerate(FACTORS):
-        campaign = fly_with_drift(setup, factor, seed)
-        treatment = with_monitor(campaign) if setup.test.monitor is not None else None
-        sizes.append(DriftSize(factor, without_monitor(campaign), treatment))
-        if factor == 0.0:
-            metres = height_per_arcsec(campaign)
-        advance("drift", k + 1, len(FACTORS))
-    angles = [spec.angles[0] for spec in setup.test.drift.values() if any(spec.angles) or spec.principal_distance]
-    return Monitoring(tuple(sizes), float(np.sqrt(np.mean(np.square(angles or [0.0])))), metres)
-
-
-def fly_with_drift(setup: CalibrationSetup, factor: float, seed: np.random.SeedSequence) -> Campaign:
-    """Simulate the campaign with the file's drift times a factor, without the effects on the light.
-
-    All other random numbers are those of the campaign without drift; the object `seed` is not modified.
-    """
-    test = setup.test
-    drift = {}
-    for name, spec in test.drift.items():
-        sizes = {
-            "angles": tuple(factor * v for v in spec.angles),
-            "principal_distance": factor * spec.principal_distance,
-        }
-        drift[name] = spec.model_copy(update=sizes)
-    update: dict[str, object] = {"drift": FrozenMap(drift), "strip": None}
-    if test.effects.corrected:
-        update["effects"] = test.effects.model_copy(update=dict.fromkeys(EFFECTS, False))
-    return fly_fields(setup.model_copy(update={"test": test.model_copy(update=update)}), stream(seed)).independent
+        Raises
+        ------
+        CalibrationError
+            The campaign cannot be adjusted.
+        """
+        if not campaign.passes[0].readings:
+            return None
+        return cls(without_monitor(campaign.independent), with_monitor(campaign.independent))
 
 
 def _treatment(
@@ -581,19 +450,6 @@ def adjust_field_with_readings(campaign: Campaign, flight: FieldPass) -> Adjustm
     field, priors, gauge = [flight.control], _reading_priors(campaign, flight), gauge_of(campaign)
     drift = Unknowns(drift=True)
     return adjust(field, campaign.laboratory, campaign.noise, unknowns=drift, priors=priors, gauge=gauge)
-
-
-def height_per_arcsec(campaign: Campaign) -> float:
-    """Return the mean height error of the first field, in metres, for a 1 arcsec pitch of the forward line camera.
-
-    The rotation is d_alpha, about the camera's Y axis.
-    """
-    flight, cameras = campaign.passes[0], dict(campaign.truth)
-    ground = [
-        intersect(flight.check, {**cameras, "forward": turned}, campaign.noise, bias=flight.bias).ground
-        for turned in (cameras["forward"], cameras["forward"].drifted(np.array([ARCSEC, 0.0, 0.0, 0.0])))
-    ]
-    return float(np.nanmean(check_errors(ground[1], ground[0]).error[:, 2]))
 
 
 def _reading_priors(campaign: Campaign, flight: FieldPass) -> list[Prior]:
