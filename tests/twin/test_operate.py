@@ -109,6 +109,7 @@ def test_a_record_is_exported_with_units(tmp_path: Path) -> None:
     assert again.exit_code == 2
     assert "exists; choose another" in again.stderr
     assert run("export", record, "--out", out, "--force").exit_code == 0
+    assert "neither a run folder nor" in run("ingest", record, tmp_path).stderr  # exported tables are no reading
     (out / "mine.txt").write_text("mine", "utf-8")
     kept = run("export", record, "--out", out, "--force")
     assert (kept.exit_code, "mine.txt" in kept.stderr) == (2, True), kept.stderr
