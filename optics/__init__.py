@@ -14,6 +14,7 @@ Rays
     distortion          distortion of chief rays
 Wavefronts and images
     wavefront           Wavefront error, its rms, Zernike coefficients and Strehl ratio
+    ray_fans            ray fans and OPD fans along two diameters of the stop
     psf                 point spread function by diffraction, of one wavelength or a band
     mtf                 modulation transfer function
     encircled_energy, ensquared_energy    energy of an image within circles or squares
@@ -61,12 +62,14 @@ from optics.numerics.llvm import LibraryMissing, ensure_llvm
 if TYPE_CHECKING:
     from optics.camera.ghosts import Ghost, ghosts
     from optics.camera.image_quality import (
+        Fans,
         TracedRays,
         Wavefront,
         distortion,
         launch_rays,
         mtf,
         psf,
+        ray_fans,
         spot_radius,
         trace,
         wavefront,
@@ -90,6 +93,7 @@ with suppress(LibraryMissing):
 
 __all__ = [
     "Camera",
+    "Fans",
     "Ghost",
     "OpticalSurface",
     "PupilNodes",
@@ -114,6 +118,7 @@ __all__ = [
     "noll_to_nm",
     "psf",
     "pupil_quadrature",
+    "ray_fans",
     "refractive_index",
     "seidel",
     "spot_radius",
@@ -127,7 +132,8 @@ _MODULES = {
     "camera.prescription": ("Camera", "OpticalSurface", "SeidelSums", "seidel"),
     "camera.ghosts": ("Ghost", "ghosts"),
     "camera.image_quality": (
-        *("TracedRays", "Wavefront", "distortion", "launch_rays", "mtf", "psf", "spot_radius", "trace", "wavefront"),
+        *("Fans", "TracedRays", "Wavefront", "distortion", "launch_rays", "mtf", "psf", "ray_fans", "spot_radius"),
+        *("trace", "wavefront"),
     ),
     "geometry.zernike": ("annular_zernike", "fit_zernikes", "noll_to_nm", "zernike", "zernike_name"),
     "materials.fresnel_scatter": ("fresnel",),

@@ -509,6 +509,70 @@ def wavefront(camera: Camera, field: Field = (0.0, 0.0), terms: int = 28) -> Wav
     return Wavefront(nodes.x, nodes.y, nodes.share, *sizes, fit.strehl, light)
 
 
+@dataclass(frozen=True, eq=False)
+class Fans:
+    """Rays through two diameters of the stop, along x and along y, at a point of the field.
+
+    Attributes
+    ----------
+    pupil : (N,) ndarray
+        Coordinates of the N rays of a fan, in units of the stop's radius.
+    transverse : (2, 2, N) ndarray
+        Positions on the image plane minus that of the chief ray, metres: fan (x, y), direction (x, y), ray; nan where
+        edges stop the ray.
+    path : (2, N) ndarray
+        Wavefront error against the chief ray, metres, positive where the wavefront is ahead: fan, ray; nan as above.
+    """
+
+    pupil: np.ndarray
+    transverse: np.ndarray
+    path: np.ndarray
+
+
+def ray_fans(camera: Camera, field: Field = (0.0, 0.0), pupil: ArrayLike | None = None) -> Fans:
+    """Trace the ray fans and the fans of optical path difference (OPD) at a point of the field.
+
+    Parameters
+    ----------
+    camera : Camera
+        Camera in the light of its wavelength.
+    field : (float, float)
+        Angles x and y of the far point, radians.
+    pupil : (N,) array_like, optional
+        Coordinates along each diameter of the stop, from -1 to 1; by default 41 in equal steps.
+
+    Returns
+    -------
+    Fans
+        Positions and wavefront errors of the rays; the reference sphere is that of `wavefront`, with tilt.
+
+    Raises
+    ------
+    ValueError
+        The coordinates are not (N,) and within the stop, or no light of the field comes through.
+
+    Examples
+    --------
+    A spherical mirror with its image plane at the paraxial focus has the transverse aberration (y / R)^2 y / 2:
+
+    >>> sphere = OpticalSurface(-4.0, -2.0, 0.0, "mirror", diameter=0.2)
+    >>> fans = ray_fans(Camera([sphere], 550e-9), pupil=[-1, 0, 0.4, 1])
+    >>> (fans.transverse[1, 1] / (0.1**3 / 4.0**2 / 2)).round(2) + 0.0
+    array([ 1.  ,  0.  , -0.06, -1.  ])
+    """
+    shares = np.linspace(-1.0, 1.0, 41) if pupil is None else np.asarray(pupil, float)
+    if shares.ndim != 1 or not shares.size or not np.all(np.abs(shares) <= 1.0):
+        raise ValueError(f"pupil must be coordinates of shape (N,) from -1 to 1, got shape {shares.shape}")
+    origin, radius = _chief(camera, field)
+    inside = (1.0 - _RIM) * shares[:, None]  # rounding would put rays of the rim beyond it
+    rays = trace_stop(camera, field, np.concatenate([np.zeros((1, 2)), *(inside * axis for axis in np.eye(2))]))
+    place = camera._image_pose.inverse().apply(rays.position)[:, :2]
+    path = path_to_sphere(rays.position, rays.direction, rays.path, origin, radius)
+    ahead, step = path[0] - path[1:], place[1:] - place[0]
+    ahead[~rays.valid[1:]], step[~rays.valid[1:]] = np.nan, np.nan
+    return Fans(shares, np.moveaxis(step.reshape(2, -1, 2), 2, 1), ahead.reshape(2, -1))
+
+
 def _colours(camera: Camera, spectrum: Spectrum | None) -> list[tuple[Camera, float]]:
     """Return pairs of the camera at a wavelength of a spectrum and the weight of that wavelength; weights sum to 1."""
     shares = {camera.wavelength: 1.0} if spectrum is None else spectrum

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from optics import Camera, OpticalSurface
 from optics.geometry.pose import Pose
 from optics.numerics.backend import Backend
 from optics.raytrace.aim import AimError
@@ -109,6 +110,26 @@ class Rayoptics:
             float(np.arctan(chief[0][1])),
         )
 
+    def fan(self) -> tuple[tuple[float, float], np.ndarray, np.ndarray, np.ndarray, float]:
+        """Field, radians, and its fan along y at the end of the field.
+
+        Where the rays cross the stop, positions relative to the chief ray and optical path differences, metres, (N,),
+        and the radius of its reference sphere, metres.
+        """
+        from rayoptics.raytr.analyses import RayFan
+
+        self.sequence.gaps[0].thi = 1e10
+        self.model.update_model()
+        fields = self.model["optical_spec"]["fov"].fields
+        fan = RayFan(self.model, f=len(fields) - 1, num_rays=21, xyfan="y")
+        dx, dy, waves = np.array([values for _, values in fan.fan], float).T
+        assert not dx.any()
+        heading = np.asarray(fields[-1].chief_ray[0][0][0][1])
+        x, y = heading[:2] / heading[2]
+        stop = self.scale * np.array([ray[2][0][self.sequence.stop_surface][0][1] for ray in fan.fan_pkg[0]])
+        radius = self.scale * float(fields[-1].ref_sphere[2])
+        return (float(np.arctan(x)), float(np.arctan(y))), stop, self.scale * dy, 1e-9 * self.wave * waves, radius
+
     def glasses(self) -> list[tuple[str, float]]:
         """Names and indices of its glasses, in the order of the light."""
         surfaces = self.sequence.ifcs[: len(self.sequence.gaps)]
@@ -202,6 +223,21 @@ def read_alike(read: Callable[[Path, Glasses], Prescription], path: Path, peer: 
         surfaces.append(replace(surface, index=index))
     assert not indices, "other glasses"
     return replace(lens, surfaces=tuple(surfaces))
+
+
+def typed(lens: Prescription, diameter: float) -> Camera:
+    """The centred surfaces as a user types them, the stop of a diameter in metres."""
+    places = [s.pose.translation[2] for s in lens.surfaces] + [lens.image.pose.translation[2]]
+    rows, index = [], 1.0
+    for s, step in zip(lens.surfaces, np.diff(places), strict=True):
+        mirror = s.interaction is Interaction.REFLECT
+        index = s.index if s.interaction is Interaction.REFRACT else index
+        radius = 1.0 / s.surface.curvature if s.surface.curvature else np.inf
+        rows.append(
+            OpticalSurface(radius, step, s.surface.conic, "mirror" if mirror else index, asphere=s.surface.even)
+        )
+    rows[lens.stop] = replace(rows[lens.stop], diameter=diameter)
+    return Camera(rows, lens.wavelength, stop=lens.stop)
 
 
 def differences(first: Rays, second: Rays) -> dict[str, float]:

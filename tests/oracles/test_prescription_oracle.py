@@ -16,6 +16,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+import optics
+from optics.camera.image_quality import _chief
 from optics.camera.prescription import seidel_sums
 from optics.numerics.backend import Backend
 from optics.raytrace.assembly import Interaction
@@ -142,6 +144,30 @@ def test_seidel_sums_by_surface_are_those_of_ray_optics(name: str) -> None:
     largest = np.max(np.abs(theirs), axis=0)
     acting = [rows[np.max(np.abs(rows), axis=1) > 1e-12 * largest.max()] for rows in (ours, theirs)]
     assert np.max(np.abs(acting[0] - acting[1]) / largest) < 1e-6
+
+
+SPHERES = ("ag_dblgauss.seq", "schmidt.seq", "CODV_65988_noDOE.seq", "US00583336-2-scaled.zmx")
+"""Systems whose reference sphere in ray-optics is nearly the paraxial exit pupil's: paths differ by a few per mille."""
+
+
+@pytest.mark.parametrize("name", quick(2, SEIDEL))
+def test_ray_fans_are_those_of_ray_optics(name: str) -> None:
+    """Its light comes from D = 1e7 m: the image is f^2 / D farther, the wavefront r^2 / (2 D) rounder."""
+    path = package("rayoptics") / name
+    peer = peers.Rayoptics(path)
+    lens = peers.read_alike(read_zemax if path.suffix.lower() == ".zmx" else read_codev, path, peer)
+    field, stop, transverse, opd, radius = peer.fan()
+    diameter = 2.0 * np.max(np.abs(stop))
+    camera = peers.typed(lens, diameter)
+    fans = optics.ray_fans(camera, field, 2.0 * stop / diameter)
+    finite = 1.1e-7 * camera.focal_length**2 / (2.0 * camera.f_number)
+    assert np.max(np.abs(fans.transverse[1, 1] - transverse)) < 1e-6 * np.max(np.abs(transverse)) + finite
+    assert np.max(np.abs(fans.transverse[1, 0])) < 1e-15
+    if path.name in SPHERES:
+        finite = 1.3e-7 * camera.entrance_pupil_diameter**2 / 8.0
+        other = 0.55 * np.max(transverse**2) * abs(1.0 / radius - 1.0 / abs(_chief(camera, field)[1]))
+        assert other < 5e-3 * np.max(np.abs(opd))
+        assert np.max(np.abs(fans.path[1] - opd)) < 1e-6 * np.max(np.abs(opd)) + finite + other
 
 
 BATOID = """

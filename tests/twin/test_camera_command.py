@@ -224,6 +224,9 @@ def test_an_area_detector_has_its_size_and_may_be_larger_than_the_field(tmp_path
     (tmp_path / "own.yaml").write_text(text.replace("{pixels: 3700,", "{pixels: 2048, rows: 2048,"), "utf-8")
     report = camera_report(run_camera(resolve_camera(tmp_path / "own.yaml"), backend))
     assert ("detector", "2048 × 2048 pixels, 14.34 × 14.34 mm") in report.summary.rows
+    blocked = float(dict(report.summary.rows)["light blocked by edges"].split()[0])
+    vanes = 4 * 4e-3 * (0.25 - 0.0875)  # four of 4 mm from the shadow to the rim
+    assert blocked == pytest.approx(100.0 * (np.pi * 0.0875**2 + vanes) / (np.pi * 0.25**2), abs=0.03)
     assert any("is larger across the line" in text for text in report.lead)
 
 

@@ -13,6 +13,7 @@ from scenes.specs.resolved import resolve_camera
 from scenes.yaml.errors import InputError
 from twin.camera.camera_optics import CameraOptics
 from twin.camera.colour import spectral_psfs
+from twin.camera.first_order_data import FIRST_ORDER, first_order_data
 from twin.live.camera_design import MOST_BLUR, RANGE_WAVES, changed_camera, image_width, point_image
 from twin.live.computer import RequestHandler, camera_file, course_text
 from twin.live.live_bench import LiveBench
@@ -51,6 +52,9 @@ def optics_of(file, backend) -> CameraOptics:
 
 def agrees(told, optics: CameraOptics, field) -> None:
     """The page's numbers are those of twin.camera, to the rounding of traces in another order."""
+    first = FIRST_ORDER(first_order_data(optics))
+    assert told["layout"]["focal_length_m"] == pytest.approx(first["focal_length_m"], rel=1e-9)
+    assert told["layout"]["f_number"] == pytest.approx(first["f_number"], rel=1e-9)
     wave, spot = optics.wavefronts([field], by_rays=True)[0], optics.spot(field)
     assert told["wavefront"]["rms_waves"] == pytest.approx(wave.rms, rel=1e-6, abs=1e-9)
     assert told["spot"]["rms_um"] == pytest.approx(1e6 * spot.rms, rel=1e-6)

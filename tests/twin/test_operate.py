@@ -94,7 +94,7 @@ def test_a_record_is_exported_with_units(tmp_path: Path) -> None:
     run("init", record, "gf7_pair")
     run("ingest", record, EXAMPLES / "telemetry.yaml")
     assert run("export", record, "--out", out).exit_code == 0
-    rows = {path.stem: list(csv.DictReader(path.open())) for path in out.iterdir()}
+    rows = {path.stem: list(csv.DictReader(path.open())) for path in out.glob("*.csv")}
     assert set(rows) == {"temperature", "attitude", "focus", "event"}
     (warm,) = (r for r in rows["temperature"] if (r["subject"], r["time_utc"][11:16]) == ("base/forward/M1", "00:00"))
     assert float(warm["temperature_K [K]"]) == pytest.approx(293.27, abs=1e-12)
@@ -108,6 +108,11 @@ def test_a_record_is_exported_with_units(tmp_path: Path) -> None:
     again = run("export", record, "--out", out)
     assert again.exit_code == 2
     assert "exists; choose another" in again.stderr
+    assert run("export", record, "--out", out, "--force").exit_code == 0
+    assert "neither a run folder nor" in run("ingest", record, tmp_path).stderr  # exported tables are no reading
+    (out / "mine.txt").write_text("mine", "utf-8")
+    kept = run("export", record, "--out", out, "--force")
+    assert (kept.exit_code, "mine.txt" in kept.stderr) == (2, True), kept.stderr
     assert "did you mean 'parquet'" in run("export", record, "--tables", "parket", "--out", tmp_path / "x").stderr
 
 
@@ -353,7 +358,7 @@ def test_a_place_that_cannot_be_written_is_told(record: Path) -> None:
     below = record / FILE / "below"
     for words, code, told in (
         (("init", below, "gf7_pair"), 2, "no folder can be made at"),
-        (("export", record, "--out", below), 1, "not all files of the record were written"),
+        (("export", record, "--out", below), 2, "cannot make the output folder"),
     ):
         done = run(*words)
         assert (done.exit_code, told in " ".join(done.stderr.split())) == (code, True), done.stderr

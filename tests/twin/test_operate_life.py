@@ -43,6 +43,7 @@ from tests.twin.published_life import (
 from tests.twin.test_operate import run
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.operate.estimate.operation_filter import Operation
+from twin.operate.overview import Overview
 from twin.operate.record.entries import MICRO, Entry, micros
 
 FALSE_ALARM = 1e-3
@@ -352,6 +353,12 @@ def test_a_move_of_a_body_of_a_monitored_instrument_is_no_jump(tmp_path: Path):
         with monitored_record(tmp_path / name, setup) as history:
             history.ingest(given("all", [*moves, *entries]))
             results.append(Operation(history, setup).filter_readings())
+            if moves:  # plots mark a move that is in force
+                assert [e[1] for e in Overview.of(history, Operation(history, setup)).events] == ["commanded_move"]
+                history.decide(1, False, "entered twice")
+                overview = Overview.of(history, Operation(history, setup))
+                assert not overview.events
+                assert "entry 1 was excluded: entered twice" in [why for *_, why in overview.filter_result.excluded]
     told_result, untold = results
     assert not told_result.jumps
     assert [jump.body for jump in untold.jumps] == ["base/backward/M2"]

@@ -76,14 +76,21 @@ def _first_order_text(run: CameraRun) -> str:
     """Return a sentence on focal length, F-number and other first-order data, and on the obscuration."""
     n, d = FIRST_ORDER(run.first_order), run.distortion
     blocked = ", ".join(f"{body} {100 * share:.1f}%" for body, share in n["obscuration"].items())
+    own = f"{'further ' if run.optics.model.edges else ''}obscuration by its own parts"
     unmodelled = unmodelled_obscuration(run.optics.model, run.first_order.obscuration)
     return (
         f"f {n['focal_length_m']:.4g} m, F/{n['f_number']:.3g}, field {n['field_deg'][0]:.3g} by "
         f"{n['field_deg'][1]:.3g} deg; principal distance along the line {d.line_distance:.6g} m, "
         f"distortion at most {1e6 * d.line_largest:.3g} µm there; "
-        + (f"obscuration by its own parts: {blocked}." if blocked else "no obscuration by its own parts.")
+        + (f"its edges block {100.0 * _blocked(run):.1f} % of the light; " if run.optics.model.edges else "")
+        + (f"{own}: {blocked}." if blocked else f"no {own}.")
         + "".join(f" {text}." for text in (unmodelled, detector_beyond_field(run.first_order)) if text)
     )
+
+
+def _blocked(run: CameraRun) -> float:
+    """Return the share of the light that edges block in the middle of the field."""
+    return next(wave.vignetted for wave in run.waves if wave.field == (0.0, 0.0))
 
 
 def _facts(run: CameraRun) -> tuple[tuple[str, str], ...]:
@@ -108,6 +115,7 @@ def _facts(run: CameraRun) -> tuple[tuple[str, str], ...]:
 def first_order_table(run: CameraRun) -> Table:
     """Return the report's first table: focal length, F-number, pupils, apertures and other first-order data."""
     n = FIRST_ORDER(run.first_order)
+    further = "further " if run.optics.model.edges else ""
     state = "as perturbed" if run.perturbed else "as built" if run.optics.built else "as designed"
 
     def far(value: float | None) -> str:
@@ -138,7 +146,8 @@ def first_order_table(run: CameraRun) -> Table:
         ("sampling", f"λF / pixel {n['sampling_lambda_f_per_pixel']:.3f} (2 samples the cut-off); "
          f"Nyquist {n['nyquist_per_mm']:.2f}, cut-off {n['cutoff_per_mm']:.1f} cycles/mm"),
         ("length along the axis", f"{n['length_m']:.4f} m"),
-        ("obscuration by its own parts" + (", as designed" if state != "as designed" else ""),
+        *([("light blocked by edges", f"{100.0 * _blocked(run):.2f} % in the middle")] if further else []),
+        (f"{further}obscuration by its own parts" + (", as designed" if state != "as designed" else ""),
          ", ".join(f"{b} {100 * s:.2f}%" for b, s in n["obscuration"].items()) or "none"),
     ]  # fmt: skip
     if "detector_mm" in n:

@@ -419,7 +419,7 @@ def obstacle(state: FolderState) -> str:
     """Return the reason why a run cannot be repeated from its folder; empty if it can be."""
     manifest = state.manifest
     if not manifest.again:
-        return "it holds measurements that a test exported beside its run (--export); verify the run folder of the test"
+        return "it holds files written beside a run (--export) or from a record; verify the run folder of the test"
     made_of = (CONFIG, "deformation", "temperature", "finish")
     changed = [name for name in (*state.changed, *state.missing) if name.split("/")[0] in made_of]
     for names, text in (

@@ -240,7 +240,7 @@ def optics_data(optics: CameraOptics, field: Field) -> tuple[dict[str, Any], dic
     scale = float(np.nanmax(np.abs(wave.map)))
     shade = 1.0 + np.rint(32767.0 * (1.0 + wave.map / (scale or 1.0)))
     images = {"wavefront": np.nan_to_num(shade).astype(np.uint16)[None]}
-    first = optics.model.first_order
+    focal_length = abs(optics.model.paraxial.focal_length)
     data: dict[str, Any] = {
         "field_deg": [angle / DEGREE for angle in wave.field_rad],
         "wavefront": {
@@ -257,8 +257,8 @@ def optics_data(optics: CameraOptics, field: Field) -> tuple[dict[str, Any], dic
         },
         "layout": {
             **_layout(optics.model, optics.path.backend, field),
-            "focal_length_m": optics.model.line_principal_distance,
-            "f_number": float(np.mean(np.abs(first.principal_distance))) / optics.model.entrance_pupil,
+            "focal_length_m": focal_length,
+            "f_number": focal_length / optics.model.entrance_pupil,
         },
     }
     if wave.rms > MOST_BLUR:

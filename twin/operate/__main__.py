@@ -43,7 +43,6 @@ from twin.operate.terminal import (
     on_record,
     print_line,
     print_result,
-    require_new,
     show_table,
     utc_option,
 )
@@ -361,6 +360,7 @@ def export(
     call: Call,
     tables: Annotated[str, typer.Option(help="Format of the tables: csv, parquet or fits.")] = "csv",
     out: NewFolder = Path("tables"),
+    force: cli.Force = False,
 ) -> None:
     """Write a record as tables for other programs, one for each kind of reading; column heads contain the units.
 
@@ -369,17 +369,18 @@ def export(
     Exit codes: 0 success, 2 bad input (nothing is written), 1 anything else.
     """
     from twin.framework.data_files import TABLE_FORMATS, MissingPackage
+    from twin.framework.run_folder import RunFolder
     from twin.operate.record.record_tables import tables as all_tables
 
     cli.require_one_of("--tables", tables, TABLE_FORMATS)
-    require_new(out)
+    folder = RunFolder(out, force)
     try:
         made = [
             (f"{table.name}.{tables}", TABLE_FORMATS[tables](table), table.rows) for table in all_tables(call.history)
         ]
     except MissingPackage as error:
         raise InputErrorText(str(error)) from None
-    call.write_new(out, {name: content for name, content, _ in made}, "record")
+    call.write_files(folder, {name: content for name, content, _ in made}, "export")
     data = {"out": str(out), "tables": [{"file": name, "rows": rows} for name, _, rows in made]}
     text = "\n".join(f"{out / name}: {rows} rows" for name, _, rows in made)
     call.print_result(data, lambda console: print_line(console, text or "the record is empty"))

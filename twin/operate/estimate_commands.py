@@ -11,7 +11,7 @@ from rich.console import Console
 
 from scenes.yaml.standard_output import FAILURE, print_error
 from twin.framework import durable
-from twin.framework.cli import InputErrorText, print_verdict
+from twin.framework.cli import Force, InputErrorText, print_verdict
 from twin.operate.terminal import (
     Call,
     NewFolder,
@@ -162,6 +162,7 @@ def products(
         ),
     ] = None,
     out: NewFolder = Path("products"),
+    force: Force = False,
 ) -> None:
     """Write the products of the estimate for one time.
 
@@ -174,10 +175,11 @@ def products(
     Exit codes: 0 success, 2 bad input (nothing is written), 1 anything else.
     """
     from optics.numerics.backend import load_backend
+    from twin.framework.run_folder import RunFolder
     from twin.operate.products import make_products, product_files, scene_time, summary
     from twin.orbit.export.export_run import read_source
 
-    require_new(out)
+    folder = RunFolder(out, force)
     source = None if scene is None else read_source(scene)
     if moment is not None:
         time = utc_option("--time", moment)
@@ -190,7 +192,7 @@ def products(
     with input_errors():
         made = make_products(operation, call.history, time, source, load_backend())
     files, numbers = product_files(made)
-    call.write_new(out, files, "products")
+    call.write_files(folder, files, "products")
     call.print_result(numbers, lambda console: print_line(console, summary(made)))
 
 

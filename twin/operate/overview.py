@@ -21,6 +21,7 @@ from analysis.monitor.parameters import ANGLE_GROUP, GROUND_GROUP
 from analysis.statistics import proportion_interval
 from optics.numerics.number_tree import FrozenMap
 from twin.framework.artefact import SAME
+from twin.operate.estimate.learned_model import moves_of
 from twin.operate.estimate.reported_estimate import name_of, percent, with_current_interval, with_sigma
 from twin.operate.record.entries import MICRO, utc_text
 from twin.operate.record.history import History, content_of
@@ -263,7 +264,7 @@ class Overview:
         """Return the overview of a record and its estimate after all readings."""
         known = operation.plan.operation.events
         dated = [(int(entry["time_us"]), str(entry["subject"])) for entry in history.entries("event")]
-        dated += [(int(entry["time_us"]), "commanded_move") for entry in history.entries("move")]
+        dated += [(int(entry["time_us"]), "commanded_move") for entry in moves_of(history)]
         events = tuple((time, name, tuple(known.get(name, ()))) for time, name in sorted(dated))
         begin = reading_span(history, operation.reading_kind)[0]
         result = operation.filter_readings()

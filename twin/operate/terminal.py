@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import os
+import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import wraps
 from inspect import Parameter, signature
 from pathlib import Path
@@ -16,12 +17,13 @@ from rich.console import Console
 
 from scenes.yaml.errors import Problem
 from scenes.yaml.standard_output import FAILURE, Terminal, print_error, print_json, to_stdout
-from twin.framework import cli, durable
+from twin.framework import cli
 from twin.framework.cli import InputErrorText
 from twin.operate.record import NotARecord, RecordFailed, file_of, require_file
 
 if TYPE_CHECKING:
     from scenes.specs.operation import OperationSetup
+    from twin.framework.run_folder import RunFolder
     from twin.operate.estimate.operation_filter import Operation
     from twin.operate.estimate.reported_estimate import FilterResult
     from twin.operate.record.entries import Alarm
@@ -137,12 +139,15 @@ class Call:
         Console for errors and progress.
     options : cli.Options
         Options of the command: output as JSON (``as_json``), no output (``quiet``).
+    started : float
+        Start of the command, seconds since the epoch.
     """
 
     location: str
     history: History
     errors: Console
     options: cli.Options
+    started: float = field(default_factory=time.time)
 
     def print_result(self, data: Any, show: Callable[[Console], None]) -> None:
         """Print the result of the command, as JSON or, by the function ``show``, as text."""
@@ -215,37 +220,35 @@ class Call:
         filter_result = operation.filter_readings()
         return operation, filter_result, raise_alarms(self.history, operation.plan.operation, filter_result)
 
-    def write_new(self, out: Path, files: Mapping[str, bytes], what: str) -> None:
-        """Write files into a new folder.
+    def write_files(self, folder: RunFolder, files: Mapping[str, bytes], command: str) -> None:
+        """Write files into a new folder, with the manifest by which ``--force`` recognises it.
 
         Parameters
         ----------
-        out : Path
-            Folder to be created.
+        folder : RunFolder
+            Folder, not yet open.
         files : Mapping[str, bytes]
             Path in the folder -> content.
-        what : str
-            Name of the files for an error.
+        command : str
+            Word of the command.
 
         Raises
         ------
-        typer.Exit
-            The files cannot be written; the error has been printed.
+        RunFolderError
+            The files cannot be written.
         """
-        try:
-            for folder in sorted({out, *((out / name).parent for name in files)}):
-                durable.make_folders(folder)
-            durable.write_all_safely((out / name, content) for name, content in files.items())
-        except OSError as error:
-            print_error(self.errors, f"{out}: {error.strerror or error}; not all files of the {what} were written")
-            raise typer.Exit(FAILURE) from None
+        from twin.framework.run_folder import write_manifest
+
+        with folder:
+            for name, content in files.items():
+                folder.write_bytes(name, content)
+            write_manifest(folder, "twin.operate", self.started, time.time() - self.started, test=command)
 
 
-def require_new(out: Path, force: bool | None = None) -> None:
-    """Raise InputErrorText if a file or folder exists, unless the option ``force``, where there is one, is used."""
+def require_new(out: Path, force: bool) -> None:
+    """Raise InputErrorText if a file exists, unless the option ``force`` is used."""
     if os.path.lexists(out) and not force:
-        remedy = "" if force is None else ", or replace it with --force"
-        raise InputErrorText(f"--out: {out} exists; choose another{remedy}")
+        raise InputErrorText(f"--out: {out} exists; choose another, or replace it with --force")
 
 
 def on_record(work: Callable[..., None]) -> Callable[..., None]:

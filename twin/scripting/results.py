@@ -456,6 +456,11 @@ class TestResult:
     __test__ = False  # for pytest, which looks for tests by this name
 
     @property
+    def verdict(self) -> str:
+        """Result, its accuracy, and what limits it."""
+        return self.report.verdict
+
+    @property
     def summary(self) -> pd.DataFrame:
         """Main table of the test's report, as a data frame."""
         table = self.report.summary

@@ -86,6 +86,17 @@ def moves_of(history: History) -> list[dict[str, Any]]:
     return [entry for entry in history.entries(MOVE) if decisions.get(entry["id"], (True, ""))[0]]
 
 
+def excluded_moves(history: History) -> list[tuple[int, str, str, str]]:
+    """Return time, kind, subject and reason of the commanded moves that a person excluded, in the order of time."""
+    decisions = history.decisions()
+    moves = ((entry, decisions.get(entry["id"], (True, ""))) for entry in history.entries(MOVE))
+    return [
+        (int(entry["time_us"]), MOVE, str(entry["subject"]), f"entry {entry['id']} was excluded: {why}")
+        for entry, (included, why) in moves
+        if not included
+    ]
+
+
 def _motion(name: str, prior: Disturbances) -> tuple[int, float]:
     """Return the index of a motion among the disturbances, and its standard deviation in SI units."""
     if name not in prior.labels:

@@ -38,7 +38,15 @@ from scenes.yaml.errors import Problem
 from twin.framework.provenance import source_digest
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.operate.estimate.estimate_snapshot import EntryFilter, EstimatorState, Violation, packed, unpacked
-from twin.operate.estimate.learned_model import MOVE, NEAR, LearnedTerm, contradicted_moves, learned_terms, terms_of
+from twin.operate.estimate.learned_model import (
+    MOVE,
+    NEAR,
+    LearnedTerm,
+    contradicted_moves,
+    excluded_moves,
+    learned_terms,
+    terms_of,
+)
 from twin.operate.estimate.operation_model import OperationModel, focus_model, plan_digest, traced_model
 from twin.operate.estimate.reported_estimate import (
     Course,
@@ -375,7 +383,7 @@ class Operation:
             jumps,
             self.events,
             tuple(sorted(sensors, key=lambda item: item.body)),
-            state.excluded,
+            (*state.excluded, *excluded_moves(self.history)),
             {item.name: share for item, share in zip(self.quantities, state.explained.tolist(), strict=True)},
             self._sigma_inflation,
             self.too_many_jumps,

@@ -477,7 +477,7 @@ class Sources:
                 yield from self._run(path, self.moment, history)
                 continue
             described = sorted(path.glob("*.yaml")) if path.is_dir() else [path]
-            runs = sorted(folder for folder in path.iterdir() if is_run_folder(folder)) if path.is_dir() else []
+            runs = sorted(filter(_may_be_read, path.iterdir())) if path.is_dir() else []
             if not described and not runs and not (self.watching and path.is_dir()):
                 raise InputErrorText(
                     f"{path}: neither a run folder nor a folder with a YAML file that describes tables"
@@ -523,6 +523,16 @@ class Sources:
             return True
         self.seen[str(path)] = now
         return False
+
+
+def _may_be_read(folder: Path) -> bool:
+    """Return whether a path is a run folder, and not one of products or tables of a record."""
+    manifest = read_manifest(folder)
+    return manifest is not None and (manifest.program, manifest.test) not in _WRITTEN
+
+
+_WRITTEN = (("twin.operate", "products"), ("twin.operate", "export"))
+"""Program and command whose folders hold no readings."""
 
 
 def _runs_named(table: ReadingTableSpec, path: Path) -> list[Path]:

@@ -233,7 +233,7 @@ def _ground_figure(ground: np.ndarray, cases: Sequence[tuple[str, np.ndarray, np
             east[where], north[where], *errors.T, cmap="viridis", clim=(-extent, extent), width=0.005, scale=12.0 * size
         )
         # below the title and left of its arrow, the label stays within a narrow map
-        axes.quiverkey(arrows, 0.88, 1.03, size, f"{size:g} m in plan", labelpos="W", coordinates="axes")
+        axes.quiverkey(arrows, 0.88, 1.03, size, f"{size:g} m in plan", labelpos="W", coordinates="axes", color=svg.INK)
         axes.set_title(f"{len(where)} {title}", loc="left", pad=20)
         axes.set(xlabel="east [km]", ylabel="north [km]")
         axes.set_aspect("equal", adjustable="datalim")

@@ -562,7 +562,7 @@ def _check_figure(run: CalibrationRun) -> Figure:
             width=0.004,
             scale=16.0 * size,
         )
-        axes.quiverkey(arrows, 0.8, 0.04, size, f"{size:g} m in plan", labelpos="E", coordinates="axes")
+        axes.quiverkey(arrows, 0.8, 0.04, size, f"{size:g} m in plan", labelpos="E", coordinates="axes", color=svg.INK)
         axes.set_title(f"{title}: plan {errors.plan_rms:.2f} m, height {errors.height_rms:.2f} m")
         axes.set(xlabel="east [km]")
         axes.set_aspect("equal")
