@@ -92,6 +92,7 @@ def asbuilt_report(run: AsBuiltRun) -> Report:
             (
                 "`instrument.yaml` is the instrument as built, which every command accepts; `posterior.yaml` beside it "
                 "is the posterior covariance as a disturbances file.",
+                *(("Terms of the wavefront are in neither: no body has them.",) if run.setup.test.wavefront else ()),
             ),
             (CameraFile("instrument", "Instrument", "", instrument_text(run)), *_posterior(run)),
             closed=True,

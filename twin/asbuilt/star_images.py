@@ -21,7 +21,7 @@ from optics.waves.star_image import StarImage, StarPupil
 from scenes.specs import asbuilt as specs
 from twin.asbuilt.measured_kinds import MeasuredKind, View, field_text
 from twin.asbuilt.star_readings import FWHM, StarFit, StarReading, centroid
-from twin.camera.varied_beams import VariedBeams
+from twin.camera.varied_beams import BeamLight, VariedBeams
 
 TYPICAL_SEEING = 1.5
 """Full width at half maximum of the seeing of simulated stars whose seeing the estimate does not know, pixels."""
@@ -88,7 +88,8 @@ class ImageReadings(MeasuredKind):
         self.rows = []
         for number, pupil in enumerate(self.pupils):
             u, v = (self.beams.cosines[0, number] - self.beams.designed.chiefs[0, number, 1::-1]).T
-            self.rows.append(pupil.terms(u, v, self.beams.nodes.weight, self.beams.degree))
+            self.rows.append(pupil.terms_of_slopes(u, v, self.beams.nodes.weight, self.beams.degree))
+        self.along = [matrix @ self.beams.solve for matrix in slopes(self.beams.nodes, self.beams.degree)]
         self.stars = tuple(self._expected(number, typical) for number in range(len(self.pupils)))
         rows, columns = self.shape
         self.labels = tuple(
@@ -103,14 +104,21 @@ class ImageReadings(MeasuredKind):
         image = StarImage(self.pupils[number], self.beams.degree, self.shape, self.pitch, blur=most)
         first = StarFit(np.zeros(2), blur, spec.flux, spec.background, np.zeros(self.shape), np.zeros((0, 0)))
         star = StarReading(image, self.blur, first, None, np.ones(self.shape))
-        return star.with_noise(
-            star.predict(self._terms(self.beams.designed.eikonals)[0, number]).model, spec.read_noise
-        )
+        return star.with_noise(star.predict(self._terms(self.beams.designed)[0, number]).model, spec.read_noise)
 
-    def _terms(self, eikonals: np.ndarray) -> np.ndarray:
-        """Return the coefficients of the eikonals of F fields, (S, F, T), for those at N nodes, (S, F, N)."""
-        eikonals = eikonals + self.spec.defocus * self.beams.defocus
-        return np.stack([eikonals[:, f] @ rows.T for f, rows in enumerate(self.rows)], axis=1)
+    def _terms(self, light: BeamLight) -> np.ndarray:
+        """Return the coefficients of eikonals over the nominal directions, (S, F, T), that have the rays' intercepts.
+
+        A state changes the directions of its rays. The derivatives of its eikonal with respect to its own directions
+        are the intercepts of its rays with the focal plane; an eikonal over the nominal directions with the same
+        intercepts has the same image up to the second order of the change.
+        """
+        leading = np.einsum("sfni,sfi->sfn", light.directions, light.chiefs) - 1.0
+        paths = light.eikonals + self.spec.defocus * leading
+        slope = np.stack([paths @ matrix.T for matrix in self.along], axis=-1)
+        cosines = np.stack([matrix @ light.directions[..., 1::-1] for matrix in self.along], axis=-2)
+        intercepts = np.linalg.solve(cosines, slope[..., None])[..., 0].reshape(*paths.shape[:2], -1)
+        return np.stack([intercepts[:, f] @ rows.T for f, rows in enumerate(self.rows)], axis=1)
 
     @property
     def traced_count(self) -> int:
@@ -119,7 +127,7 @@ class ImageReadings(MeasuredKind):
 
     def traced(self, view: View) -> np.ndarray:
         """Return the wavefront coefficients of all stars in every state, metres."""
-        return self._terms(self.beams.light(view.states).eikonals).reshape(len(view.states), -1)
+        return self._terms(self.beams.light(view.states)).reshape(len(view.states), -1)
 
     @one_blas_thread()
     def fits(self, view: View) -> list[StarFit]:
