@@ -285,6 +285,21 @@ def test_recorded_images_are_read_and_judged(backend, tmp_path):
     assert run.images[0].star.fitted == 4
 
 
+@pytest.mark.second
+def test_a_star_that_contradicts_the_others_is_excluded(backend, tmp_path):
+    """One of three stars has the image of another camera: it is named, and the others agree. One of two would stay."""
+    fields = [[-0.7, 0], [0, 0], [0.7, 0.5]]
+    bench = star_bench(backend, tmp_path, ("-0.6 mm",), fields=fields)
+    rng = np.random.default_rng(5)
+    true = 0.3 * bench.draw(rng, "normal")
+    (data,), (other,) = bench.measured(true, rng), bench.measured(true + 0.5 * bench.draw(rng, "normal"), rng)
+    half = 28 * 28
+    found = bench.estimate((np.concatenate([data[:half], other[half : 2 * half], data[2 * half :]]),))
+    assert [block for _, block, _ in found.excluded] == ["star (0, 0)"]
+    assert found.whole.passes()
+    assert found.whole.degrees == 2 * (half - 4)
+
+
 def test_images_that_do_not_fit_the_file_are_refused(backend, tmp_path):
     file = recorded(tmp_path, np.ones((3, 16, 16), np.float32))
     with pytest.raises(InputError, match="3 pages in the file, 2 fields"):

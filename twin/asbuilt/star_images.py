@@ -6,7 +6,6 @@ import copy
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 
@@ -22,6 +21,7 @@ from scenes.specs import asbuilt as specs
 from twin.asbuilt.measured_kinds import MeasuredKind, View, field_text
 from twin.asbuilt.star_readings import FWHM, StarFit, StarReading, centroid
 from twin.camera.varied_beams import BeamLight, VariedBeams
+from twin.framework.record import Quantity, Record
 
 TYPICAL_SEEING = 1.5
 """Full width at half maximum of the seeing of simulated stars whose seeing the estimate does not know, pixels."""
@@ -95,7 +95,7 @@ class ImageReadings(MeasuredKind):
         self.labels = tuple(
             f"{field_text(field)} pixel {r} {c}" for field in spec.fields for r in range(rows) for c in range(columns)
         )
-        self.blocks = ("all stars",) * len(self.labels)
+        self.blocks = tuple(f"star {field_text(field)}" for field in spec.fields for _ in range(rows * columns))
 
     def _expected(self, number: int, blur: float) -> StarReading:
         """Return the image of a star before the measurement, as the nominal camera makes it."""
@@ -158,8 +158,8 @@ class ImageReadings(MeasuredKind):
         return np.concatenate([star.variance.ravel() for star in self.stars])
 
     def group(self, values: np.ndarray) -> MeasuredGroup:
-        """Return the measurement as the estimate needs it, with the number of quantities fitted to every star."""
-        return replace(super().group(values), fitted=sum(star.fitted for star in self.stars))
+        """Return the measurement as the estimate needs it, with the number of quantities fitted to each star."""
+        return replace(super().group(values), fitted=self.stars[0].fitted)
 
     def about(self, values: np.ndarray) -> ImageReadings:
         """Return the measurement with recorded images, with a noise for steps from a distant state.
@@ -276,21 +276,6 @@ class StarResidual:
         """Chi-square of the image per degree of freedom."""
         return self.test.chi_square / max(1, self.test.degrees)
 
-    def plain(self) -> dict[str, Any]:
-        """Return the numbers of the star as plain data."""
-        return {
-            "measurement": self.measurement,
-            "field": list(self.field),
-            "row_px": float(self.fit.position[0]),
-            "column_px": float(self.fit.position[1]),
-            "flux_e": self.fit.flux,
-            "background_e": self.fit.background,
-            "seeing_px": self.seeing_px,
-            "outside": self.outside,
-            "chi_square": self.test.chi_square,
-            "degrees": self.test.degrees,
-        }
-
     def warnings(self) -> list[str]:
         """Return warnings on a star that fits badly, is cut or is saturated."""
         out, name = [], f"{self.measurement}: the star at {field_text(self.field)}"
@@ -306,3 +291,20 @@ class StarResidual:
         if lost:
             out.append(f"{name} has {lost} saturated pixels, which are not used")
         return out
+
+
+STAR: Record[StarResidual] = Record(
+    "Image of a star, with what is estimated for it.",
+    Quantity("measurement", lambda star: star.measurement, "name of the measurement"),
+    Quantity("field", lambda star: list(star.field), "as fractions of the half field"),
+    Quantity("row_px", lambda star: star.fit.position[0], "from the middle of the cut-out", head="row", decimals=2),
+    Quantity("column_px", lambda star: star.fit.position[1], "from its middle", head="column", decimals=2),
+    Quantity("flux_e", lambda star: star.fit.flux, "light of the whole star", head="flux [e-]", decimals=0),
+    Quantity("background_e", lambda star: star.fit.background, "in a pixel", head="background [e-]", decimals=1),
+    Quantity("seeing_px", lambda star: star.seeing_px, "full width at half maximum", head="seeing", decimals=2),
+    Quantity("outside", lambda star: star.outside, "share beyond the cut-out", head="outside", shown="percent"),
+    Quantity("chi_square", lambda star: star.test.chi_square, "of its pixels", head="chi-square", decimals=1),
+    Quantity("degrees", lambda star: star.test.degrees, "degrees of freedom", head="degrees"),
+    Quantity("p_value", lambda star: star.test.p_value, "of the chi-square", head="p", decimals=4),
+)
+"""Numbers of a star in asbuilt.json and in the report."""
