@@ -170,6 +170,9 @@ class MtfReadingsSpec(ReadingsSpec):
         MTF at each field for a pattern of lines parallel to the line CCD.
     sigma : float
         Standard deviation of each MTF value.
+    defocus : float
+        Shift of the focal plane along its normal, downstream, during the measurement, in metres. The MTF in focus does
+        not have a sign of defocus; that of a page of edges out of focus by more than the prior's sigma has.
     """
 
     fields: Fields
@@ -177,6 +180,7 @@ class MtfReadingsSpec(ReadingsSpec):
     along_line: Annotated[tuple[Modulation, ...], Field(min_length=1, max_length=200)] | None = None
     along_track: Annotated[tuple[Modulation, ...], Field(min_length=1, max_length=200)] | None = None
     sigma: Annotated[spec.Number, Field(gt=0.0, le=1.0)]
+    defocus: Annotated[float, Quantity(LENGTH, largest="100 mm")] = 0.0
 
     @model_validator(mode="after")
     def _as_many(self) -> MtfReadingsSpec:
