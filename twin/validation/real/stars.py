@@ -28,8 +28,10 @@ FILE = "danish/AuxTelTestDonuts.pkl"
 """File in the folder of measured data; the wheel of danish has it as tests/data/AuxTelTestDonuts.pkl."""
 BINNING, PITCH, FOCAL = 3, 30e-6, 20.8
 """Pixels that are added along each axis, their pitch together and the focal length, metres, as in ``auxtel.yaml``."""
-NOISE = 1e5
-"""Standard deviation of a pixel, electrons, far above its noise: the model's error, with even weights as danish's."""
+NOISE = 3e3
+"""Standard deviation of a pixel, electrons: far above shot noise, so that weights are even as danish's, and below the
+model's error, so that sigmas grow to it.
+"""
 TERMS = tuple(range(4, 12))
 ESTIMATE: dict[str, Any] = {
     "instrument": str(Path(__file__).parent / "auxtel.yaml"),
