@@ -156,14 +156,14 @@ def test_derivatives_of_an_instrument_are_those_of_its_images(backend, tmp_path)
 @pytest.mark.second
 @pytest.mark.parametrize(("instrument", "defocus"), [("gf7", "0.6 mm"), ("ritchey_chretien", "0.8 mm")])
 def test_sigmas_hold_for_some_cameras(backend, tmp_path, instrument, defocus):
-    """Four cameras on both sides of focus, by the independent path: wavefronts at nine fields and six combinations.
+    """Three cameras on both sides of focus, by the independent path: wavefronts at nine fields and six combinations.
 
     All covered shares together, of which some six a camera are independent, lie below the bound once in 1e4 times.
     """
     inside, p_values, modes = judged(star_bench(backend, tmp_path, (f"-{defocus}", defocus), instrument),
-                                     np.random.default_rng(7), 4)  # fmt: skip
+                                     np.random.default_rng(7), 3)  # fmt: skip
     for k, share in enumerate((0.68, 0.95)):
-        assert inside[:, :, k].mean() >= binom.ppf(1e-4, 24, share) / 24
+        assert inside[:, :, k].mean() >= binom.ppf(1e-4, 18, share) / 18
     assert np.all(p_values > 1e-4)
     assert np.all(modes == 1)
 
