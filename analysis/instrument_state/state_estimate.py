@@ -141,8 +141,8 @@ class MeasuredGroup:
     blocks : tuple of str
         For each number, the name of its block: the numbers that one gross error would affect together, such as a field.
     fitted : int
-        Number of quantities of the measurement alone that the prediction fits to these numbers in every state, such as
-        the fluxes of stars (variable projection: Golub & Pereyra, SIAM J. Numer. Anal. 10, 413, 1973).
+        Number of quantities of each block alone that the prediction fits to its numbers in every state, such as the
+        flux of a star (variable projection: Golub & Pereyra, SIAM J. Numer. Anal. 10, 413, 1973).
     """
 
     name: str
@@ -503,6 +503,7 @@ def _tested(
     # to the first order this is the residual's inverse marginal covariance, times the residual about the prior's mean
     total = float(residual @ residual + unit @ unit)
     measurements: list[ConsistencyTest] = []
+    fitted = 0
     blocks: dict[str, tuple[ConsistencyTest, ...]] = {}
     start = 0
     for group, white in zip(groups, whiteners, strict=True):
@@ -510,8 +511,15 @@ def _tested(
         start += white.shape[0]
         part = residual[rows]
         if group.covariance.ndim == 1:
-            measurements.append(_consistency_of_many(group.name, part, left[rows], group.fitted))
-            blocks[group.name] = (replace(measurements[-1], name=group.blocks[0]),)
+            # a row of the whitener of independent numbers has one of them
+            owners = np.array(group.blocks)[white.indices]
+            names = tuple(dict.fromkeys(owners.tolist()))
+            fitted += group.fitted * len(names)
+            measurements.append(_consistency_of_many(group.name, part, left[rows], group.fitted * len(names)))
+            blocks[group.name] = tuple(
+                _consistency_of_many(name, part[owners == name], left[rows][owners == name], group.fitted)
+                for name in names
+            )
             continue
         spread = np.eye(len(white)) - left[rows] @ left[rows].T
         measurements.append(_consistency(group.name, part, spread, np.eye(len(white))))
@@ -521,7 +529,7 @@ def _tested(
             if np.any(columns):
                 tests.append(_consistency(block, part, spread, columns))
         blocks[group.name] = tuple(tests)
-    whole = ConsistencyTest.of("all", total, len(residual) - sum(group.fitted for group in groups))
+    whole = ConsistencyTest.of("all", total, len(residual) - fitted)
     return StateEstimate(
         prior, tuple(groups), unit, root, table, residual, whole, tuple(measurements), blocks, (), steps, moved
     )

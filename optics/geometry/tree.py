@@ -157,7 +157,17 @@ AT_REST = Motion()
 """Motion of a body that a perturbed state does not list: no displacement and no other change."""
 
 State = Mapping[str, Motion]
-"""Perturbed state: body path -> motion; bodies not named stay at their nominal pose."""
+"""Perturbed state: body path -> motion; bodies not named stay at their nominal pose.
+
+It may have the keys ``WAVEFRONT`` besides bodies.
+"""
+
+WAVEFRONT = ("wavefront", "wavefront along the line", "wavefront along the track")
+"""Keys of a state whose ``figure`` holds Zernike terms of the wavefront that no body causes, metres.
+
+They are the terms of the middle of the field and their changes to the edges of the field, along the line and along the
+track. ``twin.camera.varied_beams`` adds them to the wavefronts of traced rays.
+"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -266,7 +276,7 @@ class RigidTree:
             A state names an unknown body or pivot.
         """
         index, nominal = self._index, self._nominal if step is None else self._nominal_complex
-        moved = {path for state in states for path in state}
+        moved = {path for state in states for path in state} - set(WAVEFRONT)
         for path in moved:
             if path not in index:
                 raise KeyError(path)

@@ -18,7 +18,8 @@ import numpy as np
 from scipy.sparse import csr_array, diags_array
 
 from optics.numerics.array_math import UnphysicalError
-from optics.waves.pupil_terms import orders, products
+from optics.numerics.quadrature import PupilNodes
+from optics.waves.pupil_terms import orders, products, slopes
 
 _POINTS = 8
 """Number of grid points along each axis over which a node of the pupil is spread."""
@@ -85,6 +86,16 @@ class StarPupil:
         """
         root = np.sqrt(weight)
         return np.asarray(np.linalg.pinv(products(*self.normalised(u, v), degree) * root[:, None]) * root)
+
+    def terms_of_slopes(self, u: np.ndarray, v: np.ndarray, weight: np.ndarray, degree: int) -> np.ndarray:
+        """Return the matrix from derivatives with respect to u and v at N directions to T coefficients, (T, 2 N).
+
+        Parameters are those of ``terms``; the two derivatives of a direction follow each other.
+        """
+        across, down = slopes(PupilNodes(*self.normalised(u, v), weight), degree)
+        table = np.stack([across, down], axis=1).reshape(-1, across.shape[1]) / self.half
+        root = np.repeat(np.sqrt(weight), 2)
+        return np.asarray(np.linalg.pinv(table * root[:, None]) * root)
 
 
 def _spread(x: np.ndarray, axis: np.ndarray) -> csr_array:

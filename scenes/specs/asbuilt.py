@@ -10,7 +10,7 @@ from pydantic import AfterValidator, Field, model_validator
 from optics.geometry.zernike import MAX_NOLL
 from optics.numerics.number_tree import FrozenMap
 from scenes.specs import load
-from scenes.specs.course import noll
+from scenes.specs.course import Term, noll
 from scenes.specs.disturbances import DisturbancesSpec
 from scenes.specs.resolved import ExperimentSetup, ResolvedJob, resolve_on
 from scenes.specs.tolerance import Amount, CompensatorSpec, FieldShare, MeritSpec
@@ -170,6 +170,9 @@ class MtfReadingsSpec(ReadingsSpec):
         MTF at each field for a pattern of lines parallel to the line CCD.
     sigma : float
         Standard deviation of each MTF value.
+    defocus : float
+        Shift of the focal plane along its normal, downstream, during the measurement, in metres. The MTF in focus does
+        not have a sign of defocus; that of a page of edges out of focus by more than the prior's sigma has.
     """
 
     fields: Fields
@@ -177,6 +180,7 @@ class MtfReadingsSpec(ReadingsSpec):
     along_line: Annotated[tuple[Modulation, ...], Field(min_length=1, max_length=200)] | None = None
     along_track: Annotated[tuple[Modulation, ...], Field(min_length=1, max_length=200)] | None = None
     sigma: Annotated[spec.Number, Field(gt=0.0, le=1.0)]
+    defocus: Annotated[float, Quantity(LENGTH, largest="100 mm")] = 0.0
 
     @model_validator(mode="after")
     def _as_many(self) -> MtfReadingsSpec:
@@ -442,6 +446,39 @@ class MeasurementsSpec(spec.Spec):
                 yield kind, name, measurement
 
 
+MOST_TERM = 45
+"""Largest Noll index of a wavefront's unknown term: degree 8, which the rays of every beam sample."""
+
+
+def _require_wavefront(terms: Mapping[str, float]) -> FrozenMap[str, float]:
+    for term in terms:
+        if not 4 <= noll(term) <= MOST_TERM:
+            raise Problem("not a term of a wavefront", term, f"Z4 to Z{MOST_TERM}")
+    return FrozenMap(terms)
+
+
+WavefrontTerms = Annotated[dict[Term, Sigma], AfterValidator(_require_wavefront)]
+
+
+class WavefrontPriorSpec(spec.Spec):
+    """Zernike terms of the wavefront at the exit pupil that are estimated besides the motions of bodies.
+
+    Terms are those of `wavefronts`: Noll, rms, orthonormal over the light of each field, positive where the wavefront
+    is ahead.
+
+    Attributes
+    ----------
+    constant : dict[str, float]
+        Term -> standard deviation of its amount, equal at all fields, in metres.
+    linear : dict[str, float]
+        Term -> standard deviation of its change from the middle to the edge of the field, in metres, along the line
+        and, independently, along the track.
+    """
+
+    constant: WavefrontTerms = Field(default_factory=FrozenMap)
+    linear: WavefrontTerms = Field(default_factory=FrozenMap)
+
+
 class ActuatorSpec(CompensatorSpec):
     """Actuator: a motion that can be made to align the instrument.
 
@@ -514,6 +551,8 @@ class AsBuiltSpec(spec.Spec):
         Name of the camera to which the estimate applies; may be omitted if the instrument has one camera.
     prior : str
         Disturbances file with the prior: the uncertainty of the state before any measurement.
+    wavefront : WavefrontPriorSpec | None
+        Zernike terms of the wavefront that are estimated besides the motions of the prior; none by default.
     measurements : MeasurementsSpec
         Measurements by kind and name.
     merits : Mapping[str, MeritSpec]
@@ -536,6 +575,7 @@ class AsBuiltSpec(spec.Spec):
     instrument: spec.Ref
     camera: spec.Name | None = None
     prior: spec.Ref = "assembled"
+    wavefront: Annotated[WavefrontPriorSpec, spec.NothingIsEmpty] | None = None
     measurements: MeasurementsSpec
     merits: Annotated[spec.Named[MeritSpec], Field(min_length=1, max_length=50)]
     actuators: Annotated[spec.Named[ActuatorSpec], spec.NothingIsEmpty] = Field(default_factory=FrozenMap)

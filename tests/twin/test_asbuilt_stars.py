@@ -12,6 +12,7 @@ from astropy.io import fits
 from scipy.stats import binom
 
 from analysis.instrument_state.state_estimate import MeasuredGroup, StatePrior, estimate_state
+from optics.geometry.tree import WAVEFRONT
 from optics.numerics.quadrature import disk
 from optics.waves.diffraction import Grid, PupilField, airy, image
 from optics.waves.star_image import CoarsePupilError, StarImage, StarPupil
@@ -21,8 +22,9 @@ from scenes.yaml.yaml_file import dump_yaml
 from tests.twin.star_bench import PRIOR, TWO, independent_share, judged, measured, star_bench
 from twin.asbuilt.asbuilt_bench import AsBuiltBench
 from twin.asbuilt.asbuilt_run import probabilities, run_asbuilt
+from twin.asbuilt.built_instrument import built_motions, instrument_text, unknown
 from twin.asbuilt.star_readings import StarFit, StarReading
-from twin.validation.real.stars import FILE, star_file, star_images
+from twin.validation.real.stars import FILE, RIGID, star_file, star_images
 
 WAVE, APERTURE = 650e-9, 1.0 / 20.0
 
@@ -122,7 +124,9 @@ def test_variances_are_a_diagonal_covariance():
 @pytest.mark.second
 @pytest.mark.parametrize(("instrument", "spiral"), [("gf7", 0), ("ritchey_chretien", 0), ("ritchey_chretien", 60_000)])
 def test_images_are_those_of_exact_rays(backend, tmp_path, instrument, spiral):
-    """Of a drawn camera, by rays of its own directions: 1.5e-3 of the peak, most of it by the samples in a pixel there.
+    """Of a drawn camera, by rays of its own directions: 8e-4 of the peak, some of it by the samples in a pixel there.
+
+    With the directions of the nominal camera it would be 2e-3, up to half a sigma of a bright star's focus.
 
     On a spiral, edges stop rays one by one: 4e-3 with 60 000 of them. A mirrored image would be 0.3 away.
     """
@@ -132,7 +136,7 @@ def test_images_are_those_of_exact_rays(backend, tmp_path, instrument, spiral):
     exact = independent_share(kind, 1, state, place, spiral)
     star, terms = kind.stars[1], kind.traced(bench.view(true[None], None))[0].reshape(2, -1)[1]
     found = star.image.pixels(star.image.irradiance(terms), place)
-    assert np.max(np.abs(found - exact)) < (4e-3 if spiral else 1.5e-3) * np.max(exact)
+    assert np.max(np.abs(found - exact)) < (4e-3 if spiral else 8e-4) * np.max(exact)
 
 
 @pytest.mark.second
@@ -152,14 +156,14 @@ def test_derivatives_of_an_instrument_are_those_of_its_images(backend, tmp_path)
 @pytest.mark.second
 @pytest.mark.parametrize(("instrument", "defocus"), [("gf7", "0.6 mm"), ("ritchey_chretien", "0.8 mm")])
 def test_sigmas_hold_for_some_cameras(backend, tmp_path, instrument, defocus):
-    """Four cameras on both sides of focus, by the independent path: wavefronts at nine fields and six combinations.
+    """Three cameras on both sides of focus, by the independent path: wavefronts at nine fields and six combinations.
 
     All covered shares together, of which some six a camera are independent, lie below the bound once in 1e4 times.
     """
     inside, p_values, modes = judged(star_bench(backend, tmp_path, (f"-{defocus}", defocus), instrument),
-                                     np.random.default_rng(7), 4)  # fmt: skip
+                                     np.random.default_rng(7), 3)  # fmt: skip
     for k, share in enumerate((0.68, 0.95)):
-        assert inside[:, :, k].mean() >= binom.ppf(1e-4, 24, share) / 24
+        assert inside[:, :, k].mean() >= binom.ppf(1e-4, 18, share) / 18
     assert np.all(p_values > 1e-4)
     assert np.all(modes == 1)
 
@@ -183,6 +187,72 @@ def test_one_focus_leaves_two_states_and_a_second_one_decides(backend, tmp_path)
     assert max(apart) > 10.0
     both = star_bench(backend, tmp_path, ("-0.8 mm", "0.8 mm"), "ritchey_chretien", flux=2e4)
     assert len(both.estimates(measured(both, true, rng))) == 1
+
+
+def terms_bench(backend, folder: Path, instrument: str, fields: list[list[float]], **more: object) -> AsBuiltBench:
+    """A camera whose bodies do not move, with an interferometer and unknown terms of the wavefront."""
+    (folder / "rigid.yaml").write_text(dump_yaml(RIGID))
+    data = {
+        "instrument": instrument,
+        "prior": "./rigid.yaml",
+        "wavefront": {"constant": {"Z5": "20 nm", "Z8": "30 nm"}, "linear": {"Z7": "10 nm"}},
+        "measurements": {"wavefronts": {"fizeau": {"fields": fields, "sigma": "5 nm", "focus": "0 m"}}},
+        "merits": {"wavefront": {"kind": "wavefront", "at_most": 0.0714}},
+        "draws": 20,
+        "simulate": {},
+        **more,
+    }
+    (folder / "terms.yaml").write_text(dump_yaml(data))
+    return AsBuiltBench(AsBuiltSetup.read(folder / "terms.yaml"), backend)
+
+
+@pytest.mark.second
+@pytest.mark.parametrize("instrument", ["gf7", "ritchey_chretien"])
+def test_terms_of_the_wavefront_are_those_that_are_measured(backend, tmp_path, instrument):
+    """Over each field's light, in proportion to the field; their estimate is the closed form of a linear model."""
+    fields = [[-1.0, 0.0], [0.5, 0.4], [1.0, -1.0]]
+    bench = terms_bench(backend, tmp_path, instrument, fields)
+    assert bench.parameters.labels[2:] == ("wavefront along the line Z7", "wavefront along the track Z7")
+    amounts = np.array([3e-9, -7e-9, 4e-9, 5e-9])
+    nominal, moved = bench.predict(np.stack([np.zeros(4), amounts])).reshape(2, 3, 8)
+    wanted = np.zeros((3, 8))
+    wanted[:, 1], wanted[:, 4], wanted[:, 3] = 3e-9, -7e-9, np.array(fields) @ [4e-9, 5e-9]
+    np.testing.assert_allclose(moved - nominal, wanted, atol=1e-15)
+    rng = np.random.default_rng(0)
+    true = bench.draw(rng, "normal")
+    (data,) = bench.measured(true, rng)
+    found = bench.estimate((data,))
+    table = np.zeros((3, 8, 4))
+    table[:, 1, 0], table[:, 4, 1], table[:, 3, 2:] = 1.0, 1.0, fields
+    table = table.reshape(24, 4)
+    inverse = table.T @ table / (5e-9) ** 2 + np.diag(1.0 / np.array([20e-9, 30e-9, 10e-9, 10e-9]) ** 2)
+    np.testing.assert_allclose(found.covariance, np.linalg.inv(inverse), rtol=1e-6, atol=1e-24)
+    mean = np.linalg.solve(inverse, table.T @ (data - nominal.ravel()) / (5e-9) ** 2)
+    np.testing.assert_allclose(found.mean, mean, atol=1e-13)
+
+
+@pytest.mark.second
+def test_terms_of_the_wavefront_are_found_in_images(backend, tmp_path):
+    """Of two stars on both sides of focus; neither the resulting instrument nor its covariance contains them."""
+    stars = {"fields": TWO, "read_noise": 8.0, "pixels": 28}
+    images = {side: {**stars, "defocus": defocus} for side, defocus in (("in", "-0.6 mm"), ("out", "0.6 mm"))}
+    (tmp_path / "focused.yaml").write_text(dump_yaml(PRIOR))
+    bench = terms_bench(backend, tmp_path, "gf7", TWO, measurements={"images": images}, prior="./focused.yaml")
+    run = run_asbuilt(bench.setup, backend)
+    assert run.true is not None
+    terms = slice(-4, None)
+    apart = (run.estimate.mean - run.true)[terms] / run.estimate.sigma[terms]
+    assert np.max(np.abs(apart)) < 4.0
+    assert np.all(run.estimate.sigma[terms] < 0.9 * run.estimate.prior.sigma[terms])
+    assert "wavefront" not in instrument_text(run).split("as_built", 1)[1].split("description")[0]
+    assert not set(WAVEFRONT) & {component.body for component in unknown(run)[0]}
+    assert not set(WAVEFRONT) & set(built_motions(run))
+
+
+def test_terms_that_are_no_wavefront_are_refused(backend, tmp_path):
+    for term in ("Z3", "Z46"):
+        with pytest.raises(InputError, match="not a term of a wavefront"):
+            terms_bench(backend, tmp_path, "gf7", TWO, wavefront={"constant": {term: "5 nm"}})
 
 
 def recorded(folder: Path, pages: np.ndarray, **more: object) -> Path:
@@ -215,6 +285,21 @@ def test_recorded_images_are_read_and_judged(backend, tmp_path):
     assert run.images[0].star.fitted == 4
 
 
+@pytest.mark.second
+def test_a_star_that_contradicts_the_others_is_excluded(backend, tmp_path):
+    """One of three stars has the image of another camera: it is named, and the others agree. One of two would stay."""
+    fields = [[-0.7, 0], [0, 0], [0.7, 0.5]]
+    bench = star_bench(backend, tmp_path, ("-0.6 mm",), fields=fields)
+    rng = np.random.default_rng(5)
+    true = 0.3 * bench.draw(rng, "normal")
+    (data,), (other,) = bench.measured(true, rng), bench.measured(true + 0.5 * bench.draw(rng, "normal"), rng)
+    half = 28 * 28
+    found = bench.estimate((np.concatenate([data[:half], other[half : 2 * half], data[2 * half :]]),))
+    assert [block for _, block, _ in found.excluded] == ["star (0, 0)"]
+    assert found.whole.passes()
+    assert found.whole.degrees == 2 * (half - 4)
+
+
 def test_images_that_do_not_fit_the_file_are_refused(backend, tmp_path):
     file = recorded(tmp_path, np.ones((3, 16, 16), np.float32))
     with pytest.raises(InputError, match="3 pages in the file, 2 fields"):
@@ -233,3 +318,39 @@ def test_a_pickled_file_runs_nothing(tmp_path):
     place.write_bytes(pickle.dumps([print]))
     with pytest.raises(pickle.UnpicklingError, match="print is no array"):
         star_images(place)
+
+
+@pytest.mark.second
+def test_edges_out_of_focus_determine_the_focus_with_its_sign(backend, tmp_path):
+    """A shift of the plane is that motion of its body, and best focus is as far upstream; the focus of drawn planes.
+
+    MTF of sigma 0.005 in two directions at three fields, 0.4 mm from focus: nine foci of three cameras, of which the
+    prior knows 0.08 mm, are within four sigma, of 10 um.
+    """
+    fields = [[-0.9, 0], [0, 0], [0.9, 0]]
+    edges = {"fields": fields, "sigma": 0.005, "frequency": 12.0}
+    page, zero = {"mtf": {"page": {**edges, "defocus": "0.4 mm"}}}, {"mtf": {"zero": edges}}
+    focus = {"focus": {"scan": {"fields": fields, "sigma": "1 um"}}}
+    plane = {"causes": {"plane": PRIOR["causes"]["plane"]}}
+    (tmp_path / "plane.yaml").write_text(dump_yaml({**PRIOR, **plane}))
+
+    def bench_of(measurements: dict) -> AsBuiltBench:
+        data = {"instrument": "gf7", "prior": "./plane.yaml", "measurements": measurements, "simulate": {}}
+        (tmp_path / "edges.yaml").write_text(
+            dump_yaml(data | {"merits": {"w": {"kind": "wavefront", "at_most": 0.07}}})
+        )
+        return AsBuiltBench(AsBuiltSetup.read(tmp_path / "edges.yaml"), backend)
+
+    bench, exact, paged = (bench_of(part) for part in (zero, focus, page))
+    along = [label.endswith("focal_plane shift z") for label in bench.parameters.labels].index(True)
+    shifted = 0.4e-3 * np.eye(len(bench.parameters.labels))[along : along + 1]
+    np.testing.assert_allclose(bench.predict(shifted), paged.predict(0.0 * shifted), atol=1e-9)
+    np.testing.assert_allclose(exact.predict(shifted) - exact.predict(0.0 * shifted), -0.4e-3, rtol=2e-2)
+    rng = np.random.default_rng(1)
+    for _ in range(3):
+        true = paged.draw(rng, "normal")
+        found = paged.estimate(paged.measured(true, rng))
+        apart = exact.predict(found.mean[None])[0] - exact.predict(true[None])[0]
+        sigma = np.std(exact.predict(found.draw(rng, 100)), axis=0)
+        assert np.max(np.abs(apart) / sigma) < 4.0
+        assert np.max(sigma) < 15e-6

@@ -33,7 +33,7 @@ from twin.asbuilt.measured_kinds import (
     View,
     WavefrontReadings,
 )
-from twin.asbuilt.parameters import Parameters
+from twin.asbuilt.parameters import Parameters, with_wavefront
 from twin.asbuilt.star_images import ImageReadings, StarResidual
 from twin.camera.camera_optics import CameraOptics
 from twin.camera.varied_beams import VariedBeams
@@ -119,8 +119,9 @@ class AsBuiltBench(Site):
         self.experiment = MonitorExperiment(setup.base, backend)
         self.camera = judged_camera(self.test, self.experiment.instrument)
         self.line = line_points(self.experiment.instrument, self.camera)
-        prior = self.experiment.stated
-        if prior is None or not prior.components:
+        assert self.experiment.stated is not None
+        prior = with_wavefront(self.experiment.stated, self.test.wavefront)
+        if not prior.components:
             allowed = "a disturbances file with standard deviations greater than zero, such as `assembled`"
             raise self.test.error("the prior has no motions", ("prior",), found=self.test.prior, allowed=allowed)
         self.prior: DisturbancePrior = prior

@@ -10,6 +10,8 @@ from matplotlib.figure import Figure
 from optics.numerics.number_tree import FrozenMap
 from twin.asbuilt.asbuilt_run import ALONG, AsBuiltRun, MeritPrediction, motions, moves_plain, responses
 from twin.asbuilt.built_instrument import CORRELATION, POSTERIOR, instrument_text, posterior_files
+from twin.asbuilt.measured_kinds import field_text
+from twin.asbuilt.star_images import STAR, StarResidual
 from twin.framework.artefact import (
     CameraFile,
     Cell,
@@ -92,6 +94,7 @@ def asbuilt_report(run: AsBuiltRun) -> Report:
             (
                 "`instrument.yaml` is the instrument as built, which every command accepts; `posterior.yaml` beside it "
                 "is the posterior covariance as a disturbances file.",
+                *(("Terms of the wavefront are in neither: no body has them.",) if run.setup.test.wavefront else ()),
             ),
             (CameraFile("instrument", "Instrument", "", instrument_text(run)), *_posterior(run)),
             closed=True,
@@ -271,44 +274,23 @@ def _measured_table(run: AsBuiltRun) -> Table:
     return Table("measurements", "Consistency of the measurements", caption, heads, rows, decimals)
 
 
-_MOST_STARS = 12
-"""Largest number of stars in the figure."""
+_MOST_STARS, _FEW_STARS = 12, 4
+"""Largest number of stars in the figure, and number up to which each has a row of its own."""
 
 
 def _image_sections(run: AsBuiltRun) -> tuple[Section, ...]:
     if not run.images:
         return ()
+    images = sorted(run.images, key=lambda image: image.test.p_value)[:_MOST_STARS]
+    shown = [image for image in run.images if image in images]
     with look("asbuilt"):
-        figure = to_svg(_image_figure(run))
-    rows: list[list[Cell]] = [
-        [
-            image.measurement,
-            *image.field,
-            image.fit.flux,
-            image.fit.background,
-            image.seeing_px,
-            100.0 * image.outside,
-            image.chi_square_per_degree,
-            image.test.p_value,
-        ]
-        for image in run.images
-    ]
-    heads = (
-        "measurement",
-        "x",
-        "y",
-        "flux [e-]",
-        "background [e-]",
-        "seeing [px]",
-        "outside [%]",
-        "chi-square / degree",
-        "p",
-    )
-    caption = (
-        "Field as shares of the half field; seeing: full width at half maximum; outside: light beyond the cut-out."
-    )
-    table = Table("star_images", "Stars", caption, heads, rows, (None, 2, 2, 0, 1, 2, 2, 3, 4))
+        figure = to_svg(_image_figure(shown))
+    stars = {f"{image.measurement} {field_text(image.field)}": STAR(image) for image in run.images}
+    caption = "Outside: light beyond the cut-out; seeing: full width at half maximum; p: as for the measurements."
+    table = STAR.table("star_images", "Stars", caption, stars, STAR.headed, "star")
     text = "Images of stars, the prediction in the estimated state, and their difference in standard deviations."
+    if len(shown) < len(run.images):
+        text += f" Shown are the {len(shown)} of {len(run.images)} stars that fit worst."
     return (
         Section(
             "Images of stars", (text,), (SvgFigure("stars", "Images and residuals", "", figure), table), name="stars"
@@ -316,25 +298,29 @@ def _image_sections(run: AsBuiltRun) -> tuple[Section, ...]:
     )
 
 
-def _image_figure(run: AsBuiltRun) -> Figure:
-    images = run.images[:_MOST_STARS]
-    figure = new_figure(3.4)
-    axes = figure.subplots(3, len(images), squeeze=False)
-    for column, image in zip(axes.T, images, strict=True):
+def _image_figure(images: Sequence[StarResidual]) -> Figure:
+    few = len(images) <= _FEW_STARS
+    figure = new_figure(2.1 * len(images) if few else 3.4)
+    axes = figure.subplots(*((len(images), 3) if few else (3, len(images))), squeeze=False)
+    for panels, image in zip(axes if few else axes.T, images, strict=True):
         counts = image.star.counts
         assert counts is not None
         low, high = float(np.min(image.fit.model)), float(np.max(image.fit.model))
         for ax, values, limits, colours in (
-            (column[0], counts, (low, high), "viridis"),
-            (column[1], image.fit.model, (low, high), "viridis"),
-            (column[2], image.pulls, (-4.0, 4.0), "RdBu_r"),
+            (panels[0], counts, (low, high), "viridis"),
+            (panels[1], image.fit.model, (low, high), "viridis"),
+            (panels[2], image.pulls, (-4.0, 4.0), "RdBu_r"),
         ):
             ax.imshow(values, cmap=colours, vmin=limits[0], vmax=limits[1], origin="lower")
             ax.set(xticks=[], yticks=[])
-        column[0].set_title(f"{image.measurement}\n({image.field[0]:g}, {image.field[1]:g})", fontsize=6)
-    for ax, text in zip(axes[:, 0], ("measured", "predicted", "residual, \u00b14 \u03c3"), strict=True):
-        ax.set_ylabel(text, fontsize=7)
+        name = f"{image.measurement}\n({image.field[0]:g}, {image.field[1]:g})"
+        (panels[0].set_ylabel if few else panels[0].set_title)(name, fontsize=8 if few else 6)
+    for ax, name in zip(axes[0] if few else axes[:, 0], _PANELS, strict=True):
+        (ax.set_title if few else ax.set_ylabel)(name, fontsize=8)
     return figure
+
+
+_PANELS = ("measured", "predicted", "residual, \u00b14 \u03c3")
 
 
 def _move_sections(run: AsBuiltRun) -> tuple[Section, ...]:

@@ -21,7 +21,7 @@ from scenes.specs.asbuilt import AsBuiltSetup
 from scenes.specs.tolerance import MeritSpec, amount_text
 from twin.asbuilt.asbuilt_bench import AsBuiltBench, nan_where_lost, selected_moves
 from twin.asbuilt.next_step import Advice, advice
-from twin.asbuilt.star_images import StarResidual
+from twin.asbuilt.star_images import STAR, StarResidual
 from twin.framework.memory import Lowered, require_memory
 from twin.framework.procedure import Advance, silent
 from twin.framework.random_streams import stream
@@ -438,10 +438,6 @@ def responses(run: AsBuiltRun) -> dict[str, Any] | None:
     }
 
 
-def _images_plain(run: AsBuiltRun) -> list[dict[str, Any]] | None:
-    return [image.plain() for image in run.images] or None
-
-
 def _modes_plain(run: AsBuiltRun) -> list[dict[str, Any]] | None:
     if len(run.modes) < 2:
         return None
@@ -469,7 +465,7 @@ ASBUILT: Record[AsBuiltRun] = Record(
     ),
     Quantity("next_move", _advice_plain, "recommended move of the actuators", where_known=True),
     Quantity("responses", responses, "of the actuators, relative to the traced ones", where_known=True),
-    Quantity("images", _images_plain, "of stars, with what is estimated for each", where_known=True),
+    Quantity("images", lambda run: run.images or None, "of stars", record=STAR, where_known=True),
     Quantity("modes", _modes_plain, "states that explain the measurements, the most probable first", where_known=True),
     Quantity("steps", lambda run: run.estimate.steps, "Gauss-Newton steps"),
     Quantity("settled", lambda run: run.estimate.settled, "change of the readings by the last step, in sigmas"),

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from optics.geometry.tree import Motion
+from optics.geometry.tree import WAVEFRONT, Motion
 from scenes.models.disturbances import HEAT, Component, joint_disturbances, joint_files
 from scenes.specs.instrument import as_built_file
 from scenes.specs.load import CAMERAS, INSTRUMENTS, is_path, library_names
@@ -26,7 +26,8 @@ def built_motions(run: AsBuiltRun) -> Mapping[str, Motion]:
     for k, component in enumerate(run.bench.parameters.components):
         if component.kind in HEAT:
             values[k] = 0.0
-    return run.bench.parameters.states(values[None], run.bench.last)[0]
+    state = run.bench.parameters.states(values[None], run.bench.last)[0]
+    return {body: motion for body, motion in state.items() if body not in WAVEFRONT}
 
 
 def instrument_text(run: AsBuiltRun) -> str:
@@ -50,14 +51,15 @@ def instrument_text(run: AsBuiltRun) -> str:
 def unknown(run: AsBuiltRun) -> tuple[list[Component], np.ndarray]:
     """Return the C uncertain components of bodies' motions and their posterior covariance (C, C), SI units.
 
-    Thermal components are omitted. Errors of actuator moves are added to the components of the bodies that were moved.
+    Thermal components and terms of the wavefront are omitted. Errors of actuator moves are added to the components of
+    the bodies that were moved.
     """
     parameters, estimate = run.bench.parameters, run.estimate
-    components = [component for component in parameters.components if component.kind not in HEAT]
+    components = [c for c in parameters.components if c.kind not in HEAT and c.body not in WAVEFRONT]
     indices = {(component.body, component.kind, component.axis): k for k, component in enumerate(components)}
     rows: dict[int, np.ndarray] = {}
     for k, component in enumerate(parameters.components):
-        if component.kind not in HEAT:
+        if component in components:
             rows[indices[component.body, component.kind, component.axis]] = np.eye(len(estimate.mean))[k]
     tree = run.bench.experiment.instrument.assembly.tree
 

@@ -19,10 +19,12 @@ import numpy as np
 
 from analysis.arrays import ARCSEC
 from analysis.instrument_state.state_estimate import MeasuredGroup
-from optics.geometry.tree import State
+from optics.geometry.tree import Motion, State, compose_each
 from optics.numerics.array_math import PhysicalError
 from optics.raytrace.first_order import line_tangents
+from scenes.models.camera_model import focal_plane_body
 from scenes.specs import asbuilt as specs
+from scenes.specs.instrument import BASE
 from scenes.specs.perturbation import find_node
 from scenes.specs.tolerance import MeritSpec
 from scenes.yaml.errors import InputError, Problem
@@ -330,6 +332,7 @@ class MtfReadings(MeasuredKind):
         spec = self.spec
         asked = MeritSpec(kind="mtf", fields=spec.fields, frequency=spec.frequency, at_least=0.0)
         self.tried = self.site.bench({self.name: asked})
+        self.plane = focal_plane_body(f"{BASE}/{self.site.camera}")
         self.labels = tuple(
             f"{field_text(field)} {direction}" for field in spec.fields for direction in ("line", "track")
         )
@@ -337,7 +340,12 @@ class MtfReadings(MeasuredKind):
 
     def predict(self, view: View) -> np.ndarray:
         """Return the MTF of each field and direction in every state."""
-        return self.tried.parts_of(view.states)
+        if not self.spec.defocus:
+            return self.tried.parts_of(view.states)
+        instrument = self.site.experiment.instrument
+        bodies = {body.path: body for body in instrument.assembly.tree.bodies}
+        shift = {self.plane: Motion(shift=(0.0, 0.0, self.spec.defocus))}
+        return self.tried.parts_of(compose_each([(state, shift) for state in view.states], bodies))
 
     def read(self) -> np.ndarray:
         """Return the MTF values in the test's file."""

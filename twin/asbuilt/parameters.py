@@ -8,18 +8,21 @@ each move. The state at a time is the sum of the components and of all moves unt
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.linalg import block_diag
 
 from analysis.instrument_state.state_estimate import StatePrior
-from optics.geometry.tree import State
+from optics.geometry.tree import WAVEFRONT, State
 from optics.numerics.number_tree import FrozenMap
 from optics.thermal.heat import Temperature
 from scenes.models.disturbances import HEAT, Component, DisturbancePrior
 from scenes.models.instrument_model import Instrument
 from scenes.models.thermal_model import ThermalModel
-from scenes.specs.asbuilt import AsBuiltSpec
+from scenes.specs.asbuilt import AsBuiltSpec, WavefrontPriorSpec
+from scenes.specs.course import noll
+from scenes.specs.disturbances import TimeLawSpec
 from scenes.specs.perturbation import short_name
 from scenes.specs.tolerance import amount_si
 from twin.tolerance.variations import BodyMove, ParameterMaker, VariedParameter, heat_moves, states_of
@@ -96,7 +99,7 @@ class Parameters:
         gains = tuple(k for k, entry in enumerate(test.actuators.values()) if entry.response > 0.0)
         return cls(
             prior,
-            tuple(f"{short_name(entry.body, instrument.nodes)} {entry.what}" for entry in prior.components),
+            tuple(_words(entry, instrument) for entry in prior.components),
             component_parameters(prior.components, instrument, thermal),
             actuators,
             names,
@@ -192,6 +195,27 @@ class Parameters:
         return out
 
 
+def with_wavefront(prior: DisturbancePrior, spec: WavefrontPriorSpec | None) -> DisturbancePrior:
+    """Return a prior with the Zernike terms of the wavefront at the exit pupil as further components."""
+    if spec is None:
+        return prior
+    parts = zip(WAVEFRONT, (spec.constant, spec.linear, spec.linear), strict=True)
+    terms = tuple(
+        Component("wavefront", key, "figure", noll(term), "origin", sigma)
+        for key, sigmas in parts
+        for term, sigma in sigmas.items()
+    )
+    laws = (*prior.laws, *[TimeLawSpec(kind="constant")] * len(terms))
+    correlation = block_diag(prior.correlation, np.eye(len(terms)))
+    return replace(prior, components=(*prior.components, *terms), correlation=correlation, laws=laws)
+
+
+def _words(component: Component, instrument: Instrument) -> str:
+    if component.body in WAVEFRONT:
+        return f"{component.body} Z{component.axis}"
+    return f"{short_name(component.body, instrument.nodes)} {component.what}"
+
+
 def _upward(path: str) -> list[str]:
     parts = path.split("/")
     return ["/".join(parts[:n]) for n in range(len(parts), 0, -1)]
@@ -222,6 +246,8 @@ def _does(
 ) -> FrozenMap[str, BodyMove]:
     if component.kind in HEAT:
         return heat_moves(thermal, instrument, component.body, component.kind, component.axis, component.sigma, warm)
+    if component.kind == "figure":
+        return FrozenMap({component.body: BodyMove(figure=FrozenMap({component.axis: 1.0}))})
     axis = np.eye(3)[component.axis] if component.kind in ("shift", "rotate") else np.zeros(3)
     about = np.array(instrument.assembly.tree[component.body].pivots[component.pivot])
     match component.kind:
@@ -229,8 +255,6 @@ def _does(
             move = BodyMove(shift=axis)
         case "rotate":
             move = BodyMove(rotate=axis, pivot=about)
-        case "figure":
-            move = BodyMove(figure=FrozenMap({component.axis: 1.0}))
         case "scale":
             move = BodyMove(shift=-about, shape=FrozenMap({"scale": 1.0}))
         case kind:

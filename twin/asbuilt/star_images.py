@@ -6,7 +6,6 @@ import copy
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 
@@ -21,7 +20,8 @@ from optics.waves.star_image import StarImage, StarPupil
 from scenes.specs import asbuilt as specs
 from twin.asbuilt.measured_kinds import MeasuredKind, View, field_text
 from twin.asbuilt.star_readings import FWHM, StarFit, StarReading, centroid
-from twin.camera.varied_beams import VariedBeams
+from twin.camera.varied_beams import BeamLight, VariedBeams
+from twin.framework.record import Quantity, Record
 
 TYPICAL_SEEING = 1.5
 """Full width at half maximum of the seeing of simulated stars whose seeing the estimate does not know, pixels."""
@@ -88,13 +88,14 @@ class ImageReadings(MeasuredKind):
         self.rows = []
         for number, pupil in enumerate(self.pupils):
             u, v = (self.beams.cosines[0, number] - self.beams.designed.chiefs[0, number, 1::-1]).T
-            self.rows.append(pupil.terms(u, v, self.beams.nodes.weight, self.beams.degree))
+            self.rows.append(pupil.terms_of_slopes(u, v, self.beams.nodes.weight, self.beams.degree))
+        self.along = [matrix @ self.beams.solve for matrix in slopes(self.beams.nodes, self.beams.degree)]
         self.stars = tuple(self._expected(number, typical) for number in range(len(self.pupils)))
         rows, columns = self.shape
         self.labels = tuple(
             f"{field_text(field)} pixel {r} {c}" for field in spec.fields for r in range(rows) for c in range(columns)
         )
-        self.blocks = ("all stars",) * len(self.labels)
+        self.blocks = tuple(f"star {field_text(field)}" for field in spec.fields for _ in range(rows * columns))
 
     def _expected(self, number: int, blur: float) -> StarReading:
         """Return the image of a star before the measurement, as the nominal camera makes it."""
@@ -103,14 +104,21 @@ class ImageReadings(MeasuredKind):
         image = StarImage(self.pupils[number], self.beams.degree, self.shape, self.pitch, blur=most)
         first = StarFit(np.zeros(2), blur, spec.flux, spec.background, np.zeros(self.shape), np.zeros((0, 0)))
         star = StarReading(image, self.blur, first, None, np.ones(self.shape))
-        return star.with_noise(
-            star.predict(self._terms(self.beams.designed.eikonals)[0, number]).model, spec.read_noise
-        )
+        return star.with_noise(star.predict(self._terms(self.beams.designed)[0, number]).model, spec.read_noise)
 
-    def _terms(self, eikonals: np.ndarray) -> np.ndarray:
-        """Return the coefficients of the eikonals of F fields, (S, F, T), for those at N nodes, (S, F, N)."""
-        eikonals = eikonals + self.spec.defocus * self.beams.defocus
-        return np.stack([eikonals[:, f] @ rows.T for f, rows in enumerate(self.rows)], axis=1)
+    def _terms(self, light: BeamLight) -> np.ndarray:
+        """Return the coefficients of eikonals over the nominal directions, (S, F, T), that have the rays' intercepts.
+
+        A state changes the directions of its rays. The derivatives of its eikonal with respect to its own directions
+        are the intercepts of its rays with the focal plane; an eikonal over the nominal directions with the same
+        intercepts has the same image up to the second order of the change.
+        """
+        leading = np.einsum("sfni,sfi->sfn", light.directions, light.chiefs) - 1.0
+        paths = light.eikonals + self.spec.defocus * leading
+        slope = np.stack([paths @ matrix.T for matrix in self.along], axis=-1)
+        cosines = np.stack([matrix @ light.directions[..., 1::-1] for matrix in self.along], axis=-2)
+        intercepts = np.linalg.solve(cosines, slope[..., None])[..., 0].reshape(*paths.shape[:2], -1)
+        return np.stack([intercepts[:, f] @ rows.T for f, rows in enumerate(self.rows)], axis=1)
 
     @property
     def traced_count(self) -> int:
@@ -119,7 +127,7 @@ class ImageReadings(MeasuredKind):
 
     def traced(self, view: View) -> np.ndarray:
         """Return the wavefront coefficients of all stars in every state, metres."""
-        return self._terms(self.beams.light(view.states).eikonals).reshape(len(view.states), -1)
+        return self._terms(self.beams.light(view.states)).reshape(len(view.states), -1)
 
     @one_blas_thread()
     def fits(self, view: View) -> list[StarFit]:
@@ -150,8 +158,8 @@ class ImageReadings(MeasuredKind):
         return np.concatenate([star.variance.ravel() for star in self.stars])
 
     def group(self, values: np.ndarray) -> MeasuredGroup:
-        """Return the measurement as the estimate needs it, with the number of quantities fitted to every star."""
-        return replace(super().group(values), fitted=sum(star.fitted for star in self.stars))
+        """Return the measurement as the estimate needs it, with the number of quantities fitted to each star."""
+        return replace(super().group(values), fitted=self.stars[0].fitted)
 
     def about(self, values: np.ndarray) -> ImageReadings:
         """Return the measurement with recorded images, with a noise for steps from a distant state.
@@ -268,21 +276,6 @@ class StarResidual:
         """Chi-square of the image per degree of freedom."""
         return self.test.chi_square / max(1, self.test.degrees)
 
-    def plain(self) -> dict[str, Any]:
-        """Return the numbers of the star as plain data."""
-        return {
-            "measurement": self.measurement,
-            "field": list(self.field),
-            "row_px": float(self.fit.position[0]),
-            "column_px": float(self.fit.position[1]),
-            "flux_e": self.fit.flux,
-            "background_e": self.fit.background,
-            "seeing_px": self.seeing_px,
-            "outside": self.outside,
-            "chi_square": self.test.chi_square,
-            "degrees": self.test.degrees,
-        }
-
     def warnings(self) -> list[str]:
         """Return warnings on a star that fits badly, is cut or is saturated."""
         out, name = [], f"{self.measurement}: the star at {field_text(self.field)}"
@@ -298,3 +291,20 @@ class StarResidual:
         if lost:
             out.append(f"{name} has {lost} saturated pixels, which are not used")
         return out
+
+
+STAR: Record[StarResidual] = Record(
+    "Image of a star, with what is estimated for it.",
+    Quantity("measurement", lambda star: star.measurement, "name of the measurement"),
+    Quantity("field", lambda star: list(star.field), "as fractions of the half field"),
+    Quantity("row_px", lambda star: star.fit.position[0], "from the middle of the cut-out", head="row", decimals=2),
+    Quantity("column_px", lambda star: star.fit.position[1], "from its middle", head="column", decimals=2),
+    Quantity("flux_e", lambda star: star.fit.flux, "light of the whole star", head="flux [e-]", decimals=0),
+    Quantity("background_e", lambda star: star.fit.background, "in a pixel", head="background [e-]", decimals=1),
+    Quantity("seeing_px", lambda star: star.seeing_px, "full width at half maximum", head="seeing", decimals=2),
+    Quantity("outside", lambda star: star.outside, "share beyond the cut-out", head="outside", shown="percent"),
+    Quantity("chi_square", lambda star: star.test.chi_square, "of its pixels", head="chi-square", decimals=1),
+    Quantity("degrees", lambda star: star.test.degrees, "degrees of freedom", head="degrees"),
+    Quantity("p_value", lambda star: star.test.p_value, "of the chi-square", head="p", decimals=4),
+)
+"""Numbers of a star in asbuilt.json and in the report."""

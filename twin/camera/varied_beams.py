@@ -12,8 +12,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from optics.geometry import zernike
 from optics.geometry.polygon import area
-from optics.geometry.tree import PlacedBodies, State
+from optics.geometry.tree import WAVEFRONT, PlacedBodies, State
 from optics.numerics import quadrature
 from optics.numerics.array_math import UnphysicalError
 from optics.numerics.backend import one_blas_thread
@@ -68,12 +69,15 @@ class BeamLight(NamedTuple):
         Directions of the chief rays.
     aimed : (S, K, F, 1 + N, 3) ndarray
         Starting points of the rays in the world frame, metres.
+    directions : (S, F, K N, 3) ndarray
+        Directions of the rays.
     """
 
     paths: np.ndarray
     eikonals: np.ndarray
     chiefs: np.ndarray
     aimed: np.ndarray
+    directions: np.ndarray
 
 
 class VariedBeams:
@@ -138,6 +142,7 @@ class VariedBeams:
         self.shares = np.full(len(traced), 1.0 / len(traced)) if shares is None else shares
         self._glass = [glass_steps(optics.model.spec, optics.path.root, float(colour)) for colour in traced]
         self.radius = float(optics.model.first_order.exit_pupil_distance[0])
+        self._values: dict[int, np.ndarray] = {}
         self._planes = planes and bool(np.isfinite(self.radius))
         self._prepare()
 
@@ -267,7 +272,8 @@ class VariedBeams:
         paths = self._to_sphere(position, direction, path, self.radius)
         eikonals = self._to_sphere(position, direction, path, np.inf) if self._planes else paths
         chiefs = np.einsum("k,skfx->sfx", self.shares, direction[:, :, :, 0])
-        return BeamLight(paths, eikonals, np.asarray(chiefs), aimed)
+        rays = np.moveaxis(direction[:, :, :, 1:], 1, 2).reshape(len(direction), len(self.fields), -1, 3)
+        return BeamLight(paths, eikonals, np.asarray(chiefs), aimed, rays)
 
     @one_blas_thread()
     def light(self, states: Sequence[State], aimed: np.ndarray | None = None) -> BeamLight:
@@ -292,7 +298,35 @@ class VariedBeams:
             if not traced[3].all():
                 raise BeamMissedError("the edge of a surface blocks light of a field")
             parts.append(self._light(traced, starts))
-        return BeamLight(*(np.concatenate(starts) for starts in zip(*parts, strict=True)))
+        light = BeamLight(*(np.concatenate(starts) for starts in zip(*parts, strict=True)))
+        added = self._added(states)
+        return light if added is None else light._replace(paths=light.paths + added, eikonals=light.eikonals + added)
+
+    def _added(self, states: Sequence[State]) -> np.ndarray | None:
+        """Return the optical paths of the Zernike terms in states, (S, F, K N), metres; None without such terms."""
+        entries = [
+            (s, k, j - 1, amount)
+            for s, state in enumerate(states)
+            for k, key in enumerate(WAVEFRONT)
+            if key in state
+            for j, amount in state[key].figure.items()
+        ]
+        if not entries:
+            return None
+        *indices, values = map(np.array, zip(*entries, strict=True))
+        amounts = np.zeros((len(states), len(WAVEFRONT), 1 + max(indices[2])))
+        amounts[tuple(indices)] = values
+        share = np.concatenate([np.ones((len(self.fields), 1)), self.fields], axis=1)
+        paths = -np.einsum("fk,skj,fjn->sfn", share, amounts, self._zernike_values(amounts.shape[2]))
+        return np.tile(paths, len(self._glass))
+
+    def _zernike_values(self, last: int) -> np.ndarray:
+        """Return the values of the orthonormal terms of ``zernike_rows`` at the N nodes, (F, last, N)."""
+        if last not in self._values:
+            basis = zernike.basis(last, self.nodes.x, self.nodes.y).T
+            roots = [orthonormal_rows(*light, last)[1] for light in self.illuminated_nodes()]
+            self._values[last] = np.stack([np.linalg.solve(root, basis) for root in roots])
+        return self._values[last]
 
     @property
     def free(self) -> bool:

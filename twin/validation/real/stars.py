@@ -3,34 +3,56 @@
 from __future__ import annotations
 
 import pickle
+import tempfile
 from collections.abc import Iterator
 from importlib.metadata import PackageNotFoundError, files
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from astropy.io import fits
 from matplotlib.figure import Figure
 
-from analysis.instrument_state.state_estimate import MeasuredGroup, StateEstimate, StatePrior, estimate_state
-from optics.numerics.quadrature import disk
-from optics.waves.imaging import orthonormal_rows
-from optics.waves.star_image import StarImage, StarPupil
-from twin.asbuilt.star_readings import FWHM, StarFit, StarReading
+from analysis.arrays import ARCSEC
+from optics.numerics.backend import Backend
+from scenes.specs.asbuilt import AsBuiltSetup
+from scenes.yaml.yaml_file import dump_yaml
+from twin.asbuilt.asbuilt_bench import AsBuiltBench
+from twin.asbuilt.star_images import StarResidual
+from twin.asbuilt.star_readings import StarFit
 from twin.validation.check import CheckResult
 from twin.validation.group import Context, drawing, group_of, load_printed
 from twin.validation.row_names import REAL, matches
 
 FILE = "danish/AuxTelTestDonuts.pkl"
 """File in the folder of measured data; the wheel of danish has it as tests/data/AuxTelTestDonuts.pkl."""
-RADIUS, HOLE, FOCAL, PITCH = 0.6, 0.2115, 20.8, 10e-6
-"""Radii of the pupil, focal length and pitch of the pixels, metres, as in danish's tests of this telescope."""
-WAVELENGTH = 1.4e-6
-"""Wavelength of the model, metres: twice the real one, since a seeing of ten times the diffraction leaves only rays."""
-BINNING, NOISE = 3, 300.0
-"""Pixels that are added along each axis, and standard deviation of their sum, electrons: the error of the model."""
+BINNING, PITCH, FOCAL = 3, 30e-6, 20.8
+"""Pixels that are added along each axis, their pitch together and the focal length, metres, as in ``auxtel.yaml``."""
+NOISE = 3e3
+"""Standard deviation of a pixel, electrons: far above shot noise, so that weights are even as danish's, and below the
+model's error, so that sigmas grow to it.
+"""
 TERMS = tuple(range(4, 12))
-START, SIGMAS = 3.2e-6, (1e-6, *[3e-7] * 7)
-"""Defocus at which the fit starts, and standard deviations of the prior of all terms, metres."""
+ESTIMATE: dict[str, Any] = {
+    "instrument": str(Path(__file__).parent / "auxtel.yaml"),
+    "prior": "./rigid.yaml",
+    "wavefront": {"constant": {f"Z{j}": "1 um" if j == TERMS[0] else "300 nm" for j in TERMS}},
+    "measurements": {
+        "images": {
+            "star": {
+                "fields": [[0, 0]], "file": "star.fits", "defocus": "30.4 mm", "seeing": "free", "read_noise": NOISE,
+            }
+        }
+    },
+    "merits": {"wavefront": {"kind": "wavefront", "at_most": 10}},
+}  # fmt: skip
+"""Estimate of one image; the defocus is that of the 3.2 um at which danish's fit starts."""
+RIGID = {
+    "name": "rigid",
+    "description": "A telescope whose bodies do not move.",
+    "causes": {"none": {"bodies": "base/*/M2", "shift": "0 um", "time": "constant", "reason": "terms alone"}},
+}
+"""Prior without motions."""
 
 
 class _Arrays(pickle.Unpickler):
@@ -63,39 +85,27 @@ def star_images(path: Path) -> list[np.ndarray]:
     return [np.asarray(page, float).reshape(size, BINNING, size, BINNING).sum(axis=(1, 3)) for page in pages]
 
 
-def fitted(counts: np.ndarray) -> tuple[StateEstimate, StarReading, StarFit]:
-    """Return annular Zernike terms of a star's wavefront, metres, and the image that they predict."""
-    nodes, aperture = disk(60, 240, inner=HOLE / RADIUS), RADIUS / FOCAL
-    element = nodes.weight * aperture**2
-    pupil = StarPupil(aperture * nodes.x, aperture * nodes.y, element / np.sqrt(np.sum(element)), WAVELENGTH)
-    annular = orthonormal_rows(nodes.x, nodes.y, nodes.weight, TERMS[-1])[0][TERMS[0] - 1 :] / nodes.share
-    terms = annular @ pupil.terms(pupil.u, pupil.v, nodes.weight, 6).T
-    blur = 10.0 * PITCH
-    image = StarImage(pupil, 6, counts.shape, BINNING * PITCH, blur=1.5 * blur)
-    none = np.zeros((0, 0))
-    variance = np.full(counts.shape, NOISE**2)
-    star = StarReading(image, None, StarFit(np.zeros(2), blur, 0.0, 0.0, none, none), counts, variance)
-    mean = np.zeros(len(TERMS))
-    mean[0] = START
-    prior = StatePrior.of([f"Z{j}" for j in TERMS], np.diag(SIGMAS) ** 2, mean)
-    names = ("star",) * counts.size
-    group = MeasuredGroup(
-        "star", "images", names, counts.ravel(), variance.ravel(), np.zeros((counts.size, 0)), np.zeros(0), names,
-        star.fitted,
-    )  # fmt: skip
-
-    def predict(states: np.ndarray) -> np.ndarray:
-        return np.stack([star.predict(state @ terms).model.ravel() for state in states])
-
-    estimate = estimate_state(prior, [group], predict, lambda state: star.slope(state @ terms, terms))
-    return estimate, star, star.predict(estimate.mean @ terms)
+def fitted(counts: np.ndarray, backend: Backend) -> tuple[np.ndarray, np.ndarray, StarResidual]:
+    """Return annular Zernike terms of a star's wavefront and their sigmas, metres, (T,), and the image they predict."""
+    with tempfile.TemporaryDirectory() as folder:
+        fits.PrimaryHDU(counts[None]).writeto(Path(folder) / "star.fits")
+        for name, content in (("rigid", RIGID), ("estimate", ESTIMATE)):
+            (Path(folder) / f"{name}.yaml").write_text(dump_yaml(content))
+        bench = AsBuiltBench(AsBuiltSetup.read(Path(folder) / "estimate.yaml"), backend)
+        data = bench.data()
+        state = bench.estimate(data)
+        (star,) = bench.star_images(data, state)
+    beams, defocus = bench.kinds[0].beams, bench.kinds[0].spec.defocus  # type: ignore[attr-defined]
+    paths = beams.light(bench.view(state.mean[None], None).states).paths[0, 0] + defocus * beams.defocus[0]
+    values = beams.zernike_rows(TERMS[-1])[0, TERMS[0] - 1 :] @ paths
+    return values, state.sigma * np.sqrt(state.variance_factor), star
 
 
 @drawing("real-stars", 3.6)
-def stars_svg(figure: Figure, images: list[np.ndarray], fits: list[StarFit]) -> None:
+def stars_svg(figure: Figure, images: list[np.ndarray], stars: list[StarFit]) -> None:
     """Draw the images, the fitted ones and the differences."""
     axes = figure.subplots(len(images), 3)
-    for row, counts, fit in zip(axes, images, fits, strict=True):
+    for row, counts, fit in zip(axes, images, stars, strict=True):
         peak = float(np.max(counts))
         shown = ((counts, 0.0, peak, "viridis"), (fit.model, 0.0, peak, "viridis"))
         for ax, (values, low, high, colours) in zip(
@@ -119,21 +129,20 @@ def run(context: Context) -> Iterator[CheckResult]:
         )
         return
     other = load_printed(REAL).content.data["danish"]
-    images, fits, worst = star_images(path), [], []
+    images, stars, worst = star_images(path), [], []
     for name, counts in zip(("first", "second"), images, strict=True):
-        estimate, _, fit = fitted(counts)
-        fits.append(fit)
-        values, theirs = 1e9 * estimate.mean, np.array(other[name])
-        sigma = 1e9 * estimate.sigma * np.sqrt(estimate.variance_factor)
+        *terms, star = fitted(counts, context.backend)
+        stars.append(star.fit)
+        (values, sigma), theirs = (1e9 * part for part in terms), np.array(other[name])
         apart = np.abs(values - theirs)
         worst.append((float(apart[0]), float(sigma[0])))
         k = 1 + int(np.argmax(apart[1:-1]))
         yield context.row(
             f"real.stars.{name}", float(apart[k]), float(sigma[k]), 0.0, values=values, other=theirs,
-            seeing=FWHM * fit.blur / FOCAL * 206264.8,
+            seeing=star.seeing_px * PITCH / FOCAL / ARCSEC,
         )  # fmt: skip
     yield context.row("real.stars.defocus", *max(worst), 0.0)
-    context.figure("stars", stars_svg(images, fits))
+    context.figure("stars", stars_svg(images, stars))
 
 
 GROUP = group_of("real.stars", run)
