@@ -16,7 +16,7 @@ from analysis.orbit.rational_polynomial import RationalPolynomial
 from scenes.specs.procedures import PROCEDURES
 from scenes.yaml.errors import InputError
 from tests.twin.commands import invoke
-from tests.twin.rational_bench import HALF, SIDE, Bench, bench, polynomial
+from tests.twin.rational_bench import HALF, LOOKS, SIDE, Bench, bench, polynomial
 from twin.framework.artefact import Table
 from twin.framework.data_files import FrameFacts, tiff
 from twin.framework.procedure import BenchError
@@ -328,3 +328,24 @@ def test_points_of_another_image_are_named(tmp_path: Path) -> None:
     one.places["third"][:, 1:] += 40.0 * HALF
     with pytest.raises(BenchError, match="or half an image, from the directions of their images"):
         adjusted(one.write(tmp_path, {"shift": [5.0, 5.0]}, 3))
+
+
+@pytest.mark.second
+def test_images_are_projected_once_for_each_state(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The cost of a large block is the number of projections of an image: those of one state serve all that needs them,
+    however many images there are; and pieces that bound the memory change nothing."""
+    calls: list[int] = []
+    seen = PolynomialImage.seen
+    monkeypatch.setattr(
+        PolynomialImage, "seen", lambda image, ground: (calls.append(len(ground)), seen(image, ground))[1]
+    )
+    file = bench(SIGMA).write(tmp_path, ERRORS, 4)
+    run = adjusted(file)
+    # 45 for start, steps of the adjustments with and without each sensor, and residuals; 55 if none were kept
+    once = len(calls) / len(LOOKS)
+    assert once <= 46
+    monkeypatch.setattr("analysis.block.point_reduction._AT_ONCE", 300)
+    pieces = adjusted(file)
+    assert len(calls) / len(LOOKS) > 2.5 * once
+    assert np.allclose(pieces.adjustment.x, run.adjustment.x, rtol=0.0, atol=1e-12)
+    assert pieces.rejected == run.rejected
