@@ -25,7 +25,7 @@ from twin.orbit.block.rational_block import IMAGE_POINTS
 from twin.orbit.export.rational_polynomial import PolynomialImage
 from twin.orbit.flight.earth import Earth
 from twin.orbit.images.simulate_run import MATCHED
-from twin.orbit.matching.surface import Surface, _fused, surface
+from twin.orbit.matching.surface import Surface, _displacements, _fused, _ranges, surface
 
 MATCH, ADJUST = PROCEDURES["orbit match"], PROCEDURES["orbit adjust"]
 SIDE = 360
@@ -321,3 +321,20 @@ def test_the_command_exports_and_shows_the_surface(folder: Path) -> None:
     report = MATCH.report(found)
     assert "Surface" in [section.title for section in report.sections]
     assert any("correct them by `twin.orbit adjust` first" in text for text in report.warnings)
+
+
+@pytest.mark.second
+def test_displacements_of_a_photographed_scene() -> None:
+    """Stereo pair with measured disparities of scikit-image (Middlebury 2014, motorcycle): a near
+    scene, most of whose depth lies in steps; nothing is chosen on it."""
+    left, right, truth = pytest.importorskip("skimage.data").stereo_motorcycle()
+    first, second = (one[..., :3] @ [0.2125, 0.7154, 0.0721] for one in (left, right))
+    found = _displacements(first, second, 72)
+    seen = np.isfinite(found) & np.isfinite(truth)
+    wrong, sigma = (found - truth)[seen], np.hypot(0.25, 0.25 * _ranges(found)[seen])
+    assert seen.sum() > 0.8 * np.isfinite(truth).sum()
+    # 0.21 px, where the default sigma is 0.25 px
+    assert 1.4826 * np.median(np.abs(wrong - np.median(wrong))) < 0.25
+    assert abs(np.median(wrong)) < 0.15
+    # 3.0 % beyond four sigma: spokes, cables and bare walls, on which windows of 5 pixels see another depth
+    assert np.mean(np.abs(wrong) > 4.0 * sigma) < 0.04
