@@ -550,7 +550,9 @@ def _solved(
         state = replace(state, x=state.x + step, ground=state.ground + point_steps, steps=state.steps + 1)
         size = max(size, _largest(point_steps, reduced.spread))
         if size < tolerance or (size < 1e3 * tolerance and size > 0.5 * last):
-            return state, reduction.with_priors(points.eliminated(state), state), factor
+            if tolerance == _CONVERGED:  # a rough solution is not the last one
+                reduced = reduction.with_priors(points.eliminated(state), state)
+            return state, reduced, factor
         if not np.isfinite(size):
             break
         last = size

@@ -405,7 +405,11 @@ class Heights:
 
 
 _PIECE = 4_000
-"""Number of points whose equations are linearised at once, which limits the memory."""
+"""Largest number of points of a bundle."""
+_AT_ONCE = 4_000_000
+"""Number of derivatives that are linearised at once, which limits the memory to some times 32 MB. A set is linearised
+once for each piece that sees it, so that small pieces would cost time where many images have few points each.
+"""
 _FLUSH = 4_000_000
 """Number of contributions to entries of the reduced matrix that are collected before they are summed, which limits the
 memory.
@@ -626,15 +630,17 @@ class Reduction:
 
     @cached_property
     def pieces(self) -> tuple[tuple[Bundle, ...], ...]:
-        """Bundles grouped into parts of at most some thousand points, each of which is linearised at once."""
+        """Bundles grouped into parts of some million derivatives, each of which is linearised at once."""
         pieces: list[list[Bundle]] = [[]]
         size = 0
         for bundle in self.bundles:
-            if size and size + len(bundle.points) > _PIECE:
+            members = zip(bundle.members, bundle.places, strict=True)
+            derivatives = len(bundle.points) * sum(self.sets[k].rows * (3 + len(place)) for (k, _), place in members)
+            if size and size + derivatives > _AT_ONCE:
                 pieces.append([])
                 size = 0
             pieces[-1].append(bundle)
-            size += len(bundle.points)
+            size += derivatives
         return tuple(tuple(piece) for piece in pieces)
 
     @cached_property
@@ -656,37 +662,51 @@ class Reduction:
             True to multiply the equations by the square roots of their weights.
         """
         for piece in self.pieces:
-            needed: dict[int, list[Indices]] = {}
-            for bundle in piece:
-                for k, which in bundle.members:
-                    needed.setdefault(k, []).append(which)
-            parts, used = {}, dict.fromkeys(needed, 0)
-            for k, selections in needed.items():
-                which = np.concatenate(selections)
-                packets = self.sets[k]
-                miss, by_x, by_point = packets.linearised(which, state.x, state.ground[packets.point[which]])
-                if weighted:
-                    root = np.sqrt(state.weight[k][which] / state.factor.get(packets.group, 1.0))
-                    miss, by_x, by_point = (
-                        root[:, None] * miss,
-                        root[:, None, None] * by_x,
-                        root[:, None, None] * by_point,
-                    )
-                parts[k] = (miss, by_x, by_point)
+            parts, used = self._linearised(piece, state), {}
+            if weighted:
+                for k, (which, *equations) in parts.items():
+                    root = np.sqrt(state.weight[k][which] / state.factor.get(self.sets[k].group, 1.0))
+                    parts[k] = (which, *(root.reshape(-1, *[1] * (part.ndim - 1)) * part for part in equations))
             for bundle in piece:
                 n, width = len(bundle.points), len(bundle.columns)
                 depth = sum(self.sets[k].rows for k, _ in bundle.members)
                 rows = Rows(bundle, np.zeros((n, depth, width)), np.empty((n, depth, 3)), np.empty((n, depth)))
                 d = 0
                 for (k, which), position in zip(bundle.members, bundle.places, strict=True):
-                    a = used[k]
+                    a = used.get(k, 0)
                     used[k] = b = a + len(which)
-                    miss, by_x, by_point = (v[a:b] for v in parts[k])
+                    miss, by_x, by_point = (v[a:b] for v in parts[k][1:])
                     rows.miss[:, d : d + miss.shape[1]] = miss
                     rows.by_point[:, d : d + miss.shape[1]] = by_point
                     rows.by_x[:, d : d + miss.shape[1], position] = by_x
                     d += miss.shape[1]
                 yield rows
+
+    @cached_property
+    def _last(self) -> list[tuple[Array, Array, dict[int, tuple[Array, ...]]]]:
+        """Unknowns and points of the last linearisation, and its equations, of measurements that make one piece."""
+        return []
+
+    def _linearised(self, piece: Sequence[Bundle], state: State) -> dict[int, tuple[Array, ...]]:
+        """Return indices of measurements, misclosures and derivatives by unknowns and points, of each set of a piece.
+
+        Normal equations, steps of the points and residuals need the same ones, which are kept where they are few.
+        """
+        for x, ground, parts in self._last:
+            if x is state.x and ground is state.ground:
+                return dict(parts)
+        selected: dict[int, list[Indices]] = {}
+        for bundle in piece:
+            for k, which in bundle.members:
+                selected.setdefault(k, []).append(which)
+        needed = {k: np.concatenate(selections) for k, selections in selected.items()}
+        parts = {
+            k: (which, *self.sets[k].linearised(which, state.x, state.ground[self.sets[k].point[which]]))
+            for k, which in needed.items()
+        }
+        if len(self.pieces) == 1:
+            self._last[:] = [(state.x, state.ground, parts)]
+        return dict(parts)
 
     def reduced(self, state: State) -> Reduced:
         """Return the normal equations of measurements and priors at a state, with the ground points eliminated."""

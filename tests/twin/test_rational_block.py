@@ -11,12 +11,13 @@ import tifffile
 from scipy.stats import chi2
 
 import twin.orbit.__main__ as command
+from analysis.block.robust_start import scales
 from analysis.orbit.forward_intersection import level_axes
 from analysis.orbit.rational_polynomial import RationalPolynomial
 from scenes.specs.procedures import PROCEDURES
 from scenes.yaml.errors import InputError
 from tests.twin.commands import invoke
-from tests.twin.rational_bench import HALF, SIDE, Bench, bench, polynomial
+from tests.twin.rational_bench import HALF, LOOKS, SIDE, Bench, bench, polynomial
 from twin.framework.artefact import Table
 from twin.framework.data_files import FrameFacts, tiff
 from twin.framework.procedure import BenchError
@@ -328,3 +329,44 @@ def test_points_of_another_image_are_named(tmp_path: Path) -> None:
     one.places["third"][:, 1:] += 40.0 * HALF
     with pytest.raises(BenchError, match="or half an image, from the directions of their images"):
         adjusted(one.write(tmp_path, {"shift": [5.0, 5.0]}, 3))
+
+
+@pytest.mark.second
+def test_images_are_projected_once_for_each_state(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The cost of a large block is the number of projections of an image: those of one state serve all that needs them,
+    however many images there are; and pieces that bound the memory change nothing."""
+    calls: list[int] = []
+    seen = PolynomialImage.seen
+    monkeypatch.setattr(
+        PolynomialImage, "seen", lambda image, ground: (calls.append(len(ground)), seen(image, ground))[1]
+    )
+    file = bench(SIGMA).write(tmp_path, ERRORS, 4)
+    run = adjusted(file)
+    # 45 for start, steps of the adjustments with and without each sensor, and residuals; 55 if none were kept
+    once = len(calls) / len(LOOKS)
+    assert once <= 46
+    monkeypatch.setattr("analysis.block.point_reduction._AT_ONCE", 300)
+    pieces = adjusted(file)
+    assert len(calls) / len(LOOKS) > 2.5 * once
+    assert np.allclose(pieces.adjustment.x, run.adjustment.x, rtol=0.0, atol=1e-12)
+    assert pieces.rejected == run.rejected
+
+
+def test_the_scale_of_a_start_is_the_median_over_that_of_good_measurements(tmp_path: Path) -> None:
+    """Without it the first weights would reject good measurements of an uncorrected block."""
+    sets = adjusted(bench({"shift": 5.0}).write(tmp_path, {"shift": [5.0, 5.0]})).adjustment.assembly.reduction.sets
+    median = float(np.sqrt(chi2.median(2)))
+    for size, scale in ((3.0, 3.0), (1.4, 1.4), (0.2, 1.0)):
+        sizes = [np.full(len(packets.point), size * median) for packets in sets]
+        assert scales(sets, sizes)["image"] == pytest.approx(scale)
+
+
+@pytest.mark.parametrize("wrong", [20.0, 2000.0])
+def test_a_control_point_far_from_its_images_is_rejected(tmp_path: Path, wrong: float) -> None:
+    file = bench({"shift": 5.0}).write(tmp_path, {"shift": [5.0, 5.0]}, 5)
+    head, first, *others = (tmp_path / "ground.csv").read_text().splitlines()
+    name, x, *rest = first.split(",")
+    (tmp_path / "ground.csv").write_text("\n".join([head, ",".join([name, str(float(x) + wrong), *rest]), *others]))
+    run = adjusted(file)
+    assert run.rejected == (("p0", "control"),)
+    assert run.adjustment.p_value > 1e-3

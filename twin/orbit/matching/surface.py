@@ -3,12 +3,14 @@
 Both images of a pair are resampled to the ground at the middle height, in tiles whose rows run along the parallax: a
 point at another height is then displaced along its row only, by base-height ratio times height. OpenCV's semi-global
 matching (Hirschmueller, IEEE Trans. PAMI 30, 328 (2008)) finds these displacements within the range of heights, from
-the first image to the second and back; what does not agree is excluded. Displacements become heights through the
-polynomials of both images, and the pairs are fused by inverse variance about their median.
+the first image to the second and back. What does not agree is excluded, and so are windows that reach beyond an image
+or do not correlate. Displacements become heights through the polynomials of both images, and the pairs are fused by
+inverse variance about their median.
 
-The errors of pairs that share images are correlated: N images have N - 1 independent parallaxes, and the sigma of a
-fused height counts no more. It follows from the stated sigma of a displacement, or from the scatter of the pairs where
-that is larger.
+The sigma of a displacement is the stated one and a quarter of the range of displacements around it, the standard
+deviation of a step that may lie anywhere in the window. Beside pixels without a match, where one image is hidden or a
+step is smeared, a larger window counts. The errors of pairs that share images are correlated: N images have N - 1
+independent parallaxes, and the sigma of a fused height counts no more; it is larger where the pairs scatter more.
 """
 
 from __future__ import annotations
@@ -46,6 +48,16 @@ _APART = 3.0
 """Difference from the median of the pairs, in sigmas of both, from which a pair's height is not used."""
 _EVERY = 16
 """Spacing, in pixels, of the positions at which polynomials are evaluated; between them they are interpolated."""
+_CORRELATED, _LEAST_CORRELATION = 7, 0.6
+"""Side of the windows, pixels, that must lie within both images, and smallest correlation of their grey values: that of
+tie points.
+"""
+_AROUND, _BESIDE_HOLES = 5, 15
+"""Sides of the windows, pixels, over which displacements range: where the smaller has no pixel without a match, and
+elsewhere.
+"""
+_OF_RANGE = 0.25
+"""Standard deviation of a displacement in a window with a step, per range of its displacements."""
 _SPECKLE = 50
 """Number of pixels of the smallest region of connected displacements."""
 _Function = Callable[[np.ndarray, np.ndarray], np.ndarray]
@@ -209,10 +221,10 @@ def surface(
     if shape[0] * shape[1] > _MOST_CELLS:
         problem = f"a grid of {shape[0]} x {shape[1]} cells is too large"
         raise BenchError(problem, ("surface", "spacing"), f"at most {_MOST_CELLS:.0e} cells: a larger spacing")
-    grids, sigmas = {}, {}
+    grids, sigmas, steps = {}, {}, {}
     for k, (a, b) in enumerate(pairs):
         advance("surface", k, len(pairs))
-        grid, variance, count = np.full(shape, np.nan), 0.0, 0
+        grid, step, variance, count = np.full(shape, np.nan), np.full(shape, np.nan), 0.0, 0
         for rows, columns in _tiles(shape):
             box = np.array(
                 [
@@ -222,16 +234,16 @@ def surface(
             )
             found = _tile(views[a], views[b], box, heights, spec)
             if found is not None:
-                grid[rows, columns] = found[0]
-                variance, count = variance + found[1] ** 2, count + 1
+                grid[rows, columns], step[rows, columns] = found[:2]
+                variance, count = variance + found[2] ** 2, count + 1
         if np.any(np.isfinite(grid)):
-            grids[a, b], sigmas[a, b] = grid, float(np.sqrt(variance / count))
+            grids[a, b], steps[a, b], sigmas[a, b] = grid, step, float(np.sqrt(variance / count))
     advance("surface", len(pairs), len(pairs))
     if not grids:
         low, high = heights
         problem = f"no displacement was found at heights of {low:g} to {high:g} m above the ellipsoid"
         raise BenchError(problem, ("heights",), "heights of the ground that the images show")
-    height, sigma = _fused(grids, sigmas)
+    height, sigma = _fused(grids, sigmas, steps)
     return Surface(crs, float(west), float(north), spec.spacing, height, sigma, grids, sigmas)
 
 
@@ -265,8 +277,10 @@ def _parallax(first: _View, second: _View, place: np.ndarray, height: float) -> 
 
 def _tile(
     first: _View, second: _View, box: np.ndarray, heights: tuple[float, float], spec: SurfaceSpec
-) -> tuple[np.ndarray, float] | None:
-    """Return heights (rows, columns) of a tile by two images, and their sigma; None where both do not see it.
+) -> tuple[np.ndarray, np.ndarray, float] | None:
+    """Return heights (rows, columns) of a tile by two images; None where both do not see it.
+
+    Standard deviations by steps of the ground (rows, columns) and that of the matching follow.
 
     Parameters
     ----------
@@ -288,8 +302,8 @@ def _tile(
     along = slope / ratio
     axes = np.stack([along, [-along[1], along[0]]])
     pixel = _pixel(first, centre, middle)
-    # the first image sees ground at the ends of the range of heights this far from where it lies
-    lean = half * float(np.hypot(*_lean(first, centre, middle)))
+    # the images see ground at the ends of the range of heights this far from where it lies
+    lean = half * max(float(np.hypot(*_lean(view, centre, middle))) for view in (first, second))
     size = np.abs(axes) @ (box[1] - box[0]) + 2.0 * lean + 2.0 * _BLOCK * pixel
     columns, rows = np.ceil(size / pixel).astype(int).tolist()
     x, y = (pixel * (np.arange(n) - 0.5 * (n - 1)) for n in (columns, rows))
@@ -305,10 +319,12 @@ def _tile(
         return None
     local = np.stack([x[where[:, 1]], y[where[:, 0]]], axis=1)
     level = to_height(local, pixel * displacement[where[:, 0], where[:, 1]])
+    step = _OF_RANGE * _ranges(displacement)[where[:, 0], where[:, 1]] * pixel / ratio
     kept = (level >= heights[0]) & (level <= heights[1])
     ground = centre + to_place(local[kept], level[kept]) @ axes
     shape = round((box[1, 1] - box[0, 1]) / spec.spacing), round((box[1, 0] - box[0, 0]) / spec.spacing)
-    return _rasterised(ground - box[0], level[kept], shape, spec.spacing, pixel), spec.sigma * pixel / ratio
+    cells = _rasterised(ground - box[0], level[kept], step[kept], shape, spec.spacing, pixel)
+    return *cells, spec.sigma * pixel / ratio
 
 
 def _pixel(view: _View, place: np.ndarray, height: float) -> float:
@@ -329,6 +345,7 @@ def _displacements(first: np.ndarray, second: np.ndarray, most: int) -> np.ndarr
     A displacement is the column in the first image less that in the second, at most `most` to either side.
     """
     import cv2
+    from scipy.ndimage import minimum_filter
 
     seen = [_eight_bits(one) for one in (first, second)]
     span = 16 * int(np.ceil((2 * most + 1) / 16))
@@ -354,8 +371,29 @@ def _displacements(first: np.ndarray, second: np.ndarray, most: int) -> np.ndarr
     partner = np.where(np.isfinite(there), columns - there, -1.0)
     at = np.clip(np.rint(partner).astype(int), 0, there.shape[1] - 1)
     agrees = (np.abs(back[rows, at] - there) <= _AGREE) & (partner >= 0.0) & (partner <= there.shape[1] - 1.0)
-    visible = np.isfinite(first) & np.isfinite(second[rows, at])
-    return np.where(agrees & visible, there, np.nan)
+    whole, whole_second = (minimum_filter(np.isfinite(one), _CORRELATED, mode="constant") for one in (first, second))
+    alike = _correlation(first, second[rows, at]) >= _LEAST_CORRELATION
+    return np.where(agrees & whole & whole_second[rows, at] & alike, there, np.nan)
+
+
+def _correlation(first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    """Return the correlation of two images' grey values in a window about each pixel."""
+    from scipy.ndimage import uniform_filter
+
+    a, b = (np.nan_to_num(one - np.nanmean(one)) for one in (first, second))
+    means = [uniform_filter(one, _CORRELATED) for one in (a, b, a * a, b * b, a * b)]
+    variance = (means[2] - means[0] ** 2) * (means[3] - means[1] ** 2)
+    return np.asarray((means[4] - means[0] * means[1]) / np.sqrt(np.maximum(variance, 1e-12)))
+
+
+def _ranges(displacement: np.ndarray) -> np.ndarray:
+    """Return the range of displacements around each pixel, over a larger window beside pixels without a match."""
+    from scipy.ndimage import maximum_filter, minimum_filter
+
+    known = np.isfinite(displacement)
+    high, low = np.where(known, displacement, -np.inf), np.where(known, displacement, np.inf)
+    small, large = (maximum_filter(high, n) - minimum_filter(low, n) for n in (_AROUND, _BESIDE_HOLES))
+    return np.where(minimum_filter(known, _AROUND), small, large)
 
 
 def _eight_bits(values: np.ndarray) -> NDArray[np.uint8]:
@@ -404,33 +442,45 @@ def _geometry(
 
 
 def _rasterised(
-    ground: np.ndarray, level: np.ndarray, shape: tuple[int, int], spacing: float, pixel: float
-) -> np.ndarray:
-    """Return the mean height of each cell (rows, columns) of points (n, 2) with heights; NaN for none.
+    ground: np.ndarray, level: np.ndarray, step: np.ndarray, shape: tuple[int, int], spacing: float, pixel: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the mean height of each cell (rows, columns) of points (n, 2) with heights, and its sigma; NaN for none.
 
-    A point counts in all cells that a square of its pixel's size reaches with a quarter of it.
+    A point counts in all cells that a square of its pixel's size reaches with a quarter of it. The sigma is that by
+    steps: the points' `step` and the scatter of their heights in the cell.
     """
-    total, count = np.zeros(shape), np.zeros(shape)
-    for step in np.array([[-1, -1], [-1, 1], [1, -1], [1, 1]]) * 0.25 * pixel:
-        column, row = np.floor((ground + step) / spacing).astype(int).T
+    total, square, variance, count = np.zeros((4, *shape))
+    middle = float(np.median(level)) if len(level) else 0.0
+    for corner in np.array([[-1, -1], [-1, 1], [1, -1], [1, 1]]) * 0.25 * pixel:
+        column, row = np.floor((ground + corner) / spacing).astype(int).T
         row = shape[0] - 1 - row
         inside = (row >= 0) & (row < shape[0]) & (column >= 0) & (column < shape[1])
-        np.add.at(total, (row[inside], column[inside]), level[inside])
-        np.add.at(count, (row[inside], column[inside]), 1.0)
+        above = level[inside] - middle
+        for sums, values in ((total, above), (square, above**2), (variance, step[inside] ** 2), (count, 1.0)):
+            np.add.at(sums, (row[inside], column[inside]), values)
     with np.errstate(invalid="ignore"):
-        return np.where(count > 0, total / count, np.nan)
+        mean, square, variance = (np.where(count > 0, sums / count, np.nan) for sums in (total, square, variance))
+    return middle + mean, np.sqrt(variance + np.maximum(square - mean**2, 0.0))
 
 
 def _fused(
-    grids: Mapping[tuple[str, str], np.ndarray], sigmas: Mapping[tuple[str, str], float]
+    grids: Mapping[tuple[str, str], np.ndarray],
+    sigmas: Mapping[tuple[str, str], float],
+    steps: Mapping[tuple[str, str], np.ndarray],
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the heights of all pairs together and their sigmas, (rows, columns); NaN where no pair has a height."""
+    """Return the heights of all pairs together and their sigmas, (rows, columns); NaN where no pair has a height.
+
+    A step of the ground is smeared alike in all pairs, so that the part of sigma by `steps` does not fall with their
+    number.
+    """
     stack = np.stack(list(grids.values()))
-    sigma = np.array([sigmas[pair] for pair in grids])[:, None, None]
     known = np.isfinite(stack)
+    matched = np.array([sigmas[pair] for pair in grids])[:, None, None]
+    step = np.where(known, np.stack([steps[pair] for pair in grids]), 0.0)
+    sigma = np.where(known, np.hypot(matched, step), np.inf)
     with np.errstate(invalid="ignore"):
         middle = np.nanmedian(np.where(known.any(axis=0), stack, 0.0), axis=0)
-        used = known & ~(np.abs(stack - middle) > _APART * np.hypot(sigma, sigma.min()))
+        used = known & ~(np.abs(stack - middle) > _APART * np.hypot(sigma, sigma.min(axis=0)))
     # two pairs that contradict each other have no height
     used &= (known.sum(axis=0) < 2) | (used.sum(axis=0) >= 2)
     weight = used / sigma**2
@@ -441,5 +491,6 @@ def _fused(
         chi_square = np.sum(weight * (np.where(used, stack, 0.0) - height) ** 2, axis=0) / np.maximum(count - 1, 1)
         images = len({name for pair in grids for name in pair})
         shared = np.maximum(count / np.minimum(count, images - 1), 1.0)
-        spread = np.sqrt(np.maximum(chi_square, 1.0) * shared / total)
+        alone = shared * np.sum((weight * matched) ** 2, axis=0) / total**2
+        spread = np.sqrt(np.maximum(chi_square, 1.0) * (alone + np.sum(weight * step**2, axis=0) / total))
     return np.where(count > 0, height, np.nan), np.where(count > 0, spread, np.nan)
