@@ -399,8 +399,8 @@ def _waves(position: Array, frequency: Array, numbers: tuple[int, ...]) -> Array
     Dimensions: K harmonics, N pixels.
     """
     phase = 2.0 * np.pi * (frequency @ position)
-    turned = np.outer((1, *numbers), phase)
-    pairs = np.stack([np.cos(turned), np.sin(turned)], axis=1).reshape(-1, phase.size)
+    rotated = np.outer((1, *numbers), phase)
+    pairs = np.stack([np.cos(rotated), np.sin(rotated)], axis=1).reshape(-1, phase.size)
     return np.concatenate([np.ones((1, phase.size)), pairs])
 
 

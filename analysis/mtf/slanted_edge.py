@@ -205,8 +205,8 @@ def edge_result(
     covariance = spread.covariance(design, variance)
     transfer, gradient = spread.transform(frequency)
     modulus = np.abs(transfer)
-    turned = gradient * np.exp(-1j * np.angle(transfer))
-    along, across = (np.sqrt(np.sum(part * (covariance @ part), axis=0)) for part in (turned.real, turned.imag))
+    rotated = gradient * np.exp(-1j * np.angle(transfer))
+    along, across = (np.sqrt(np.sum(part * (covariance @ part), axis=0)) for part in (rotated.real, rotated.imag))
     signal = signal_modulus(modulus, along, across)
 
     slope_sigma, curvature, curvature_sigma, squares = _path_errors(fitted, grey - model, variance)

@@ -298,7 +298,7 @@ def fit_screened(
     return ScreenedFit(
         positions=positions,
         terms=terms,
-        others=np.array([place for place, _ in fits_of_others]).reshape(-1, 3),
+        others=np.array([position for position, _ in fits_of_others]).reshape(-1, 3),
         others_sigma=np.array([sigma for _, sigma in fits_of_others]).reshape(-1, 3),
         smear=model.smear_of(theta),
         level=level.reshape(shape),
@@ -384,9 +384,9 @@ class _Model:
     def _smear(self) -> int:
         return self._others + 3 * len(self.terms.others)
 
-    def first(self, place: tuple[float, float], flux: float, level: float) -> Array:
+    def first(self, position: tuple[float, float], flux: float, level: float) -> Array:
         theta = np.zeros(self._smear + 3 * self.terms.smear)
-        theta[:4] = *place, flux, level
+        theta[:4] = *position, flux, level
         for k, (row, column) in enumerate(self.terms.others):
             theta[self._others + 3 * k : self._others + 3 * k + 3] = row, column, 0.01 * flux
         return theta

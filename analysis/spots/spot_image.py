@@ -394,9 +394,9 @@ def check_edge(position: Array, height: int, width: int, distance: float) -> Non
     bad = ~np.all((position >= distance) & (position <= high), axis=1)
     if np.any(bad):
         where = f"px is less than {distance:g} px from the edge of the {height} x {width} image"
-        places = {n: position[n] for n in np.flatnonzero(bad).tolist()}
+        positions = {n: position[n] for n in np.flatnonzero(bad).tolist()}
         raise SpotError(
-            {n: f"too near the edge: ({row:.2f}, {column:.2f}) {where}" for n, (row, column) in places.items()}
+            {n: f"too near the edge: ({row:.2f}, {column:.2f}) {where}" for n, (row, column) in positions.items()}
         )
 
 
@@ -427,8 +427,8 @@ def coarse(image: Array, frames: int, noise: NoiseModel) -> tuple[Array, Array, 
     rows, columns = height // size, width // size
     brightest = image.reshape(count, -1).max(axis=1)
     # The mean of frames of which some are clipped lies below the clipping level, hence the allowance of a few sigmas.
-    reach = brightest + _SATURATION_SIGMAS * np.sqrt(noise.temporal_variance_dn2(brightest, 1))
-    if saturated := np.flatnonzero(reach >= noise.saturation_dn).tolist():
+    highest = brightest + _SATURATION_SIGMAS * np.sqrt(noise.temporal_variance_dn2(brightest, 1))
+    if saturated := np.flatnonzero(highest >= noise.saturation_dn).tolist():
         limit = f"DN, is within {_SATURATION_SIGMAS:g} sigma of saturation at {noise.saturation_dn:.0f} DN"
         why = f"{limit}; lower the light or the exposure"
         raise SpotError({n: f"saturated: its brightest pixel, {brightest[n]:.0f} {why}" for n in saturated})
@@ -642,9 +642,9 @@ def propagate(maps: Array, level: Array, noise: NoiseModel, frames: int) -> tupl
     frames : int
         Number of frames averaged into an image.
     """
-    turned = maps.transpose(0, 2, 1)
-    temporal = (maps * noise.temporal_variance_dn2(level, frames)[:, None]) @ turned
-    fixed = (maps * noise.fixed_variance_dn2(level)[:, None]) @ turned
+    transposed = maps.transpose(0, 2, 1)
+    temporal = (maps * noise.temporal_variance_dn2(level, frames)[:, None]) @ transposed
+    fixed = (maps * noise.fixed_variance_dn2(level)[:, None]) @ transposed
     return temporal, fixed
 
 

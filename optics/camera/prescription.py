@@ -219,9 +219,9 @@ class Camera:
         for k, surface in enumerate(self.surfaces):
             ahead = -ahead if surface.material == MIRROR else ahead
             if surface.thickness * ahead < 0.0:
-                wrong, way = ("negative", "+z") if ahead > 0.0 else ("positive", "-z")
+                wrong, axis = ("negative", "+z") if ahead > 0.0 else ("positive", "-z")
                 raise ValueError(
-                    f"the thickness of surface {k} must not be {wrong}: light travels toward {way} there, got "
+                    f"the thickness of surface {k} must not be {wrong}: light travels toward {axis} there, got "
                     f"{surface.thickness}"
                 )
         self.indices  # noqa: B018

@@ -109,8 +109,8 @@ class PupilMean:
                 values = np.where(self._free, values, terms @ self._on_stop.T)
             values = np.concatenate([values, np.squeeze(self._added @ terms[..., None], -1)], axis=1)
         weighted = self._tilts * self._share[..., None]
-        turned = np.swapaxes(weighted, 1, 2)
-        level = np.linalg.solve(turned @ self._tilts, turned @ values[..., None])
+        transposed = np.swapaxes(weighted, 1, 2)
+        level = np.linalg.solve(transposed @ self._tilts, transposed @ values[..., None])
         return np.asarray(values - np.squeeze(self._tilts @ level, -1))
 
 

@@ -107,7 +107,7 @@ class TimeSeries:
         """
         agrees = self.agrees & (self.smoothed is None or self.smoothed.consistency.agrees)
         return agrees & np.all(
-            [self.evidence.holds, *(curvature.holds for curvature in self.curvature.values())], axis=0
+            [self.evidence.consistent, *(curvature.valid for curvature in self.curvature.values())], axis=0
         )
 
     def doubts(self, spots: Sequence[str]) -> tuple[str, ...]:
@@ -123,8 +123,8 @@ class TimeSeries:
         if doubt is not None:
             out.append(f"course {doubt}")
         for name, curvature in self.curvature.items():
-            untraceable = np.flatnonzero(~curvature.holds)
-            recomputed = np.flatnonzero(curvature.beyond & curvature.holds)
+            untraceable = np.flatnonzero(~curvature.valid)
+            recomputed = np.flatnonzero(curvature.beyond & curvature.valid)
             if len(untraceable):
                 out.append(
                     f"course: σ does not hold at {len(untraceable)} times, first at "

@@ -107,8 +107,8 @@ def _length(instrument: Instrument, placed: PlacedBodies) -> float:
     """Return the largest distance between two surfaces of a camera, metres."""
     lengths = []
     for name, model in instrument.cameras.items():
-        places = np.array([placed.pose(f"{BASE}/{name}/{surface}").translation for surface in model.mirrors])
-        lengths.append(float(np.max(np.linalg.norm(places[:, None] - places, axis=-1))))
+        vertices = np.array([placed.pose(f"{BASE}/{name}/{surface}").translation for surface in model.mirrors])
+        lengths.append(float(np.max(np.linalg.norm(vertices[:, None] - vertices, axis=-1))))
     return max(lengths) or float(max(model.spec.entrance_pupil for model in instrument.cameras.values()))
 
 

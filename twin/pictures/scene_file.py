@@ -113,11 +113,11 @@ def motions(instrument: Instrument, state: State, placed: PlacedBodies) -> dict[
     bodies = instrument.assembly.tree.bodies
     rest, moved = (_all_in_parents(bodies, poses) for poses in (nominal, placed))
     back = np.swapaxes(rest[:, :3, :3], -1, -2)
-    turn = back @ moved[:, :3, :3]
+    rotation = back @ moved[:, :3, :3]
     offset = np.einsum("bij,bj->bi", back, moved[:, :3, 3] - rest[:, :3, 3])
     pivots = np.array([body.pivots[state.get(body.path, AT_REST).pivot] for body in bodies])
-    rotate = Rotation.from_matrix(turn).as_rotvec()
-    shift = np.einsum("bij,bj->bi", turn, pivots) + offset - pivots
+    rotate = Rotation.from_matrix(rotation).as_rotvec()
+    shift = np.einsum("bij,bj->bi", rotation, pivots) + offset - pivots
     out = {}
     for k in np.flatnonzero(np.maximum(np.abs(rotate), np.abs(shift)).max(axis=1) > MIN_MOTION):
         vectors = {"rotate": rotate[k].tolist(), "shift": shift[k].tolist(), "pivot": pivots[k].tolist()}

@@ -324,13 +324,13 @@ class Printed:
         for depth, part in enumerate(path):
             if not isinstance(value, dict) or part not in value:
                 known = value if isinstance(value, dict) else {}
-                place = path[:depth]
+                parent = path[:depth]
                 raise InputError(
                     Issue(
                         f"nothing is printed as {part!r}",
                         self.content.file,
-                        self.content.lines.get(place),
-                        place,
+                        self.content.lines.get(parent),
+                        parent,
                         suggestion=nearest(str(part), known),
                     )
                 )
@@ -353,8 +353,8 @@ class Printed:
             raise self._error(path, "no number", value)
         return float(value)
 
-    def _error(self, path: KeyPath, problem: str, found: Any) -> InputError:
-        return InputError(Issue(problem, self.content.file, self.content.lines.get(path), path, found=repr(found)))
+    def _error(self, path: KeyPath, problem: str, value: Any) -> InputError:
+        return InputError(Issue(problem, self.content.file, self.content.lines.get(path), path, found=repr(value)))
 
 
 @cache
