@@ -486,8 +486,8 @@ def prior_numbers(disturbances: Disturbances) -> dict[str, list[int]]:
     out: dict[str, list[int]] = {}
     for k, (cause, what) in enumerate(zip(disturbances.causes, whats, strict=True)):
         kind = what.split()[0]
-        alike = kind != "figure" and len(sizes[cause, kind]) == 1
-        out.setdefault(f"{cause} {kind if alike else what}", []).append(k)
+        shared = kind != "figure" and len(sizes[cause, kind]) == 1
+        out.setdefault(f"{cause} {kind if shared else what}", []).append(k)
     return out
 
 

@@ -45,7 +45,7 @@ from analysis.spots.likelihood import FALSE_ALARM, FitStates, fit_states, requir
 from analysis.spots.spot_image import NoiseParts, SpotPositions, difference_covariance, noise_parts
 from optics.numerics.extension_table import EntryPointError
 
-ALIKE = 2.0
+EXPLAINED = 2.0
 """Largest ratio of a spot core's chi-square per degree of freedom to the variance of the frames' noise (in units of the
 specified variance) at which that noise still explains the misfit.
 """
@@ -210,7 +210,7 @@ class SpotEvidence:
 def _noisy(fit: FitStates, k: int) -> bool:
     """Return True if the noise of the frames explains the misfit of spot k, which is then about equal everywhere."""
     noise, whole, core = (float(v[0, k]) for v in (fit.noise, fit.whole, fit.core))
-    return noise > LOUD and whole < LOUD * noise and core < ALIKE * noise
+    return noise > LOUD and whole < LOUD * noise and core < EXPLAINED * noise
 
 
 def _number(value: float) -> str:

@@ -175,7 +175,7 @@ class ScreenedFit:
         return float(max(np.sqrt(value / (noisier * spread)), 1.0 + 1e-9))
 
 
-def one_shape(template: SpotTemplate, index: int, shape: tuple[int, int]) -> SpotTemplate:
+def single_template(template: SpotTemplate, index: int, shape: tuple[int, int]) -> SpotTemplate:
     """Return one of the shapes of a template, for images of another size.
 
     Parameters
@@ -417,7 +417,7 @@ class _Model:
 
     def moved(self, theta: Array, step: Array) -> Array:
         """Return the next parameters: no position moves by more than a pixel, and the spot's flux stays positive."""
-        length = max(float(np.abs(step[self._places]).max()), 1e-300)
+        length = max(float(np.abs(step[self._position_indices]).max()), 1e-300)
         short = min(1.0, 1.0 / length)
         if step[2] < -0.9 * theta[2]:
             short = min(short, -0.9 * theta[2] / step[2])
@@ -434,13 +434,13 @@ class _Model:
         return out
 
     @cached_property
-    def _places(self) -> list[int]:
+    def _position_indices(self) -> list[int]:
         """Indices of the parameters that are positions: the spot's, then the further spots'."""
         return [0, 1, *(self._others + 3 * k + axis for k in range(len(self.terms.others)) for axis in (0, 1))]
 
     def rests(self, change: Array, inverse: Array) -> bool:
         """Return True if the last iteration step has changed all positions by less than their tolerance."""
-        others = self._places[2:]
+        others = self._position_indices[2:]
         sigma = np.sqrt(np.maximum(np.diag(inverse)[others], 0.0))
         return bool(
             np.all(np.abs(change[:2]) < _REST_PX)

@@ -155,14 +155,14 @@ def difference_covariance(before: SpotPositions, after: SpotPositions, noise: No
     total = after.covariance + np.tile(before.covariance, (count // first, 1, 1))
     g_before = before.gain_maps.reshape(first, 2, -1)
     # one side carries both terms, so that the other one is worked on once per spot
-    lit_before = (g_before * (noise.prnu**2 * before.light_dn.reshape(first, 1, -1))).transpose(0, 2, 1)
+    signal_before = (g_before * (noise.prnu**2 * before.light_dn.reshape(first, 1, -1))).transpose(0, 2, 1)
     dark_before = (noise.dsnu_variance_dn2 * g_before).transpose(0, 2, 1)
     g_after = after.gain_maps.reshape(count, 2, -1)
     light_after = after.light_dn.reshape(count, 1, -1)
     # One state at a time keeps the work in the processor's cache; the loop is over states, not over spots.
     for start in range(0, count, first):
         part = slice(start, start + first)
-        cross = (g_after[part] * light_after[part]) @ lit_before + g_after[part] @ dark_before
+        cross = (g_after[part] * light_after[part]) @ signal_before + g_after[part] @ dark_before
         total[part] -= cross + cross.transpose(0, 2, 1)
     return total
 
@@ -220,12 +220,12 @@ class SeriesNoise:
     ----------
     before : NoiseParts
         Noise of the C spots before.
-    reach : int
+    most_apart : int
         Greatest separation, in images, of two differences for which a covariance is kept, which bounds memory.
     """
 
-    def __init__(self, before: NoiseParts, reach: int) -> None:
-        self._before, self._reach = before, reach
+    def __init__(self, before: NoiseParts, most_apart: int) -> None:
+        self._before, self._most_apart = before, most_apart
         self._maps: list[NDArray[np.float32]] = []
         self._rows: list[Array] = []
 
@@ -252,7 +252,7 @@ class SeriesNoise:
             raise ValueError(f"series noise: {len(after.temporal)} positions of {count} spots")
         for start in range(0, len(after.temporal), count):
             pattern = after.pattern[start : start + count] - self._before.pattern
-            self._maps = [*self._maps, pattern][-1 - self._reach :]
+            self._maps = [*self._maps, pattern][-1 - self._most_apart :]
             row = np.stack([pattern @ earlier.transpose(0, 2, 1) for earlier in self._maps]).astype(np.float64)
             row += self._before.temporal
             row[-1] += after.temporal[start : start + count]
@@ -275,8 +275,10 @@ class SeriesNoise:
         ValueError
             Images are farther apart than the kept separation.
         """
-        if np.ptp(images) > self._reach:
-            raise ValueError(f"series noise: images {np.ptp(images)} apart, {self._reach} are kept")
+        if np.ptp(images) > self._most_apart:
+            raise ValueError(
+                f"noise of a series: images {np.ptp(images)} apart, but covariances are kept up to {self._most_apart} apart"
+            )
         count, n = len(self._before.temporal), len(images)
         out = np.zeros((n, count, 2, n, count, 2))
         for i, late in enumerate(images):

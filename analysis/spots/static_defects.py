@@ -174,7 +174,7 @@ def examine(
     noise: NoiseModel,
     template: SpotTemplate,
     vibration: bool = False,
-    own: bool = False,
+    same_image: bool = False,
     searched: bool = True,
     first: tuple[int, int] = (0, 0),
     learnt: bool = False,
@@ -191,7 +191,7 @@ def examine(
         Template with the spot's one shape.
     vibration : bool
         True to fit smear.
-    own : bool
+    same_image : bool
         True if the shape was learnt from this very image, so that its residuals show nothing.
     searched : bool
         True to search for defects; otherwise only known ones are excluded or fitted.
@@ -209,7 +209,7 @@ def examine(
     mean = screened.mean
     rough = _rough(mean, screened, noise) if searched else np.zeros_like(screened.good)
     good = screened.good & ~rough
-    smeared = (vibration or bool(np.any(screened.jitter))) and not own
+    smeared = (vibration or bool(np.any(screened.jitter))) and not same_image
     terms = FitTerms(learnt=learnt)
     lines, edges = np.zeros_like(good), np.zeros_like(good)
     limit = float(norm.isf(FALSE_ALARM / (2.0 * mean.size)))
@@ -234,7 +234,7 @@ def examine(
             dirty = dirty or not np.array_equal(good | edges, screened.good)
             if not np.array_equal(good, before[0]):
                 fit = fitted(good, terms, fit)
-            if not own and not gross:
+            if not same_image and not gross:
                 terms, fit = _uneven(fitted, mean, good, terms, fit)
                 terms, fit, edge = _others(fitted, mean, template, good, terms, fit)
                 edges, good = edges | edge, good & ~edge

@@ -648,7 +648,7 @@ class _CameraBench:
         if shadows is not None:
             self._taken.append((which, shadows.shares()))
         values = np.stack([light_lost, wfe, refocused, defocus, *mtf])
-        self._hold(values, dark, shadows)
+        self._require_possible(values, dark, shadows)
         return values, dark, np.isnan(mtf[0])
 
     def _pupils(
@@ -743,7 +743,7 @@ class _CameraBench:
                 known[k] = False
         return total, known
 
-    def _hold(self, values: np.ndarray, dark: np.ndarray, shadows: shadow.Shadows | None) -> None:
+    def _require_possible(self, values: np.ndarray, dark: np.ndarray, shadows: shadow.Shadows | None) -> None:
         """Raise UnphysicalError if a computed value is physically impossible; the message names camera and quantity.
 
         Parameters

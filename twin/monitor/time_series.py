@@ -453,7 +453,7 @@ class SmoothedCourse:
         searched: dict[str, Any] = {}
         if self.jumps is not None:
             jumps = [jump.to_dict() for jump in self.jumps]
-            searched = {"jumps": {"false_alarm": self.jump_false_alarm, "found": jumps}}
+            searched = {"jumps": {"false_alarm": self.jump_false_alarm, "detected": jumps}}
         return {
             "name": self.name,
             "chi_square": test.chi_square,

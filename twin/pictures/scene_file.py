@@ -181,9 +181,9 @@ def _body_meshes(instrument: Instrument, paths: LightPaths) -> dict[str, trimesh
         plane = f"{BASE}/{camera}/focal_plane"
         line = model.spec.line.pixels * model.spec.line.pitch
         channels = [c for c in instrument.channels if c.camera == camera]
-        reach_x, reach_y = board_size(model, [p for c in channels for p in (c.pinhole, c.ccd)])
+        width, height = board_size(model, [p for c in channels for p in (c.pinhole, c.ccd)])
         # light arrives along +Z of the focal plane, so the board that carries the detectors is on the +Z side
-        out[plane] = _painted(_box((reach_x, reach_y, BOARD), 2.0 * CHIP + 0.5 * BOARD), DARK)
+        out[plane] = _painted(_box((width, height, BOARD), 2.0 * CHIP + 0.5 * BOARD), DARK)
         out[f"{plane}/line"] = _painted(_box((LINE_WIDTH, line, CHIP), 0.5 * CHIP), SILICON)
         for channel in channels:
             out.update(_channel_meshes(instrument, channel))

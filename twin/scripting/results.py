@@ -108,10 +108,10 @@ class Shot:
         """
         cameras = self.run.targets.cameras if self.run.targets is not None else {}
         rows = {
-            (camera, name, direction): _edge_row(place, direction)
+            (camera, name, direction): _edge_row(targets_at, direction)
             for camera, targets in cameras.items()
-            for name, place in targets.places.items()
-            for direction in place.before.edges
+            for name, targets_at in targets.places.items()
+            for direction in targets_at.before.edges
         }
         return _indexed(rows, ["camera", "place", "direction"])
 
@@ -260,10 +260,10 @@ def _indexed(rows: Mapping[tuple[Any, ...], Mapping[str, float]], names: list[st
     return table
 
 
-def _edge_row(place: PlaceTargets, direction: str) -> dict[str, float]:
+def _edge_row(targets: PlaceTargets, direction: str) -> dict[str, float]:
     """Return one row of ``Shot.mtf``: MTF of a knife edge before and after, with sigma and true value."""
     out: dict[str, float] = {}
-    for when, shots in place.shots.items():
+    for when, shots in targets.shots.items():
         edge = shots.edges[direction]
         value, sigma = edge.nyquist or (np.nan, np.nan)
         out |= {when: value, f"{when}_sigma": sigma, f"{when}_true": edge.true_nyquist}

@@ -125,19 +125,19 @@ class Context:
 
     def figure(self, name: str, drawing: str | bytes, **facts: object) -> None:
         """Add a drawing (SVG or PNG) to the report, with the title and caption from the group's file."""
-        texts = self._said(name, facts)
+        texts = self._worded(name, facts)
         self.add(SvgFigure(name, *texts, drawing) if isinstance(drawing, str) else PngFigure(name, *texts, drawing))
 
     def table(self, name: str, rows: Sequence[Sequence[Cell]], **facts: object) -> None:
         """Add a table to the report, with the title, caption and column names from the group's file."""
         text = self.texts[name]
-        self.add(Table(name, *self._said(name, facts), text.heads, rows, text.decimals))
+        self.add(Table(name, *self._worded(name, facts), text.heads, rows, text.decimals))
 
     def data(self, name: str, content: dict[str, Any]) -> None:
         """Add data to the report's downloads, with the title and caption from the group's file."""
-        self.add(Data(name, *self._said(name, {}), content))
+        self.add(Data(name, *self._worded(name, {}), content))
 
-    def _said(self, name: str, facts: Mapping[str, Any]) -> tuple[str, str]:
+    def _worded(self, name: str, facts: Mapping[str, Any]) -> tuple[str, str]:
         text = self.texts[name]
         return sentence(text.title, facts), sentence(text.caption, facts)
 

@@ -155,7 +155,7 @@ def run_table_1(context: Context) -> Iterator[CheckResult]:
         )
         noise = spread * np.sqrt(1.0 / count + SIGMAS**2 / (2.0 * (count - 1)))
         exceedance = partial(_exceedance, abs(bias), SIGMAS * spread)
-        facts = {"own": independent, "point": POINT_SIGMA, "bias": bias, "spread": spread}
+        facts = {"independent": independent, "point": POINT_SIGMA, "bias": bias, "spread": spread}
         yield context.row(f"000.table1.{name}_own", exceedance(1.0), noise, inputs=_points(exceedance), **facts)
     yield _pair(context, data, independent)
     yield from _accuracy(context, data)
@@ -197,7 +197,7 @@ def _pair(context: Context, data: Data, independent: Differences) -> CheckResult
     pair = np.array([ALPHA, BETA])
     facts: dict[str, Any] = {
         "correlation": covariance[0, 1] / np.sqrt(covariance[0, 0] * covariance[1, 1]),
-        "own": independent,
+        "independent": independent,
         "distance": _distance(pair - np.mean(independent.values, axis=0), np.cov(independent.values.T)),
         "pair": (ALPHA, BETA),
         "apart": _distance(pair * [-1.0, 1.0] - bias, covariance),
@@ -247,7 +247,7 @@ AXES = ("x", "y", "z")
 FAR, SIMILAR, LITTLE, GROWS = 2.0, 1.25, 0.25, 0.05
 GREEK: Mapping[str, str] = {"alpha": "α", "beta": "β"}
 _STYLES = {"x": (BLUE, "o"), "y": (GREEN, "s"), "z": (VERMILION, "^")}
-REACH = 10.0
+LARGEST = 10.0
 """Largest displacement of the projection centre (station) or of ground points in the figures, metres."""
 ELSEWHERE = (45.0, 120.0)
 """Latitude and longitude, degrees, of another pass, at which the paper's position-dependent statements are true."""
@@ -458,7 +458,7 @@ def answers(measured: Measurement, flight: AnglePass, steps: int = 10, method: M
 
     The planes are fitted again for each displacement; ``steps`` is the number of displacements.
     """
-    amount = np.linspace(0.0, REACH, steps + 1)
+    amount = np.linspace(0.0, LARGEST, steps + 1)
     return Answers.of(sensitivity(measured.station, measured.strips, flight.pairs, method=method, amounts=amount))
 
 
@@ -493,13 +493,13 @@ def _row(
     mean = {axis: np.mean([a.rises[sentence.what, sentence.angle, axis] for a in all_answers]) for axis in AXES}
     position = _position([sentence], positions)
     facts: dict[str, Any] = {
-        "found": all_answers,
+        "simulated": all_answers,
         "mean": {axis: f"{value:+.3f}″" for axis, value in mean.items()},
-        "place": position,
+        "position": position,
         "other": sentence.measure(other.rises, other.increase),
         "north": ELSEWHERE[0],
         "east": ELSEWHERE[1],
-        "alike": SIMILAR,
+        "similar": SIMILAR,
     }
     value, sigma = (float(values[0]), None) if sentence.kind == "grows" else mean_of(values)
     inputs = [position] if sentence.row.basis == "chosen" else []
@@ -520,7 +520,7 @@ def _position(sentences: Sequence[Sentence], positions: Mapping[Position, Answer
 def _explained(sentence: Sentence, passes: Passes, other: Answers) -> list[float]:
     """Return the values that the explanations of a statement's check would give; empty if it has none."""
     if sentence.kind == "grows":
-        return [REACH / float(np.linalg.norm(passes.flight.station - passes.flight.middle_point))]
+        return [LARGEST / float(np.linalg.norm(passes.flight.station - passes.flight.middle_point))]
     if sentence.kind == "alike" and sentence.confirmed_by(other.rises, other.increase):
         normal = np.abs(passes.normal("forward"))
         return [float(normal[2] / normal[0])]
@@ -542,14 +542,14 @@ def _ordinate(context: Context, all_answers: list[Answers], positions: Mapping[P
         for sign in (1.0, -1.0)
     )
     count = sum(len(s.axes + s.others) for s in signs)
-    facts: dict[str, Any] = {"sentences": signs, "signs": count, "found": all_answers, "other": other}
+    facts: dict[str, Any] = {"sentences": signs, "signs": count, "simulated": all_answers, "other": other}
     return context.row("000.fig3.ordinate", share, None, 1.0, inputs=[_position(signs, positions)], **facts)
 
 
 def _single(context: Context, passes: Passes) -> CheckResult:
     m = passes.measured[0]
     base = intersection_angles(*planes_of(m, "corrected")).values[0]
-    shift = np.array([0.0, REACH, 0.0])
+    shift = np.array([0.0, LARGEST, 0.0])
 
     def moved(strip: Strip) -> float:
         planes = planes_of(replace(m, strips={**m.strips, "forward": strip}), "corrected")

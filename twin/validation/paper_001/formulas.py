@@ -379,7 +379,7 @@ def run(context: Context) -> Iterator[CheckResult]:
         reflected, moved = mirror_rotations(context.backend, rotations)
         ratio, screen = reflected / rotations, np.abs(moved / np.tan(2 * rotations) - 1.0)
         worst = ratio[np.argmax(np.abs(ratio - 2.0))]
-        yield context.row("001.eq1.turn", worst, turns=MIRROR_ROTATIONS, screen=screen)
+        yield context.row("001.eq1.turn", worst, rotations=MIRROR_ROTATIONS, screen=screen)
         if len(context.selected) == 1:
             return
     context.progress(0.1, f"build {INSTRUMENT}")

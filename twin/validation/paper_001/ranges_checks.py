@@ -245,7 +245,7 @@ def _defocus(context: Context, resolved: ResolvedJob, bench: ranges.Bench, data:
         "offset": offset,
         "half": ranges.CONFOCAL,
         "depth": depth,
-        "places": positions,
+        "positions": positions,
         "gradient": pupil.gradient[NAMES.index("d_alpha"), 0] * ARCSEC * f_x**2,
         "across": pupil.gradient[NAMES.index("d_beta"), 1] * ARCSEC * f**2,
     }

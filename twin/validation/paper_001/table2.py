@@ -89,7 +89,7 @@ def run(context: Context) -> Iterator[CheckResult]:
     worst, spread = max(differences.values())
     text = ", ".join(f"about {axis} {value:.3f}" for axis, (value, _) in differences.items())
     facts: dict[str, Any] = {
-        "found": measurement,
+        "rendered_benches": measurement,
         "text": text,
         "printed": {axis: printed_mean_difference(axis) for axis in differences},
     }
@@ -117,7 +117,7 @@ def _mean_difference(context: Context, measurement: Measured, series: laboratory
     means = np.array([table[axis].mean_difference for table in measurement.real])
     spread = laboratory.declared_spread(spec, series, float(np.max(result.sigma)) / math.sqrt(2.0))
     facts: dict[str, Any] = {
-        "found": measurement,
+        "rendered_benches": measurement,
         "result": result,
         "rows": series.steps + 1,
         "means": means,
@@ -144,9 +144,9 @@ def _z_columns(context: Context, measurement: Measured) -> CheckResult:
     apart = np.max(np.abs(scale * first - second), axis=1)
     facts: dict[str, Any] = {
         "scale": scale,
-        "one": mirror_1,
+        "mirror_1": mirror_1,
         "twice": mirror_1[1] * 2.0 / math.sqrt(3.0),
-        "chance": probability,
+        "probability": probability,
         "rate": np.polyfit(ANGLES, mirror_1, 1)[0],
         "sine": math.sqrt(0.75),
         "first": first,
@@ -172,7 +172,7 @@ def _relations(context: Context, measurement: Measured) -> Iterator[CheckResult]
         result, component = measurement.ideal[axis], column_component(axis)
         between = 2.0 * result.series.half_angle
         read = float(result.readings[1, -1, component] / result.series.angles[-1])
-        facts: dict[str, Any] = {"series": result.series, "between": between, "read": read, "own": "XY"[component]}
+        facts: dict[str, Any] = {"series": result.series, "between": between, "read": read, "axis": "XY"[component]}
         row = f"001.table2.relation.{axis.lower()}"
         yield context.row(row, read / autocollimator.relation_factor(axis, 2, between), **facts)
     result = measurement.ideal["Z"]

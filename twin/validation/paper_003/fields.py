@@ -265,7 +265,7 @@ def _readings(first: float, last: float, interval: float) -> np.ndarray:
 def _quality(context: Context, campaigns: Sequence[Campaign], setup: CalibrationSetup) -> Iterator[CheckResult]:
     quality = quality_of(setup, campaigns)
     errors, passes = setup.test.errors, quality.orbit.shape[0] * quality.orbit.shape[1]
-    facts: dict[str, Any] = {"found": quality, "passes": passes, "campaigns": campaigns}
+    facts: dict[str, Any] = {"simulated": quality, "passes": passes, "campaigns": campaigns}
     worst, sigma = median_of(
         np.max([v.max(axis=1) / v.min(axis=1) for v in (quality.orbit, quality.attitude)], axis=(0, 2))
     )
@@ -318,7 +318,7 @@ def _slope(context: Context, flights: Flights, number: int, k: int) -> CheckResu
     amplitude = np.array([row[k].amplitude for row in flights.fits]) / ARCSEC
     true = flights.true_amplitude[:, k] / ARCSEC
     sigmas = [row[k].amplitude_sigma for row in flights.fits]
-    facts: dict[str, Any] = {"flights": flights, "own": sigmas, "away": amplitude - true}
+    facts: dict[str, Any] = {"flights": flights, "predicted": sigmas, "away": amplitude - true}
     return context.row(f"003.fig{number}", amplitude.mean(), mean_of(amplitude - true)[1], true.mean(), **facts)
 
 
@@ -333,7 +333,7 @@ def _interior(context: Context, flights: Flights, number: int, parts: tuple[str,
     value, sigma = median_of(np.sqrt(np.mean(scatter**2, axis=1)))
     facts: dict[str, Any] = {
         "flights": flights,
-        "places": nodes,
+        "unknowns": nodes,
         "each": each,
         "ratio": rms(scatter) / claimed,
         "what": what,

@@ -660,10 +660,10 @@ def _exact(context: Context, seed: np.random.SeedSequence) -> Iterator[CheckResu
         yield context.row("003.model", max(largest.values()), implied=0.0, **facts)
     if "003.equations" in context.selected:
         line, name, worst = derivatives(setup, field_pass, field_pass.bias)
-        yield context.row("003.equations", worst, implied=0.0, one=field_pass, name=name, line=line)
+        yield context.row("003.equations", worst, implied=0.0, field_pass=field_pass, name=name, line=line)
     if "003.equations.exact" in context.selected:
         worst, name = recovered(campaign, setup.camera.pitch)
-        yield context.row("003.equations.exact", worst, implied=0.0, one=field_pass, name=name)
+        yield context.row("003.equations.exact", worst, implied=0.0, field_pass=field_pass, name=name)
 
 
 def _simulated(context: Context, seed: np.random.SeedSequence) -> Iterator[CheckResult]:
@@ -672,7 +672,7 @@ def _simulated(context: Context, seed: np.random.SeedSequence) -> Iterator[Check
     if "003.model.rank" in context.selected:
         rank = rank_of(setup, campaign)
         facts: dict[str, Any] = {
-            "found": rank,
+            "simulated": rank,
             "combinations": "; ".join(str(o) for o in rank.undetermined),
             "pixels": rank.weak_sigma / setup.camera.pitch,
         }

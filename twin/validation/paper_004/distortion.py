@@ -195,11 +195,11 @@ def run(context: Context) -> Iterator[CheckResult]:
     if not context.selected - _PRINTED_ONLY:
         return
     tests = [SpotTest(run) for run in measured_tests(context)]
-    places, sets = tests[0].run.record.reading.shape
-    count = len(tests) * places * sets
+    points, sets = tests[0].run.record.reading.shape
+    spots = len(tests) * points * sets
     facts: dict[str, Any] = {
         "tests": tests,
-        "rendered": f"{len(tests)} tests of {places} points and {sets} sets, {count} spots rendered",
+        "rendered": f"{len(tests)} tests of {points} points and {sets} sets, {spots} spots rendered",
         "points": POINTS,
         "sets": SETS,
         "accuracy": ACCURACY_UM,
@@ -323,7 +323,7 @@ def _eq2(context: Context, tests: Sequence[SpotTest], facts: Facts) -> Iterator[
     more = {
         "edge": float(np.tan(tests[0].true_angle[-1]) ** 2),
         "error": pitch * error,
-        "stated": pitch * sigma,
+        "predicted": pitch * sigma,
         "correlation": np.median([[abs(fit.correlation[2, k]) for k in (0, 1)] for fit in fits], axis=0),
     }
     yield context.row("004.eq2.point", error, error / np.sqrt(2 * len(tests)), None, [sigma], **facts, **more)
@@ -360,7 +360,7 @@ def _sensitivity(context: Context, tests: Sequence[SpotTest], facts: Facts) -> I
         "dividing error of scenes/lab/turntable.yaml, times", 1.0, "1",
         lambda factor: 100.0 * (1.0 - by_spots / (by_spots + factor**2 * by_angles)),
     )  # fmt: skip
-    more: dict[str, Any] = {"own": with_compensation, "spots": spots, "as_read": rms(all_raw[:, 1])}
+    more: dict[str, Any] = {"compensated": with_compensation, "spots": spots, "as_read": rms(all_raw[:, 1])}
     share = 100.0 * (1.0 - by_spots / with_compensation**2)
     yield context.row("004.sensitivity.angle", share, None, 50.0, inputs=[chosen], **facts, **more)
     for name, column, over, under in (("field", 1, all_raw, inner), ("distance", 0, inner, all_raw)):
@@ -370,7 +370,7 @@ def _sensitivity(context: Context, tests: Sequence[SpotTest], facts: Facts) -> I
         yield context.row(f"004.sensitivity.{name}", top / bottom, sigma, 1.0, **facts, **more)
     few = rms([t.errors(t.angle, slice(k, None, FEW))[0] for t in tests for k in range(FEW)])
     total = rms([t.errors(t.angle, whole)[0] for t in tests])
-    more = {"few": few, "every": total, "fewer": POINTS // FEW, "gain": FEW**0.5}
+    more = {"few": few, "total": total, "fewer": POINTS // FEW, "gain": FEW**0.5}
     yield context.row("004.sensitivity.points", few / total, None, 1.0, **facts, **more)
     rng = np.random.default_rng(np.random.SeedSequence(context.seed, spawn_key=(1,)))
     wrong = FIT_RMS_ARCSEC * ARCSEC
@@ -398,10 +398,10 @@ def _errors_of_tests(context: Context, tests: Sequence[SpotTest], facts: Facts) 
     )
     value = float(np.max(compensated))
     row = "004.turntable.compensated"
-    yield context.row(row, value, inputs=[dividing(value)], own=compensated, raw=raw, **facts)
+    yield context.row(row, value, inputs=[dividing(value)], compensated=compensated, raw=raw, **facts)
     raw, compensated = _errors(tests).T
     value = float(np.max(compensated))
-    yield context.row("004.table2.accuracy", value, inputs=[dividing(value)], own=compensated, raw=raw, **facts)
+    yield context.row("004.table2.accuracy", value, inputs=[dividing(value)], compensated=compensated, raw=raw, **facts)
     runs = [t.run for t in tests]
     less = 100.0 * (1.0 - compensated / raw)
     # known better than sigma, but the printed figure is of one table
@@ -573,7 +573,7 @@ def _ignored(context: Context, positions: Callable[[Array], Array], angle: Array
     second = distortion(*moved, principal_distance(*moved))
     change = float(np.max(np.abs(second - first)))
     facts: dict[str, Any] = {
-        "turn": angle,
+        "angle": angle,
         "shift": shift,
         "change": change,
         "undistorted": pitch * np.tan(angle[-1]) ** 2,
@@ -602,7 +602,7 @@ def _solutions(context: Context, positions: Callable[[Array], Array], edge: floa
     }
     for name, (difference, values) in solutions.items():
         worst = UM * float(np.max(np.abs(difference)))
-        yield context.row(f"004.{name}.solution", worst, implied=0.0, turn=angle, values=values)
+        yield context.row(f"004.{name}.solution", worst, implied=0.0, angle=angle, values=values)
 
 
 GROUP = group_of("004.distortion", run)

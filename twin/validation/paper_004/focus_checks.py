@@ -292,7 +292,7 @@ def _measured(
     rotations = np.array([abs(line_rotation(p.moved)) / ARCMIN for p in plans])
     begin = np.array([abs(a.states[0].true_level) / ARCMIN for a in alignments])
     value = float(np.max(rotations))
-    more = {"begin": _list(begin, 2), "turns": _list(rotations, 2)}
+    more = {"begin": _list(begin, 2), "rotations": _list(rotations, 2)}
     yield context.row("004.alignment.constraint", value, inputs=[_theodolite(alignments, value)], **facts, **more)
     asked, changes = (np.array(values) for values in ([p.asked for p in plans], [p.shims.change for p in plans]))
     alone = np.array([abs(p.shims.level_coupling) / ARCMIN for p in plans])

@@ -146,7 +146,7 @@ def _repeats(
             chosen = context.check(identifier).basis == "chosen"
             inputs = _readings(spec, seeds[:FAST_TABLES], identifier, value) if chosen else []
             explained = [REPEAT_RMS_ARCSEC / REPEATS**0.5] if name.endswith("mean") else []
-            more: dict[str, Any] = {"found": repeats, "quartiles": np.percentile(repeats, [25.0, 75.0])}
+            more: dict[str, Any] = {"simulated": repeats, "quartiles": np.percentile(repeats, [25.0, 75.0])}
             yield context.row(identifier, value, sigma, None, explained, inputs, **facts, **more)
 
 
