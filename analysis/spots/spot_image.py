@@ -277,7 +277,7 @@ class SeriesNoise:
         """
         if np.ptp(images) > self._most_apart:
             raise ValueError(
-                f"noise of a series: images {np.ptp(images)} apart, but covariances are kept up to {self._most_apart} apart"
+                f"noise of a series: images {np.ptp(images)} apart; covariances are kept up to {self._most_apart} apart"
             )
         count, n = len(self._before.temporal), len(images)
         out = np.zeros((n, count, 2, n, count, 2))
