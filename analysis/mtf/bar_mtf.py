@@ -603,8 +603,8 @@ def page_warnings(result: EdgeMtf | BarMtf, step: float) -> list[str]:
         out.append(f"{same} pages are identical to another one and do not count: were they copied?")
     if noise < _ROUGH * step:
         out.append(
-            f"the noise of {noise:.2g} in a pixel is below {_ROUGH:g} of the step of {step:g} between grey values,"
-            " so that rounding does not average out over pixels and pages; sigma includes it. A higher gain helps"
+            f"the noise of a pixel, {noise:.2g} grey values, is below {_ROUGH:g} of the grey-value step of {step:g}, so"
+            " that rounding does not average out over pixels and pages; sigma includes rounding. A higher gain helps"
         )
     if isinstance(result, EdgeMtf) and result.doubt:
         out.append(result.doubt)

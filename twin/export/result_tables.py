@@ -158,7 +158,7 @@ def result_tables(folder: Path, files: Sequence[str]) -> list[DataTable]:
 
 
 def _frames_of(data: Any) -> dict[str, str]:
-    """Return "frame of QUANTITY" -> its reference frame, as a JSON file lists them for its numbers."""
+    """Return the reference frames of quantities, by "frame of QUANTITY", as a JSON file lists them for its numbers."""
     frames = data.get("reference_frames", {}) if isinstance(data, Mapping) else {}
     return {f"frame of {quantity}": str(text) for quantity, text in frames.items()}
 

@@ -254,7 +254,7 @@ class ImageQuality:
         )
 
     def state(self, number: int) -> dict[str, CameraState]:
-        """Return camera -> its image quality in the state with index ``number``, for result files."""
+        """Return the image quality of each camera in the state with index ``number``, for result files."""
         positions = {
             position: self.fields.index(field) for position, field in POSITIONS.items() if field in self.fields
         }
@@ -270,7 +270,7 @@ class CameraState:
     positions: Mapping[str, int]
 
     def named(self, values: np.ndarray) -> dict[str, float | None]:
-        """Return name of the field point -> value in this state.
+        """Return the value at each field point in this state, by the name of the point.
 
         ``values`` holds the values in S states at F field points, (S, F).
         """
@@ -546,7 +546,7 @@ class _CameraBench:
                     )
 
     def bodies(self, count: int) -> dict[str, np.ndarray]:
-        """Return each body in a beam -> fraction of the stop's area that it blocks, (S, F).
+        """Return the fraction of the stop's area that each body in a beam blocks, (S, F).
 
         The fraction is NaN where the light is lost.
 

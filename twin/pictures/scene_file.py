@@ -98,7 +98,7 @@ def scene_bytes(instrument: Instrument, state: State, paths: LightPaths, tube: f
 
 
 def motions(instrument: Instrument, state: State, placed: PlacedBodies) -> dict[str, dict[str, Any]]:
-    """Return path of each moved body -> its motion relative to its parent, as in the scene's ``extras``.
+    """Return the motion of each moved body relative to its parent, by its path, as in the scene's ``extras``.
 
     Parameters
     ----------
@@ -167,7 +167,7 @@ def build_scene(instrument: Instrument, paths: LightPaths, tube: float = TUBE) -
 
 
 def _body_meshes(instrument: Instrument, paths: LightPaths) -> dict[str, trimesh.Trimesh]:
-    """Return path of each body -> mesh in the body's frame, metres, without thermal expansion."""
+    """Return the mesh of each body by its path, in the body's frame, metres, without thermal expansion."""
     out: dict[str, trimesh.Trimesh] = {}
     for camera, model in instrument.cameras.items():
         lens_of = lenses(model.spec)
@@ -208,7 +208,7 @@ def _material(solid: Solid) -> PBRMaterial:
 
 
 def _baffle_meshes(plates: tuple[Plate, ...]) -> dict[str, tuple[str, trimesh.Trimesh]]:
-    """Return name of a baffle -> the body that carries it, and its plates in that body's frame, metres."""
+    """Return for each baffle, by name, the body that carries it, and its plates in that body's frame, metres."""
     parts: dict[str, tuple[str, list[trimesh.Trimesh]]] = {}
     for plate in plates:
         outline = plate.outline

@@ -516,7 +516,7 @@ class TargetCamera:
         self.directions = path.directions(self.positions)
 
     def views(self, state: State) -> dict[str, View]:
-        """Return name of each position on the line (left, centre, right) -> its view in a state of the camera.
+        """Return the view of each position on the line (left, centre, right), by its name, in a state of the camera.
 
         Raises
         ------

@@ -282,7 +282,7 @@ def _exposed(
 def _probabilities(
     recovery: Recovery, experiment: MonitorExperiment, quantities: tuple[Quantity, ...]
 ) -> dict[str, np.ndarray]:
-    """Return estimator -> probability that an interval contains the truth, given the spot shifts.
+    """Return the probability, by estimator, that an interval contains the truth, given the spot shifts.
 
     Each is a (levels, N, Q) array for the confidence levels, N states and Q quantities. Errors of the posterior are
     independent of the shifts; the estimate of another estimator differs from the posterior's by the difference of their

@@ -234,7 +234,7 @@ STATES: Record[Coverage] = Record(
 def _by_quantity(
     quantities: Sequence[limits.Quantity], values: Sequence[Any] | np.ndarray
 ) -> dict[str, dict[str, Any]]:
-    """Return values by quantity, as group -> key -> value.
+    """Return values by quantity, as nested mappings from group and key to value.
 
     Parameters
     ----------

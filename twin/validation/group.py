@@ -262,11 +262,11 @@ class Printed:
         return self._column(_path(key), self._at(key))
 
     def numbers(self, key: str) -> Mapping[str, float]:
-        """Return name -> printed number for all entries below a key, in the order of the file."""
+        """Return the printed numbers of all entries below a key, by name, in the order of the file."""
         return FrozenMap({k: self._number((*_path(key), k), v) for k, v in self._mapping(key).items()})
 
     def columns(self, key: str) -> Mapping[str, tuple[float, ...]]:
-        """Return name -> printed list of numbers for all entries below a key, in the order of the file."""
+        """Return the printed lists of numbers of all entries below a key, by name, in the order of the file."""
         return FrozenMap({k: self._column((*_path(key), k), v) for k, v in self._mapping(key).items()})
 
     @cached_property

@@ -25,7 +25,7 @@ PAGE = "README.md"
 
 
 def summary_files(validation: Validation) -> dict[str, bytes]:
-    """Return name -> contents of the files of the summary: the page and the figures that it shows."""
+    """Return the files of the summary, content by name: the page and the figures that it shows."""
     figures = {
         f"{run.group.prefix}-{a.name}.{a.kind}": a
         for run in validation.runs

@@ -97,7 +97,7 @@ class Passes:
         return np.asarray(look / np.linalg.norm(look))
 
     def pitch_error(self, normals: Mapping[str, np.ndarray]) -> dict[str, tuple[float, float]]:
-        """Return line -> mean error of fitted plane normals toward the line of sight, and its sigma, in arcsec.
+        """Return, for each line, the mean error of plane normals toward the line of sight and its sigma, in arcsec.
 
         ``normals`` has for each line the unit normals of all measurements, (passes, 3).
         """

@@ -568,7 +568,7 @@ def _single(context: Context, passes: Passes) -> CheckResult:
 
 
 def _positions(context: Context) -> dict[Position, Answers]:
-    """Return position of the pass -> changes of the angles over the displacements, for one measurement there."""
+    """Return, for each position of the pass, the changes of the angles over the displacements in one measurement."""
     step = 5.0 if context.fast else 2.5
     out = {}
     grid = [(lat, lon) for lat in np.arange(25.0, 50.1, step) for lon in np.arange(80.0, 130.1, 2.0 * step)]

@@ -135,7 +135,7 @@ class Bench:
         return np.moveaxis(known.centre, 0, 1)
 
     def readings(self, start: np.ndarray, end: np.ndarray) -> dict[str, dict[str, np.ndarray]]:
-        """Return camera -> set of formulas -> estimated changes in S states, (S, 4), in arcsec and um.
+        """Return the estimated changes in S states, (S, 4), in arcsec and um, by camera and set of formulas.
 
         The estimates of the four parameters are computed from spot positions before and after the change, (S, C, 2) for
         C channels.
@@ -158,7 +158,7 @@ class Bench:
         return out
 
     def truth(self, states: Sequence[State]) -> dict[str, np.ndarray]:
-        """Return camera -> traced changes of its four parameters in S states, (S, 4), in arcsec and um."""
+        """Return the traced changes of each camera's four parameters in S states, (S, 4), in arcsec and um."""
         changes = self.experiment.sight.truth(states)
         return {
             name: np.stack([c.d_alpha, c.d_beta, c.d_gamma, c.d_f], axis=-1) * PER_SI
@@ -445,7 +445,7 @@ def single_range(bench: Bench, wide: Bench, parameter: str, sign: int, count: in
 
 
 def _joined(parts: Mapping[str, list[np.ndarray]]) -> dict[str, np.ndarray]:
-    """Return set of formulas -> N pairs of true change and error, (N, 2), in ascending order of the change."""
+    """Return N pairs of true change and error, (N, 2), of each set of formulas, in ascending order of the change."""
     out = {}
     for form, pieces in parts.items():
         joined = np.concatenate(pieces)
@@ -860,7 +860,7 @@ def piston_curves(bench: Bench, count: int) -> Curves:
 
 
 def gains(bench: Bench, constant: float = 0.0) -> dict[str, np.ndarray]:
-    """Return set of formulas -> estimate divided by true change, (4,), for the four single changes SMALL.
+    """Return the estimate divided by the true change, (4,), of each set of formulas for the four changes SMALL.
 
     The same piston, ``constant`` metres, is present before and after.
     """

@@ -74,7 +74,7 @@ def run(context: Context) -> Iterator[CheckResult]:
 def ranges_of(
     context: Context, resolved: ResolvedJob, bench: ranges.Bench, begin: float, share: float
 ) -> dict[str, list[ranges.Range]]:
-    """Return parameter -> its ranges of validity in both directions."""
+    """Return the ranges of validity of each parameter in both directions."""
     wide = ranges.Bench(
         ranges.variant(resolved, context.backend, bench.cameras[0], pixels=ranges.WIDE_PX), bench, shapes=True
     )

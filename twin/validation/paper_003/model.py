@@ -132,7 +132,7 @@ def true_sensors(
     trajectory: Platform | None = None,
     interior: Mapping[str, np.ndarray] = FrozenMap(),
 ) -> dict[str, Sensor]:
-    """Return line -> sensor model of the camera as it is after launch, on a trajectory.
+    """Return the sensor model of each camera line as it is after launch, on a trajectory.
 
     Parameters
     ----------
@@ -272,7 +272,7 @@ def recovered(campaign: Campaign, pitch: float) -> tuple[float, str]:
 
 
 def errors_of(campaign: Campaign, field_pass: FieldPass, adjustment: Adjustment | Stepwise) -> dict[str, float]:
-    """Return unknown (without the field's name) -> estimated minus true value, metres or radians."""
+    """Return the estimated minus the true value of each unknown, by name without the field's, metres or radians."""
     value = dict(zip(adjustment.names, adjustment.values, strict=True))
     out = {
         f"{line} {name}": float(value[f"{line} {name}"] - true)
@@ -406,7 +406,7 @@ class _Spots:
 
 
 def rendered_marks(setup: CalibrationSetup, campaign: Campaign, seed: np.random.SeedSequence) -> dict[str, FoundMarks]:
-    """Return camera line -> bright ground targets measured in it, four in each window over a campaign's first field.
+    """Return the bright ground targets measured in each camera line, four per window over a campaign's first field.
 
     They are located by their centroids.
     """
@@ -441,7 +441,7 @@ def rendered_marks(setup: CalibrationSetup, campaign: Campaign, seed: np.random.
 
 
 def missed(setup: CalibrationSetup, campaign: Campaign, marks: dict[str, FoundMarks]) -> dict[str, np.ndarray]:
-    """Return camera line -> misclosures of the analysis's model at the line's n bright targets, (n, 2), in pixels.
+    """Return the misclosures of the analysis's model at each camera line's n bright targets, (n, 2), in pixels.
 
     The model has the true interior orientation and bias, the measured attitude and the known ground.
     """

@@ -194,7 +194,7 @@ def dividing(value: float, power: float = 1.0) -> Chosen:
 
 
 def _ranks(tables: Sequence[FittedTable]) -> dict[str, Array]:
-    """Return fit -> its rank on each turntable, 1 for the smallest error."""
+    """Return the rank of each fit on each turntable, 1 for the smallest error."""
     return {
         name: np.array([1.0 + sum(v < t.held_out[name] for v in t.held_out.values()) for t in tables]) for name in FITS
     }
