@@ -524,7 +524,7 @@ class EdgeMtf:
         return (
             f"the region contains structure of {share:.2g} of the contrast (rms of means over blocks and strips, p ="
             f" {self.structure.p_value:.1g}) that a {form} edge between two planes does not explain:"
-            " light that is not a plane, a rough edge, specks, or noise correlated between pixels. sigma does not"
+            " uneven light, a rough edge, specks, or noise correlated between pixels. sigma does not"
             " include its effect on the MTF: use even light or a smaller region"
         )
 

@@ -179,8 +179,8 @@ class Camera:
 
     Examples
     --------
-    A Ritchey-Chretien telescope of 0.45 m aperture at F/8. M1 is F/2.67, and M2 magnifies 3 times; the shadow of M2
-    stands for a hole in M1:
+    A Ritchey-Chretien telescope of 0.45 m aperture at F/8. M1 is F/2.67, and M2 magnifies 3 times; the hole in
+    M1 has the size of the shadow of M2:
 
     >>> m1 = OpticalSurface(-2.4, -0.88, -1.080808, "mirror", diameter=0.45, inner_diameter=0.12)
     >>> m2 = OpticalSurface(-0.96, 0.96, -5.022727, "mirror")

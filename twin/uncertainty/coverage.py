@@ -329,7 +329,7 @@ class UncertaintyRun:
     coverage : Coverage or None
         Coverage in the random states, None if none were asked for.
     warnings : tuple of str
-        Warnings of blurred cameras, coarse grey values, and motions of the prior that no spot shows.
+        Warnings of blurred cameras, coarse grey values, and motions of the prior that the spots do not observe.
     images : ImageChecks
         Checks of its images.
     """
