@@ -508,7 +508,7 @@ def _findings(context: Context, flights: Flights) -> Iterator[CheckResult]:
         "spread": np.median(plan.std(axis=2), axis=0),
         "ratio": np.median(plan.max(axis=2) / plan.min(axis=2), axis=0),
         "steps": np.median(plan.mean(axis=2), axis=0),
-        "unseen": np.median(plan[:, :, -1], axis=0),
+        "unobserved": np.median(plan[:, :, -1], axis=0),
     }
     for name, (statistic, implied) in statistics.items():
         values = statistic(plan)
