@@ -276,9 +276,7 @@ class SeriesNoise:
             Images are farther apart than the kept separation.
         """
         if np.ptp(images) > self._most_apart:
-            raise ValueError(
-                f"noise of a series: images {np.ptp(images)} apart; covariances are kept up to {self._most_apart} apart"
-            )
+            raise ValueError(f"series noise: images {np.ptp(images)} apart, at most {self._most_apart} are kept")
         count, n = len(self._before.temporal), len(images)
         out = np.zeros((n, count, 2, n, count, 2))
         for i, late in enumerate(images):

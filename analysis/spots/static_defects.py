@@ -98,7 +98,7 @@ MOST_OTHERS = 3
 """Greatest number of further spots (reflections) that are fitted in one image."""
 NEAREST_PX = 4.0
 """Distance, px, below which a second source of light is not distinguished from the spot."""
-_NEIGHBOURS = 2
+_NEAR = 2
 _MISFIT = 0.05
 """Allowed error of the prediction of a residual from those around it, relative to the residual."""
 _ROUGH_SIGMAS, _ROUGH_PX = 12.0, 6.0
@@ -123,14 +123,12 @@ _STEEP = 0.15
 
 def _prediction() -> Array:
     """Return the weights (5, 5) that predict a pixel from those about it by a quadratic surface."""
-    row, column = (
-        np.mgrid[-_NEIGHBOURS : _NEIGHBOURS + 1, -_NEIGHBOURS : _NEIGHBOURS + 1].reshape(2, -1).astype(np.float64)
-    )
+    row, column = np.mgrid[-_NEAR : _NEAR + 1, -_NEAR : _NEAR + 1].reshape(2, -1).astype(np.float64)
     around = (row != 0) | (column != 0)
     design = np.stack([np.ones_like(row), row, column, row * row, row * column, column * column])[:, around]
     out = np.zeros(row.size)
     out[around] = np.linalg.pinv(design.T)[0]
-    return out.reshape(2 * _NEIGHBOURS + 1, -1)
+    return out.reshape(2 * _NEAR + 1, -1)
 
 
 _PREDICTION = _prediction()
@@ -342,7 +340,7 @@ def _off(residual: Array, variance: Array, good: Mask, limit: float) -> Mask:
         # where most neighbours are missing there is no prediction
         alone = ndimage.convolve((~use).astype(np.float64), np.abs(_PREDICTION), mode="nearest") > _ALONE
         z[alone] = 0.0
-        new = (z > limit) & (z >= ndimage.maximum_filter(z, 2 * _NEIGHBOURS + 1))
+        new = (z > limit) & (z >= ndimage.maximum_filter(z, 2 * _NEAR + 1))
         if not np.any(new):
             break
         bad |= new
@@ -472,10 +470,8 @@ def _second_light(
     height, width = mean.shape
     middle = (height // 2, width // 2)
     stamp = template.evaluate(float(middle[0]), float(middle[1]))[0][0]
-    half_width = min(20, *middle)
-    stamp = stamp[
-        middle[0] - half_width : middle[0] + half_width + 1, middle[1] - half_width : middle[1] + half_width + 1
-    ]
+    half = min(20, *middle)
+    stamp = stamp[middle[0] - half : middle[0] + half + 1, middle[1] - half : middle[1] + half + 1]
     weight = np.where(fit.used, 1.0 / fit.variance, 0.0)
     flipped = stamp[::-1, ::-1]
     amplitude = signal.fftconvolve((mean - fit.level) * weight, flipped, mode="same")

@@ -120,12 +120,10 @@ def setup_of(name: str, **changes: object) -> AngleSetup:
     """
     setup = AngleSetup.read(name)
     test = setup.test
-    position: dict[str, Any] = {
-        key: changes.pop(key) for key in ("latitude", "longitude", "direction") if key in changes
-    }
-    if position:
+    at: dict[str, Any] = {key: changes.pop(key) for key in ("latitude", "longitude", "direction") if key in changes}
+    if at:
         assert test.orbit.passing is not None
-        passing = test.orbit.passing.model_copy(update=position)
+        passing = test.orbit.passing.model_copy(update=at)
         test = test.model_copy(update={"orbit": test.orbit.model_copy(update={"passing": passing})})
     if changes:
         test = test.model_copy(update={"errors": test.errors.model_copy(update=changes)})

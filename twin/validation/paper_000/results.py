@@ -126,8 +126,8 @@ def make_data(context: Context) -> Data:
     return Data(repeated(setup_of(TEST), first, count), independent, Passes(repeats.flight, moved))
 
 
-def _at(measured: Measurement, position: Array) -> Measurement:
-    return replace(measured, station=replace(measured.station, position=position))
+def _at(measured: Measurement, site: Array) -> Measurement:
+    return replace(measured, station=replace(measured.station, position=site))
 
 
 @one_blas_thread()
@@ -239,12 +239,12 @@ def _accuracy(context: Context, data: Data) -> Iterator[CheckResult]:
 
 Kind = Literal["signs", "largest", "far", "alike", "little", "grows", "opposite"]
 Angle = Literal["alpha", "beta"]
-Position = tuple[float, float]
+Site = tuple[float, float]
 """Latitude and longitude of a simulated pass, degrees."""
 Rises = Mapping[tuple[str, Angle, str], float]
 """(moved object, angle, axis) -> change of the angle for a displacement of 10 m, arcsec."""
 AXES = ("x", "y", "z")
-FAR, SIMILAR, LITTLE, GROWS = 2.0, 1.25, 0.25, 0.05
+FAR, EQUAL, LITTLE, GROWS = 2.0, 1.25, 0.25, 0.05
 GREEK: Mapping[str, str] = {"alpha": "α", "beta": "β"}
 _STYLES = {"x": (BLUE, "o"), "y": (GREEN, "s"), "z": (VERMILION, "^")}
 LARGEST = 10.0
@@ -296,18 +296,17 @@ class Sentence:
     def implied(self) -> float:
         """Value of the number that `measure` returns, as the statement implies it."""
         return {
-            "signs": 0.0, "largest": 1.0, "far": FAR, "alike": SIMILAR, "little": LITTLE, "grows": GROWS,
-            "opposite": 1.0,
+            "signs": 0.0, "largest": 1.0, "far": FAR, "alike": EQUAL, "little": LITTLE, "grows": GROWS, "opposite": 1.0,
         }[self.kind]  # fmt: skip
 
-    def measure(self, rises: Rises, increase: Rises) -> float:
+    def measure(self, rises: Rises, bend: Rises) -> float:
         """Return the number that decides the statement.
 
         Parameters
         ----------
         rises : Rises
             Changes of the angles at the largest displacement, arcsec.
-        increase : Rises
+        bend : Rises
             Relative increase of the slope of each curve from its first to its last step.
         """
 
@@ -324,12 +323,12 @@ class Sentence:
         if self.kind == "little":
             return max(size[axis] for axis in self.axes) / max(size[axis] for axis in self.others)
         if self.kind == "grows":
-            return min(increase[self.what, self.angle, axis] for axis in AXES)
+            return min(bend[self.what, self.angle, axis] for axis in AXES)
         return max((-rise(axis, "beta") / rise(axis, "alpha") for axis in AXES), key=lambda ratio: abs(ratio - 1.0))
 
-    def confirmed_by(self, rises: Rises, increase: Rises) -> bool:
+    def agrees(self, rises: Rises, bend: Rises) -> bool:
         """Return True if the number confirms the statement, with the tolerance of its check."""
-        return self.row.outside(self.measure(rises, increase), self.implied) <= self.row.tolerance
+        return self.row.outside(self.measure(rises, bend), self.implied) <= self.row.tolerance
 
 
 YZ, XZ, XY = ("y", "z"), ("x", "z"), ("x", "y")
@@ -383,18 +382,18 @@ def sensitivity_svg(
 
 
 @drawing("places-000", 3.6)
-def positions_svg(figure: Figure, counts: Mapping[Position, int], total: int, marked: Sequence[Position]) -> None:
+def positions_svg(figure: Figure, counts: Mapping[Site, int], total: int, marked: Sequence[Site]) -> None:
     """Draw a map of the number of statements that are confirmed at each position of the pass."""
     axes = figure.subplots()
-    lat, lon = (np.unique([position[k] for position in counts]) for k in (0, 1))
+    lat, lon = (np.unique([site[k] for site in counts]) for k in (0, 1))
     grid = np.array([[counts[a, b] for b in lon] for a in lat])
     span: dict[str, Any] = {"vmin": grid.min() - 0.5, "vmax": total + 0.5}
     mesh = axes.pcolormesh(lon, lat, grid, cmap="cividis", shading="nearest", **span)
     for (a, b), count in counts.items():
         colour = "white" if (count - grid.min()) / (total - grid.min()) < 0.55 else INK
         axes.text(b, a, str(count), ha="center", va="center", fontsize=8, color=colour)
-    for position in marked:
-        axes.plot(position[1], position[0], "o", ms=19, mfc="none", mec=VERMILION, mew=1.8)
+    for site in marked:
+        axes.plot(site[1], site[0], "o", ms=19, mfc="none", mec=VERMILION, mew=1.8)
     axes.set(xlabel="longitude, ° E", ylabel="latitude, ° N")
     figure.colorbar(mesh, ax=axes, label=f"sentences that hold, of {total}")
 
@@ -433,7 +432,7 @@ class Answers:
         return {key: float(change[-1]) for key, change in self.change.items()}  # type: ignore[misc]
 
     @property
-    def increase(self) -> Rises:
+    def bend(self) -> Rises:
         """(moved object, angle, axis) -> relative increase of the curve's slope from the first to the last step."""
         out = {}
         for key, change in self.change.items():
@@ -443,12 +442,12 @@ class Answers:
 
 
 def make_passes(
-    context: Context, position: Position | None = None, count: int | None = None, direction: str = "descending"
+    context: Context, site: Site | None = None, count: int | None = None, direction: str = "descending"
 ) -> Passes:
-    """Simulate measurements at the library test's position, or at ``position``: latitude and longitude, degrees."""
+    """Simulate measurements at the library test's position, or at ``site``: latitude and longitude, degrees."""
     at: dict[str, Any] = {"direction": direction}
-    if position is not None:
-        at |= {"latitude": np.radians(position[0]), "longitude": np.radians(position[1])}
+    if site is not None:
+        at |= {"latitude": np.radians(site[0]), "longitude": np.radians(site[1])}
     many = context.count(full=60, fast=10) if count is None else count
     return repeated(setup_of(TEST, **at), np.random.SeedSequence([context.seed, 8]), many)
 
@@ -471,49 +470,45 @@ def run_figures(context: Context) -> Iterator[CheckResult]:
     context.progress(0.4, "the same elsewhere")
     there = make_passes(context, ELSEWHERE, 1)
     other = answers(there.measured[0], there.flight)
-    positions = _positions(context)
+    sites = _sites(context)
     for sentence in SENTENCES:
         if sentence.row.id in context.selected:
-            yield _row(sentence, passes, all_answers, other, positions)
-    yield _ordinate(context, all_answers, positions)
+            yield _row(sentence, passes, all_answers, other, sites)
+    yield _ordinate(context, all_answers, sites)
     if "000.fig4.single" in context.selected:
         yield _single(context, passes)
     context.progress(0.9, "draw")
-    _show(context, all_answers[0], positions)
+    _show(context, all_answers[0], sites)
 
 
 def _row(
-    sentence: Sentence,
-    passes: Passes,
-    all_answers: list[Answers],
-    other: Answers,
-    positions: Mapping[Position, Answers],
+    sentence: Sentence, passes: Passes, all_answers: list[Answers], other: Answers, sites: Mapping[Site, Answers]
 ) -> CheckResult:
-    values = np.array([sentence.measure(a.rises, a.increase) for a in all_answers])
+    values = np.array([sentence.measure(a.rises, a.bend) for a in all_answers])
     mean = {axis: np.mean([a.rises[sentence.what, sentence.angle, axis] for a in all_answers]) for axis in AXES}
-    position = _position([sentence], positions)
+    site = _site([sentence], sites)
     facts: dict[str, Any] = {
         "simulated": all_answers,
         "mean": {axis: f"{value:+.3f}″" for axis, value in mean.items()},
-        "position": position,
-        "other": sentence.measure(other.rises, other.increase),
+        "position": site,
+        "other": sentence.measure(other.rises, other.bend),
         "north": ELSEWHERE[0],
         "east": ELSEWHERE[1],
-        "similar": SIMILAR,
+        "similar": EQUAL,
     }
     value, sigma = (float(values[0]), None) if sentence.kind == "grows" else mean_of(values)
-    inputs = [position] if sentence.row.basis == "chosen" else []
+    inputs = [site] if sentence.row.basis == "chosen" else []
     explained = _explained(sentence, passes, other)
     return sentence.row.evaluate(value, sigma, "", sentence.implied, explained, inputs, facts)
 
 
-def _position(sentences: Sequence[Sentence], positions: Mapping[Position, Answers]) -> Supposed:
+def _site(sentences: Sequence[Sentence], sites: Mapping[Site, Answers]) -> Supposed:
     """Return the position of the pass as an input that the paper does not print.
 
     It comes with other positions where the statements are confirmed.
     """
-    confirmed = sum(all(s.confirmed_by(a.rises, a.increase) for s in sentences) for a in positions.values())
-    text = f"holds at {confirmed} of {len(positions)} places from 25° to 50° N and 80° to 130° E"
+    confirmed = sum(all(s.agrees(a.rises, a.bend) for s in sentences) for a in sites.values())
+    text = f"holds at {confirmed} of {len(sites)} places from 25° to 50° N and 80° to 130° E"
     return Supposed("a descending pass over 40° N 116° E", text)
 
 
@@ -521,29 +516,23 @@ def _explained(sentence: Sentence, passes: Passes, other: Answers) -> list[float
     """Return the values that the explanations of a statement's check would give; empty if it has none."""
     if sentence.kind == "grows":
         return [LARGEST / float(np.linalg.norm(passes.flight.station - passes.flight.middle_point))]
-    if sentence.kind == "alike" and sentence.confirmed_by(other.rises, other.increase):
+    if sentence.kind == "alike" and sentence.agrees(other.rises, other.bend):
         normal = np.abs(passes.normal("forward"))
         return [float(normal[2] / normal[0])]
     return []
 
 
-def _ordinate(context: Context, all_answers: list[Answers], positions: Mapping[Position, Answers]) -> CheckResult:
+def _ordinate(context: Context, all_answers: list[Answers], sites: Mapping[Site, Answers]) -> CheckResult:
     signs = [s for s in SENTENCES if s.kind == "signs"]
     share, other = (
         float(
-            np.mean(
-                [
-                    s.confirmed_by({k: sign * v for k, v in a.rises.items()}, a.increase)
-                    for s in signs
-                    for a in all_answers
-                ]
-            )
+            np.mean([s.agrees({k: sign * v for k, v in a.rises.items()}, a.bend) for s in signs for a in all_answers])
         )
         for sign in (1.0, -1.0)
     )
     count = sum(len(s.axes + s.others) for s in signs)
     facts: dict[str, Any] = {"sentences": signs, "signs": count, "simulated": all_answers, "other": other}
-    return context.row("000.fig3.ordinate", share, None, 1.0, inputs=[_position(signs, positions)], **facts)
+    return context.row("000.fig3.ordinate", share, None, 1.0, inputs=[_site(signs, sites)], **facts)
 
 
 def _single(context: Context, passes: Passes) -> CheckResult:
@@ -567,16 +556,16 @@ def _single(context: Context, passes: Passes) -> CheckResult:
     return context.row("000.fig4.single", value, implied=0.0, inputs=inputs, each=each, whole=whole)
 
 
-def _positions(context: Context) -> dict[Position, Answers]:
+def _sites(context: Context) -> dict[Site, Answers]:
     """Return, for each position of the pass, the changes of the angles over the displacements in one measurement."""
     step = 5.0 if context.fast else 2.5
     out = {}
     grid = [(lat, lon) for lat in np.arange(25.0, 50.1, step) for lon in np.arange(80.0, 130.1, 2.0 * step)]
-    for k, position in enumerate(grid):
+    for k, site in enumerate(grid):
         if k % 10 == 0:
             context.progress(0.4 + 0.45 * k / len(grid), "the same elsewhere")
-        passes = make_passes(context, position, 1)
-        out[position] = answers(passes.measured[0], passes.flight, 2)
+        passes = make_passes(context, site, 1)
+        out[site] = answers(passes.measured[0], passes.flight, 2)
     return out
 
 
@@ -599,17 +588,15 @@ def _readings(context: Context) -> list[tuple[str, str, int, int]]:
             # two of the frames have a nearly vertical plane
             a = answers(seen, flight, 2, "tls")
             minus = {key: -value for key, value in a.rises.items()}
-            counts = [sum(s.confirmed_by(r, a.increase) for s in SENTENCES) for r in (a.rises, minus)]
+            counts = [sum(s.agrees(r, a.bend) for s in SENTENCES) for r in (a.rises, minus)]
             rows.append((frame, direction, counts[0], counts[1]))
     return rows
 
 
-def _show(context: Context, shown: Answers, positions: Mapping[Position, Answers]) -> None:
+def _show(context: Context, shown: Answers, sites: Mapping[Site, Answers]) -> None:
     for name, panels in PANELS.items():
         context.figure(name, sensitivity_svg(shown.amount, shown.change, panels))
-    counts = {
-        position: sum(s.confirmed_by(a.rises, a.increase) for s in SENTENCES) for position, a in positions.items()
-    }
+    counts = {site: sum(s.agrees(a.rises, a.bend) for s in SENTENCES) for site, a in sites.items()}
     context.figure("places", positions_svg(counts, len(SENTENCES), ((40.0, 116.0), ELSEWHERE)), total=len(SENTENCES))
     context.table("readings", _readings(context), total=len(SENTENCES))
     moved = ((what, axis) for what in ("station", "forward", "nadir", "backward") for axis in AXES)

@@ -274,11 +274,9 @@ def _differences(axes: Axes, tables: Sequence[laboratory.ReadingTable], axis: st
         label = f"rendered, {len(tables)} bench{'es' if len(tables) > 1 else ''}" if k == 0 else None
         axes.plot(result.series.angles / ARCSEC, (start - second) / ARCSEC, color=BLUE, lw=0.9, alpha=0.6, label=label)
     printed = load_printed("001")
-    rotations, mirror_1 = (printed.column("table2.turn_arcsec"), printed.columns("table2.mirror_1_arcsec"))
-    difference = (
-        np.array(rotations if axis == "Z" else mirror_1[axis]) - printed.columns("table2.mirror_2_arcsec")[axis]
-    )
-    axes.plot(rotations, difference, "o-", color=ORANGE, ms=4, lw=1.2, label="printed Table 2")
+    angles, mirror_1 = (printed.column("table2.turn_arcsec"), printed.columns("table2.mirror_1_arcsec"))
+    difference = np.array(angles if axis == "Z" else mirror_1[axis]) - printed.columns("table2.mirror_2_arcsec")[axis]
+    axes.plot(angles, difference, "o-", color=ORANGE, ms=4, lw=1.2, label="printed Table 2")
     axes.axhline(0.0, color=GREY, lw=0.7)
     axes.set(title=_TITLES[axis], ylabel="arcsec")
     if last:

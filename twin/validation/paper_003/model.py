@@ -79,7 +79,7 @@ _SIGMA = 2.5
 The terrain's curvature under it moves its centroid by 0.004 px at most.
 """
 _APART = 300.0
-_HALF_WIDTH = MARGIN + 4
+_HALF = MARGIN + 4
 _TERRAIN: dict[str, Any] = {"kind": "fractal", "relief": "30 m", "exponent": 2.4}
 
 
@@ -341,7 +341,7 @@ class Walk:
 
     Attributes
     ----------
-    stepwise_result : Stepwise
+    steps : Stepwise
         Stepwise solution.
     together : Adjustment
         Simultaneous solution.
@@ -351,7 +351,7 @@ class Walk:
         Number of rounds of the stepwise solution -> largest difference after these, sigmas.
     """
 
-    stepwise_result: Stepwise
+    steps: Stepwise
     together: Adjustment
     distance: float
     after: Mapping[int, float]
@@ -464,18 +464,16 @@ def _brightest(image: np.ndarray, count: int) -> list[tuple[int, int]]:
     for _ in range(count):
         row, column = (int(v) for v in np.unravel_index(int(rest.argmax()), rest.shape))
         out.append((row, column))
-        rest[
-            max(row - _HALF_WIDTH, 0) : row + _HALF_WIDTH + 1, max(column - _HALF_WIDTH, 0) : column + _HALF_WIDTH + 1
-        ] = -1.0
+        rest[max(row - _HALF, 0) : row + _HALF + 1, max(column - _HALF, 0) : column + _HALF + 1] = -1.0
     return out
 
 
 def _centroid(image: np.ndarray, row: int, column: int) -> np.ndarray:
     """Return the centroid (line, pixel) of all pixels that the point spread function reaches from a given pixel."""
-    part = image[row - _HALF_WIDTH : row + _HALF_WIDTH + 1, column - _HALF_WIDTH : column + _HALF_WIDTH + 1]
-    if part.shape != (2 * _HALF_WIDTH + 1,) * 2:
+    part = image[row - _HALF : row + _HALF + 1, column - _HALF : column + _HALF + 1]
+    if part.shape != (2 * _HALF + 1,) * 2:
         raise ValueError("a mark lies too near to the window's border")
-    position, total = np.arange(-_HALF_WIDTH, _HALF_WIDTH + 1), part.sum()
+    position, total = np.arange(-_HALF, _HALF + 1), part.sum()
     return np.array([row + part.sum(axis=1) @ position / total, column + part.sum(axis=0) @ position / total])
 
 
@@ -501,7 +499,7 @@ class FromImages:
         Name of the field.
     control, check : int
         Numbers of accepted control points and check points.
-    stepwise_result : Stepwise
+    steps : Stepwise
         Stepwise solution.
     together : Adjustment
         Simultaneous solution, for sigmas.
@@ -516,7 +514,7 @@ class FromImages:
     name: str
     control: int
     check: int
-    stepwise_result: Stepwise
+    steps: Stepwise
     together: Adjustment
     error: dict[str, float]
     covariance: np.ndarray
@@ -562,13 +560,11 @@ def matching(campaign: Campaign) -> tuple[float, int, int]:
 
 def _field(campaign: Campaign, field_pass: FieldPass) -> FromImages:
     together = calibrated_alone(campaign, field_pass)
-    stepwise_result = stepwise(
-        [field_pass.control], campaign.laboratory, campaign.noise, held=GAUGE.held, tolerance=TOLERANCE
-    )
+    steps = stepwise([field_pass.control], campaign.laboratory, campaign.noise, held=GAUGE.held, tolerance=TOLERANCE)
     free = [n for n in together.names if n not in GAUGE.held]
-    error = {n: v for n, v in errors_of(campaign, field_pass, stepwise_result).items() if n not in GAUGE.held}
+    error = {n: v for n, v in errors_of(campaign, field_pass, steps).items() if n not in GAUGE.held}
     where = [together.names.index(n) for n in free]
-    value = dict(zip(stepwise_result.names, stepwise_result.values, strict=True))
+    value = dict(zip(steps.names, steps.values, strict=True))
     cameras = {
         line: camera.with_interior([value[f"{line} {k}"] for k in INTERIOR])
         for line, camera in campaign.laboratory.items()
@@ -579,7 +575,7 @@ def _field(campaign: Campaign, field_pass: FieldPass) -> FromImages:
         field_pass.name,
         int(field_pass.control.control.sum()),
         len(field_pass.check_ground),
-        stepwise_result,
+        steps,
         together,
         error,
         together.covariance[np.ix_(where, where)],
@@ -727,7 +723,7 @@ def _rendered(context: Context, seed: np.random.SeedSequence) -> Iterator[CheckR
         error, matched, wrong = matching(campaign)
         limit = setup_of(FIELDS).test.errors.image
         yield context.row("003.model.points", error, None, limit, matched=matched, wrong=wrong, **facts)
-    facts["rounds"] = ", ".join(str(f.stepwise_result.rounds) for f in fields)
+    facts["rounds"] = ", ".join(str(f.steps.rounds) for f in fields)
     for row, names, unit in (("bias", ROLL_PITCH, ARCSEC), ("interior", FREE_INTERIOR, 1e-6)):
         worst, sigma = (value / unit for value in max(f.rms(names) for f in fields))
         errors = " ".join(summary(f, names) for f in fields)

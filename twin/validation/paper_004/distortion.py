@@ -175,11 +175,8 @@ class SpotTest:
 
         A constant, f and p are fitted to these points.
         """
-        fits = [
-            _fitted(self.position[points], angle[points]),
-            _fitted(self.true_position[points], self.true_angle[points]),
-        ]
-        (f, rest), (f_true, rest_true) = fits
+        f, rest = _fitted(self.position[points], angle[points])
+        f_true, rest_true = _fitted(self.true_position[points], self.true_angle[points])
         return f - f_true, rms(rest - rest_true)
 
 
@@ -258,9 +255,7 @@ Facts = Mapping[str, Any]
 
 
 def _eq1(context: Context, tests: Sequence[SpotTest], facts: Facts) -> Iterator[CheckResult]:
-    printed, freed = (
-        np.array([_by_eq1(t, angle(t)) for t in tests]) for angle in (lambda t: t.angle, lambda t: t.zeroed)
-    )
+    printed, freed = (np.array([_by_eq1(t, w(t)) for t in tests]) for w in (lambda t: t.angle, lambda t: t.zeroed))
     left = rms([t.shifted(1, 2)[1] for t in tests])
     alone = rms([t.position - principal_distance(t.position, t.angle) * np.tan(t.angle) - t.camera.rest for t in tests])
     zero = rms([t.zero for t in tests])
