@@ -630,7 +630,7 @@ class VariedTransfer:
         cosines: np.ndarray,
         degree: int,
     ) -> VariedTransfer | None:
-        """Compute the parts of the transfer function that do not vary.
+        """Compute the parts of the transfer function that are the same for all varied wavefronts.
 
         Parameters
         ----------
