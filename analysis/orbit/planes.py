@@ -772,7 +772,9 @@ def along_track_angle(central_a: ArrayLike, side_a: ArrayLike, central_b: ArrayL
     axis = np.asarray(side_a, np.float64) + np.asarray(side_b, np.float64)
     length = float(np.linalg.norm(axis))
     if length < 1.0:
-        raise AngleError("along-track angle: the lines run in opposite directions; are pixels counted alike?")
+        raise AngleError(
+            "along-track angle: the lines run in opposite directions; are pixels counted in the same direction?"
+        )
     axis = axis / length
     return float(np.arctan2(axis @ np.cross(second, first), first @ second - (first @ axis) * (second @ axis)))
 

@@ -282,7 +282,7 @@ def _checked_points(image: ArrayLike, ground: ArrayLike) -> Array:
         )
     both = np.concatenate([left, right], axis=1)
     if not np.all(np.isfinite(both)):
-        raise ValueError("rational polynomials: coordinates must be finite; leave out other points")
+        raise ValueError("rational polynomials: coordinates must be finite; exclude other points")
     return both
 
 

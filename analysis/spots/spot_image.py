@@ -319,7 +319,7 @@ def as_images(mean: ArrayLike) -> Array:
     if image.ndim != 3 or image.shape[0] < 1 or min(image.shape[1:]) < LEAST_SIDE:
         raise ValueError(f"spots: mean images must be (B, H, W) of at least 6 x 6 px, found shape {image.shape}")
     if not np.isfinite(image.sum()):
-        raise ValueError("spots: mean images hold values that are not finite")
+        raise ValueError("spots: mean images contain values that are not finite")
     return image
 
 
@@ -441,7 +441,7 @@ def coarse(image: Array, frames: int, noise: NoiseModel) -> tuple[Array, Array, 
     peak = bins.reshape(count, -1).max(axis=1) - background
     variance = noise.temporal_variance_dn2(background, frames) + noise.fixed_variance_dn2(background)
     absent = peak < _DETECTION_SIGMAS * np.sqrt(variance) / size
-    reject(absent, f"no spot: nothing stands {_DETECTION_SIGMAS:g} sigma above the background")
+    reject(absent, f"no spot: no pixel is {_DETECTION_SIGMAS:g} sigma above the background")
     i, j = np.arange(rows), np.arange(columns)
     bright = bins - background[:, None, None]
     bright *= bright > 0.5 * peak[:, None, None]

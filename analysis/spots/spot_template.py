@@ -169,7 +169,7 @@ class SpotTemplate:
         flux = float(data.sum()) / oversampling**2
         if not flux > 0:
             raise UndeterminedError(
-                f"spot template: image holds no flux after background {background} is taken off (sum {flux:g})"
+                f"spot template: image contains no flux after background {background} is taken off (sum {flux:g})"
             )
         coefficients = ndimage.spline_filter(data / flux, order=_DEGREE, mode="mirror", output=np.float64)
         u, s, vt = np.linalg.svd(coefficients, full_matrices=False)

@@ -460,9 +460,7 @@ class ElasticBody:
         """Return the indices of the nodes that a bond holds."""
         chosen = np.flatnonzero(np.asarray(support.where(self.nodes), bool))
         if len(chosen) < 3 or _on_a_line(self.nodes[chosen]):
-            raise UnphysicalError(
-                f"a bonded support needs three nodes that are not on a line; it holds {len(chosen)} nodes"
-            )
+            raise UnphysicalError(f"a bonded support needs three nodes that are not on a line; it has {len(chosen)}")
         return chosen
 
     def _solved(self, load: np.ndarray, fixed: np.ndarray, values: np.ndarray) -> np.ndarray:

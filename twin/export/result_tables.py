@@ -77,7 +77,7 @@ NESTED = (
 DESCRIPTIONS: Mapping[str, tuple[str, str]] = FrozenMap(
     {
         "camera": ("", "name of the camera in the instrument"),
-        "channel": ("", "end of the line at which the area CCD stands: left is +Y of the focal plane"),
+        "channel": ("", "end of the line at which the area CCD is: left is +Y of the focal plane"),
         "state": ("", "before the disturbance or after it"),
         "estimator": ("", "estimator of the reading"),
         "row": ("px", "row of the spot's centre on the area CCD; 0 is the centre of the first"),

@@ -313,7 +313,7 @@ def _at_positions(quantity: Quantity[CameraQuality]) -> Quantity[CameraState]:
     return Quantity(
         quantity.key,
         lambda camera_state: camera_state.named(quantity.of(camera_state.camera)),
-        f"{quantity.meaning}, at places of the line",
+        f"{quantity.meaning}, at positions of the line",
     )
 
 

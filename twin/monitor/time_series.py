@@ -202,7 +202,7 @@ COURSE: Record[TimeSeries] = Record(
     Quantity("motions", lambda course: course.motions or None, "motions by body", record=_MOTIONS, where_known=True),
     Quantity("intersection_angle", _angle, "the angle between two cameras", where_known=True),
     Quantity("ground", lambda course: course.group("ground"), "errors of points on the ground", where_known=True),
-    Quantity("sigma_holds", lambda course: course.sigma_holds, "whether sigmas hold at each time"),
+    Quantity("sigma_holds", lambda course: course.sigma_holds, "true at the times at which the sigmas are valid"),
     Quantity("disturbances", _consistency, "whether all measurements agree with the prior", where_known=True),
     Quantity("between", _between, "filtered and smoothed changes between the times", where_known=True),
 )

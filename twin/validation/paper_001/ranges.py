@@ -609,7 +609,7 @@ def separation(experiment: MonitorExperiment, bench: Bench, trials: int, seed: i
 RETURNS: Mapping[str, tuple[tuple[float, float] | None, str]] = {
     "plane": (None, "as built"),
     "roof": (None, "as built; the ridge lies across the line"),
-    "roof along": ((0.0, 3e-3), "the ridge lies along the line; the area CCD stands beside its pinhole along the line"),
+    "roof along": ((0.0, 3e-3), "the ridge lies along the line; the area CCD is beside its pinhole along the line"),
     "corner": ((0.0, 0.0), "the spot falls on its own pinhole: the area CCD must see it through a beam splitter"),
 }
 """Kind of return reflector -> position of the area CCD for it, and a remark.
