@@ -322,7 +322,7 @@ def test_a_target(monkeypatch: pytest.MonkeyPatch) -> None:
     assert validate(JobSpec, parse_yaml(job)).render.target_images == ("star", "one_bar")
     assert json_schema("job")["$defs"]["RenderSpec"]["properties"]["images"]["items"]["enum"][-1] == "one_bar"
     ccd = line_ccd()
-    pupil = BandPupils.alike(circular_pupil(F_NUMBER), ccd.band)
+    pupil = BandPupils.achromatic(circular_pupil(F_NUMBER), ccd.band)
     view = View(ccd, pupil, identity(), np.zeros(2), 1000, np.zeros(2), REGION)
     image = view.image(registered(TARGETS)[2]["one_bar"](PITCH, REGION))
     # the optics take some light from the middle of the bar, and add nothing to its area

@@ -18,7 +18,7 @@ Functions, each with its own help, such as help(twin.load):
 Results:
 
     Shot                 of render: frames before and after, truth, verdict; save writes the run folder
-    Found                of recover: readings with their sigmas; compare lists them with the truth
+    Recovered            of recover: readings with their sigmas; compare lists them with the truth
     TestResult           of perform: numbers, summary, report
     InputError           raised for an input that cannot be used: file, line, key, what is allowed
 
@@ -49,17 +49,17 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from scenes.yaml.errors import InputError
     from twin.scripting.instrument_twin import InstrumentTwin, load, load_camera
-    from twin.scripting.results import Found, Shot, TestResult, perform
+    from twin.scripting.results import Recovered, Shot, TestResult, perform
     from twin.study.scripted import study
 
-__all__ = ["Found", "InputError", "InstrumentTwin", "Shot", "TestResult", "load", "load_camera", "perform", "study"]
+__all__ = ["InputError", "InstrumentTwin", "Recovered", "Shot", "TestResult", "load", "load_camera", "perform", "study"]
 
 _MODULES = {
     "load": "twin.scripting.instrument_twin",
     "load_camera": "twin.scripting.instrument_twin",
     "InstrumentTwin": "twin.scripting.instrument_twin",
     "Shot": "twin.scripting.results",
-    "Found": "twin.scripting.results",
+    "Recovered": "twin.scripting.results",
     "TestResult": "twin.scripting.results",
     "perform": "twin.scripting.results",
     "InputError": "scenes.yaml.errors",

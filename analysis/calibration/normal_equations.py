@@ -449,7 +449,7 @@ def assemble(
         axes, begin = site.axes, row
         for line, measured in site.rays.items():
             rays = shared.corrected(site.name, line, measured, state.shared)
-            rays = parameters.turned(state.values, site.name, line, rays)
+            rays = parameters.rotated(state.values, site.name, line, rays)
             camera, bias, offset = parameters.parts(state.values, site.name, line, cameras[line])
             points_of_rays, shift = ground[rays.point], axes @ offset
             by = partials(camera, rays, points_of_rays, bias, shift)

@@ -258,7 +258,7 @@ _SOUND_TO_BAD, _EXPLAINED, _MOST_PAIRED = 4, 0.01, 50
 _REMEDY = {
     "peak below": "the peak lies beyond the lower end of the scan, {low:.6g}, or too near to it; move the scan down",
     "peak above": "the peak lies beyond the upper end of the scan, {high:.6g}, or too near to it; move the scan up",
-    "few points": "fewer than {least} positions near the peak (about {place:.6g}); take steps of at most {step:.2g}",
+    "few points": "fewer than {least} positions near the peak (about {vertex:.6g}); take steps of at most {step:.2g}",
     "flat": "no curvature above the noise; scan a wider range or lower the noise (more frames or edge rows)",
     "not finite": "a position or a value is not finite; exclude the point or set its sigma to infinity",
 }
@@ -589,7 +589,7 @@ def _raise(
             "low": measured[0] if measured.size else np.nan,
             "high": measured[-1] if measured.size else np.nan,
             "least": LEAST_POINTS,
-            "place": vertex[b],
+            "vertex": vertex[b],
             # LEAST_POINTS in the window for any phase of the steps; less a quarter, because too few points look wide.
             "step": 0.75 * 2 * half_width[b] / LEAST_POINTS,
         }

@@ -550,9 +550,9 @@ def _consistency(name: str, residual: Array, spread: Array, rows: Array) -> Cons
         return ConsistencyTest.of(name, 0.0, 0)
     pull, stiff = rows.T @ residual, rows.T @ spread @ rows
     values, vectors = np.linalg.eigh(stiff)
-    held = values > _NO_RANK * max(1.0, float(values[-1]))
-    parts = (vectors.T @ pull)[held]
-    return ConsistencyTest.of(name, float(np.sum(parts**2 / values[held])), int(np.sum(held)))
+    determined = values > _NO_RANK * max(1.0, float(values[-1]))
+    parts = (vectors.T @ pull)[determined]
+    return ConsistencyTest.of(name, float(np.sum(parts**2 / values[determined])), int(np.sum(determined)))
 
 
 def _consistency_of_many(name: str, residual: Array, left: Array, fitted: int) -> ConsistencyTest:

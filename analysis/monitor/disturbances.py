@@ -146,14 +146,14 @@ class TimeLaw:
         return out
 
 
-def step_probability(chances: Sequence[tuple[float, float]], time: ArrayLike) -> Array:
+def step_probability(probabilities: Sequence[tuple[float, float]], time: ArrayLike) -> Array:
     """Return the probability that a step has occurred by a time in seconds (any shape).
 
-    ``chances`` are pairs of a time and this probability, linear between; one pair for a step at a known time.
+    ``probabilities`` are pairs of a time and this probability, linear between; one pair for a step at a known time.
     """
-    at, chance = np.array(chances).T
+    at, probability = np.array(probabilities).T
     when = np.asarray(time, np.float64)
-    return np.asarray((when >= at[0]) * chance[0] if len(at) == 1 else np.interp(when, at, chance))
+    return np.asarray((when >= at[0]) * probability[0] if len(at) == 1 else np.interp(when, at, probability))
 
 
 @shows("name", "labels", "spots [px]")

@@ -274,7 +274,7 @@ class Posterior(Estimator):
         """
         prior = shifts.disturbances
         if prior is None:
-            raise ValueError("posterior: needs stated disturbances")
+            raise ValueError("posterior: needs a prior of disturbances")
         return prior.best_gain(shifts.covariance)
 
 

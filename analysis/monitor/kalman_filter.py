@@ -379,13 +379,13 @@ class SeriesFilter:
             The reading has no noise and repeats what is known exactly.
         """
         if not observed.spots:
-            held = current.pending and replace(
+            deferred = current.pending and replace(
                 current.pending, ingested=self.update(current.pending.ingested, observed)[0]
             )
             now = self.at(replace(current, pending=None), observed.time)
             state, innovation = self.ingested(now.state, observed)
             search = None if now.search is None else self.ingested(now.search, observed)[0]
-            return replace(now, state=state, search=search, pending=held), innovation
+            return replace(now, state=state, search=search, pending=deferred), innovation
         pending = current.pending
         trial = self._evaluate(replace(current, pending=None), observed, pending is not None)
         if pending is not None:
@@ -400,8 +400,8 @@ class SeriesFilter:
             )
         if not sure and may_be_bad(trial.bad, trial.log_odds, trial.before.recent):
             innovation = replace(trial.innovation, bad=trial.bad)
-            held = PendingReading(self._with_detection(trial.after)[0], innovation, trial.log_odds)
-            return replace(trial.before, recent=(*trial.before.recent, True)[-RECENT:], pending=held), innovation
+            deferred = PendingReading(self._with_detection(trial.after)[0], innovation, trial.log_odds)
+            return replace(trial.before, recent=(*trial.before.recent, True)[-RECENT:], pending=deferred), innovation
         after = replace(trial.after, recent=(*trial.after.recent, False)[-RECENT:])
         now, jump = self._with_detection(after, True)
         return now, replace(trial.innovation, jump=jump)

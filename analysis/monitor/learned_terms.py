@@ -168,8 +168,8 @@ class Input(Term):
         end = int(np.searchsorted(self.times, time, side="right"))
         if not end or time - self.times[end - 1] > self.gap:
             return float("nan"), float("nan")
-        reach = self.window if self.lag is None else _FORGOTTEN * self.lag * np.exp(x)
-        begin = end - 1 if reach is None else int(np.searchsorted(self.times, time - reach, side="right"))
+        length = self.window if self.lag is None else _FORGOTTEN * self.lag * np.exp(x)
+        begin = end - 1 if length is None else int(np.searchsorted(self.times, time - length, side="right"))
         begin = min(begin if self.lag is None else max(begin - 1, 0), end - 1)
         weights = np.full(end - begin, 1.0 / (end - begin))
         if self.lag is not None:

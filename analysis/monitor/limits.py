@@ -456,7 +456,7 @@ class HeavyTail:
         Degrees of freedom of Student's distribution.
     rms : (Q,) ndarray
         Root of the mean square error, in the units of the quantities.
-    held : (3, Q) ndarray
+    half_widths : (3, Q) ndarray
         Half widths of the intervals that contain the error with the probabilities 68.3 %, 95.4 % and 99.7 %.
     beyond : (Q,) ndarray
         Probability of an error beyond 3 of the reported sigmas, 0.0027 for a normal prior.
@@ -464,7 +464,7 @@ class HeavyTail:
 
     degrees: float
     rms: Array
-    held: Array
+    half_widths: Array
     beyond: Array
 
 
@@ -486,8 +486,8 @@ def prior_numbers(disturbances: Disturbances) -> dict[str, list[int]]:
     out: dict[str, list[int]] = {}
     for k, (cause, what) in enumerate(zip(disturbances.causes, whats, strict=True)):
         kind = what.split()[0]
-        alike = kind != "figure" and len(sizes[cause, kind]) == 1
-        out.setdefault(f"{cause} {kind if alike else what}", []).append(k)
+        shared = kind != "figure" and len(sizes[cause, kind]) == 1
+        out.setdefault(f"{cause} {kind if shared else what}", []).append(k)
     return out
 
 
@@ -605,7 +605,7 @@ def heavy_tails(
     return HeavyTail(
         degrees=degrees,
         rms=np.sqrt(np.maximum(mean * diagonal.sum(axis=1) + root**2 * across + by_noise, 0.0)),
-        held=np.stack([_half_widths(sigma, level) for level in _LEVELS]),
+        half_widths=np.stack([_half_widths(sigma, level) for level in _LEVELS]),
         beyond=np.mean(2.0 * ndtr(-3.0 * normal / np.where(sigma > 0.0, sigma, np.inf)), axis=0),
     )
 
@@ -633,9 +633,9 @@ def _half_widths(sigma: Array, level: float) -> Array:
     width = np.zeros(sigma.shape[1])
     for _ in range(_STEPS):
         ratio = width * inverse
-        held = np.mean(1.0 - 2.0 * ndtr(-ratio), axis=0) + sure
+        probability = np.mean(1.0 - 2.0 * ndtr(-ratio), axis=0) + sure
         slope = np.sqrt(2.0 / np.pi) * np.mean(np.exp(-0.5 * ratio**2) * inverse, axis=0)
-        step = np.maximum(level - held, 0.0) / np.where(slope > 0.0, slope, np.inf)
+        step = np.maximum(level - probability, 0.0) / np.where(slope > 0.0, slope, np.inf)
         width = width + step
         if np.all(step <= _ROUNDING * width):
             return width

@@ -151,14 +151,14 @@ class ObservabilityReport:
         Names of the P motions that the model fits.
     motions : tuple of MotionReport
         Report on each motion.
-    statements : tuple of str
+    sentences : tuple of str
         Sentences that name the motions that cannot be separated.
     """
 
     rank: int
     family: tuple[str, ...]
     motions: tuple[MotionReport, ...]
-    statements: tuple[str, ...]
+    sentences: tuple[str, ...]
 
 
 def observability(
@@ -239,11 +239,11 @@ def observability(
         rank=rank,
         family=tuple(family_names),
         motions=tuple(reports),
-        statements=tuple(_statements(reports, family_names, rank, len(spots))),
+        sentences=tuple(_sentences(reports, family_names, rank, len(spots))),
     )
 
 
-def _statements(reports: list[MotionReport], family: list[str], rank: int, coordinates: int) -> list[str]:
+def _sentences(reports: list[MotionReport], family: list[str], rank: int, coordinates: int) -> list[str]:
     """Return sentences on what the spots can separate: all fitted motions together, then each misreported motion."""
     seen = "Four" if coordinates == 4 else str(coordinates)
     lines = [

@@ -382,7 +382,7 @@ def exact(
     nominal = abs(forward_look_rad - backward_look_rad)
     if nominal < 1e-3:
         raise UndeterminedError(
-            "intersection angle: the cameras look the same way, their angle has no direction to change in"
+            "intersection angle: the lines of sight are parallel, so that the plane of the angle is undefined"
         )
     rotations = (forward.d_alpha_rad, forward.d_beta_rad, backward.d_alpha_rad, backward.d_beta_rad)
     angles_now = np.stack(np.broadcast_arrays(*(np.asarray(angle, np.float64) for angle in rotations)))
@@ -495,7 +495,7 @@ class GroundGeometry:
         if any(abs(math.sin(a)) * (EARTH_RADIUS_M + self.altitude_m) >= EARTH_RADIUS_M for a in self.looks_rad):
             raise UndeterminedError("ground error: a camera looks past the Earth")
         if abs(self.looks_rad[0] - self.looks_rad[1]) < 1e-3:
-            raise UndeterminedError("ground error: the cameras look the same way, their rays do not meet in one point")
+            raise UndeterminedError("ground error: the lines of sight are parallel and do not intersect")
 
     @cached_property
     def incidences_rad(self) -> tuple[float, float]:

@@ -45,7 +45,7 @@ from analysis.spots.likelihood import FALSE_ALARM, FitStates, fit_states, requir
 from analysis.spots.spot_image import NoiseParts, SpotPositions, difference_covariance, noise_parts
 from optics.numerics.extension_table import EntryPointError
 
-ALIKE = 2.0
+EXPLAINED = 2.0
 """Largest ratio of a spot core's chi-square per degree of freedom to the variance of the frames' noise (in units of the
 specified variance) at which that noise still explains the misfit.
 """
@@ -122,7 +122,7 @@ class SpotEvidence:
         return cls(parts[0].before, FitStates.joined([part.after for part in parts]))
 
     @property
-    def holds(self) -> NDArray[np.bool_]:
+    def consistent(self) -> NDArray[np.bool_]:
         """True for states in which all spots have the assumed shape and noise, before and after, (S,).
 
         Dimensions: S states.
@@ -152,7 +152,7 @@ class SpotEvidence:
         names : sequence of str
             Names of the spots.
         """
-        warning, bad = self.doubt(self.worst, names), int(np.count_nonzero(~self.holds))
+        warning, bad = self.doubt(self.worst, names), int(np.count_nonzero(~self.consistent))
         return None if warning is None else f"at {moments[self.worst]}, the worst of {bad} times: {warning.text}"
 
     def doubt(self, state: int = 0, names: Sequence[str] = ()) -> SpotWarning | None:
@@ -165,7 +165,7 @@ class SpotEvidence:
         names : sequence of str
             Names of the spots; their indices if not given.
         """
-        if self.holds[state]:
+        if self.consistent[state]:
             return None
         first = self.before.at(slice(0, 1) if len(self.before.whole) == 1 else slice(state, state + 1))
         last = self.after.at(slice(state, state + 1))
@@ -210,7 +210,7 @@ class SpotEvidence:
 def _noisy(fit: FitStates, k: int) -> bool:
     """Return True if the noise of the frames explains the misfit of spot k, which is then about equal everywhere."""
     noise, whole, core = (float(v[0, k]) for v in (fit.noise, fit.whole, fit.core))
-    return noise > LOUD and whole < LOUD * noise and core < ALIKE * noise
+    return noise > LOUD and whole < LOUD * noise and core < EXPLAINED * noise
 
 
 def _number(value: float) -> str:
@@ -294,7 +294,7 @@ class Curvature(StateArrays):
     rests: NDArray[np.bool_]
 
     @property
-    def holds(self) -> NDArray[np.bool_]:
+    def valid(self) -> NDArray[np.bool_]:
         """True where the readings are valid, because they are linear or because the iteration converged, (S,).
 
         Dimensions: S states.

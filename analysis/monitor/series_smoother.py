@@ -144,7 +144,7 @@ def _series(
     if when.ndim != 1 or values.shape != (len(when), size) or not len(when):
         raise ValueError(f"series: {when.shape} times need values ({when.size}, {size}), found {values.shape}")
     if not (np.all(np.isfinite(when)) and np.all(np.isfinite(values))):
-        raise ValueError("series: times and values must be finite; leave out what was not measured")
+        raise ValueError("series: times and values must be finite; exclude missing values")
     if not hasattr(noise, "covariance"):
         noise = np.asarray(noise, np.float64)
         if noise.shape != (size, size):

@@ -123,7 +123,7 @@ class _Transition:
         Factor by which each state decays over the interval, 0 to 1.
     kept_both : (n, n) ndarray
         Factor by which the product of two states decays over the interval.
-    turned : tuple of (slice, ndarray)
+    rotated : tuple of (slice, ndarray)
         For each law with a period its states, and the matrix of their rotation.
     gained : (n, n) ndarray
         Process noise: covariance that the time laws without events add to the states in the interval.
@@ -131,7 +131,7 @@ class _Transition:
 
     kept: Array
     kept_both: Array
-    turned: tuple[tuple[slice, Array], ...]
+    rotated: tuple[tuple[slice, Array], ...]
     gained: Array
 
 
@@ -344,7 +344,7 @@ class StateSpace:
             return states
         over = self._transition(now - then)
         out = np.asarray(states * over.kept[:, None])
-        for at, rotation in over.turned:
+        for at, rotation in over.rotated:
             out[..., at, :] = (rotation.T if back else rotation) @ out[..., at, :]
         return out
 
@@ -370,7 +370,7 @@ class StateSpace:
             return square
         over = self._transition(now - then)
         out = np.asarray(square * over.kept_both)
-        for at, rotation in over.turned:
+        for at, rotation in over.rotated:
             rotation = rotation.T if back else rotation
             strip = rotation @ out[at]
             rotated = strip[:, at] @ rotation.T
@@ -382,15 +382,15 @@ class StateSpace:
         if over not in self._transitions:
             if len(self._transitions) > _INTERVALS:
                 self._transitions.clear()
-            kept, turned, gained = np.ones(self.size), [], np.zeros((self.size, self.size))
+            kept, rotated, gained = np.ones(self.size), [], np.zeros((self.size, self.size))
             for block in self._blocks:
                 kept[block.at] = _kept(block.law, over)
                 if not block.law.event:
                     self._add(gained, block, (1.0 - _kept(block.law, over) ** 2) * block.covariance)
             for at, period, still, quarter in self._turning:
                 angle = 2.0 * math.pi * over / period
-                turned.append((at, math.cos(angle) * still + math.sin(angle) * quarter))
-            self._transitions[over] = _Transition(kept, kept[:, None] * kept, tuple(turned), gained)
+                rotated.append((at, math.cos(angle) * still + math.sin(angle) * quarter))
+            self._transitions[over] = _Transition(kept, kept[:, None] * kept, tuple(rotated), gained)
         return self._transitions[over]
 
     @cached_property

@@ -399,8 +399,8 @@ def _waves(position: Array, frequency: Array, numbers: tuple[int, ...]) -> Array
     Dimensions: K harmonics, N pixels.
     """
     phase = 2.0 * np.pi * (frequency @ position)
-    turned = np.outer((1, *numbers), phase)
-    pairs = np.stack([np.cos(turned), np.sin(turned)], axis=1).reshape(-1, phase.size)
+    rotated = np.outer((1, *numbers), phase)
+    pairs = np.stack([np.cos(rotated), np.sin(rotated)], axis=1).reshape(-1, phase.size)
     return np.concatenate([np.ones((1, phase.size)), pairs])
 
 
@@ -603,8 +603,8 @@ def page_warnings(result: EdgeMtf | BarMtf, step: float) -> list[str]:
         out.append(f"{same} pages are identical to another one and do not count: were they copied?")
     if noise < _ROUGH * step:
         out.append(
-            f"the noise of {noise:.2g} in a pixel is below {_ROUGH:g} of the step of {step:g} between grey values,"
-            " so that rounding does not average out over pixels and pages; sigma includes it. A higher gain helps"
+            f"the noise of a pixel, {noise:.2g} grey values, is below {_ROUGH:g} of the grey-value step of {step:g}, so"
+            " that rounding does not average out over pixels and pages; sigma includes rounding. A higher gain helps"
         )
     if isinstance(result, EdgeMtf) and result.doubt:
         out.append(result.doubt)

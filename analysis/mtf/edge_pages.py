@@ -211,7 +211,7 @@ class _Shift:
         return float(p_value_of(self.chi_square, 2 * (len(self.line) - 1))) if len(self.line) > 1 else 1.0
 
     @property
-    def turned(self) -> bool:
+    def rotated(self) -> bool:
         """True if the edge rotates from page to page in addition to being shifted."""
         slope = self.line[:, 1] - self.line[:, 1].mean()
         chi_square = float(np.sum(slope**2 / self.covariance[:, 1, 1]))
@@ -419,7 +419,7 @@ def _aligned(pages: Array, line: EdgeLine, stack: _Stack | None, run: _Run) -> E
         new = current.levels + shift.levels * gain[:, None]
         significance = np.abs(change) / np.sqrt(np.diagonal(shift.covariance, axis1=1, axis2=2))
         current = _fitted(flat, current.line + change, new, stack.bend)
-        if not turning and number >= _SETTLED and shift.turned:
+        if not turning and number >= _SETTLED and shift.rotated:
             turning = True
         elif number >= _SETTLED and np.max(significance) < _DONE:
             break

@@ -205,8 +205,8 @@ def edge_result(
     covariance = spread.covariance(design, variance)
     transfer, gradient = spread.transform(frequency)
     modulus = np.abs(transfer)
-    turned = gradient * np.exp(-1j * np.angle(transfer))
-    along, across = (np.sqrt(np.sum(part * (covariance @ part), axis=0)) for part in (turned.real, turned.imag))
+    rotated = gradient * np.exp(-1j * np.angle(transfer))
+    along, across = (np.sqrt(np.sum(part * (covariance @ part), axis=0)) for part in (rotated.real, rotated.imag))
     signal = signal_modulus(modulus, along, across)
 
     slope_sigma, curvature, curvature_sigma, squares = _path_errors(fitted, grey - model, variance)
@@ -524,7 +524,7 @@ class EdgeMtf:
         return (
             f"the region contains structure of {share:.2g} of the contrast (rms of means over blocks and strips, p ="
             f" {self.structure.p_value:.1g}) that a {form} edge between two planes does not explain:"
-            " light that is not a plane, a rough edge, specks, or noise correlated between pixels. sigma does not"
+            " uneven light, a rough edge, specks, or noise correlated between pixels. sigma does not"
             " include its effect on the MTF: use even light or a smaller region"
         )
 

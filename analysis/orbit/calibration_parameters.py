@@ -487,7 +487,7 @@ class Parameters:
             return np.zeros(len(rays.point))
         return np.asarray(rays.time - self.middles[name])
 
-    def turned(self, values: Array, name: str, line: str, rays: Rays) -> Rays:
+    def rotated(self, values: Array, name: str, line: str, rays: Rays) -> Rays:
         """Return rays whose attitude includes the drift of the bias since the middle of the field.
 
         Parameters

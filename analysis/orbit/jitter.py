@@ -628,7 +628,7 @@ _MOST_ALIASES = 24
 """Largest number of alias frequencies that are tried instead of a detected line's frequency, those of highest power
 first.
 """
-_ALIKE = 0.8
+_SIMILAR = 0.8
 """Smallest approximate power of a candidate alias, as a fraction of the power of the detected oscillation."""
 
 
@@ -941,7 +941,7 @@ def _unaliased(
     frequency, power = peaks(beside, *band)
     near = np.abs(frequency - at) <= cell
     noise, margin = _left(observations, fitted) / observations.freedom, 2.0 * np.log(1.0 / false_alarm)
-    least = _ALIKE * float(power[near].max(initial=0.0)) - margin * noise
+    least = _SIMILAR * float(power[near].max(initial=0.0)) - margin * noise
     distinct = np.all(np.abs(frequency[:, None] - fitted.frequency) > cell, axis=1)
     fits = [(_left(observations, fitted), fitted)]
     for candidate in frequency[distinct & (power >= least)][:_MOST_ALIASES]:

@@ -665,7 +665,8 @@ def line_frame(plane: PlaneFit, tangent: ArrayLike, bend: float = 0.0) -> LineFr
     Parameters
     ----------
     plane : PlaneFit
-        Plane fitted to the line's points; not the printed one.
+        Plane fitted to the line's points. The method "printed" (the paper's equations as printed) is not allowed: its
+        plane does not contain the points.
     tangent : (n,) array_like
         Tangent of the angle of each of the plane's n points from the line of sight along the CCD line, from its pixel
         number and the interior orientation; either sense of counting.
@@ -677,7 +678,7 @@ def line_frame(plane: PlaneFit, tangent: ArrayLike, bend: float = 0.0) -> LineFr
     Raises
     ------
     AngleError
-        The plane is the printed one, the tangents are not (n,) finite numbers, or they do not match the points.
+        The method is "printed", the tangents are not (n,) finite numbers, or they do not match the points.
     """
     if plane.method == "printed":
         raise AngleError("central ray: the printed plane does not contain its points")
@@ -771,7 +772,9 @@ def along_track_angle(central_a: ArrayLike, side_a: ArrayLike, central_b: ArrayL
     axis = np.asarray(side_a, np.float64) + np.asarray(side_b, np.float64)
     length = float(np.linalg.norm(axis))
     if length < 1.0:
-        raise AngleError("along-track angle: the lines run in opposite directions; are pixels counted alike?")
+        raise AngleError(
+            "along-track angle: the lines run in opposite directions; are pixels counted in the same direction?"
+        )
     axis = axis / length
     return float(np.arctan2(axis @ np.cross(second, first), first @ second - (first @ axis) * (second @ axis)))
 

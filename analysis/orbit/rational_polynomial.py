@@ -153,9 +153,9 @@ class RationalPolynomial:
 
     def _scaled(self, latitude: ArrayLike, longitude: ArrayLike, height: ArrayLike) -> Array:
         """Return scaled latitude, longitude and height (..., 3); longitudes may differ by a whole circle."""
-        place = np.stack(np.broadcast_arrays(latitude, longitude, height), axis=-1) - self.offset[2:]
-        place[..., 1] = np.remainder(place[..., 1] + 180.0, 360.0) - 180.0
-        return np.asarray(place / self.scale[2:])
+        position = np.stack(np.broadcast_arrays(latitude, longitude, height), axis=-1) - self.offset[2:]
+        position[..., 1] = np.remainder(position[..., 1] + 180.0, 360.0) - 180.0
+        return np.asarray(position / self.scale[2:])
 
     def text(self) -> str:
         """Return the polynomials as the text of a file NAME_RPC.TXT, which GDAL reads beside NAME.tif."""
@@ -245,8 +245,8 @@ def fit_rpc(
     """
     points = _checked_points(image, ground)
     if check is None:
-        held = np.arange(len(points)) % 4 == 3
-        points, others = points[~held], points[held]
+        checked = np.arange(len(points)) % 4 == 3
+        points, others = points[~checked], points[checked]
     else:
         others = _checked_points(*check)
     ends = np.stack([np.min(points, axis=0), np.max(points, axis=0)])
@@ -284,7 +284,7 @@ def _checked_points(image: ArrayLike, ground: ArrayLike) -> Array:
         )
     both = np.concatenate([left, right], axis=1)
     if not np.all(np.isfinite(both)):
-        raise ValueError("rational polynomials: coordinates must be finite; leave out other points")
+        raise ValueError("rational polynomials: coordinates must be finite; exclude other points")
     return both
 
 

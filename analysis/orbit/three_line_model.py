@@ -154,7 +154,7 @@ class LineModel:
     @cached_property
     def axes(self) -> Array:
         """Rotation (3, 3) from the axes of the drifted camera to the body's."""
-        return np.asarray(self.to_body @ self._turned)
+        return np.asarray(self.to_body @ self._rotated)
 
     @property
     def principal_distance(self) -> Array:
@@ -185,7 +185,7 @@ class LineModel:
             A ground point is behind the camera.
         """
         f, mounted = self.principal_distance, (body - self.position) @ self.to_body
-        a, b, c = np.ascontiguousarray((mounted @ self._turned).T)
+        a, b, c = np.ascontiguousarray((mounted @ self._rotated).T)
         if np.any(c <= 0):
             raise UndeterminedError("three-line model: a ground point lies behind a camera")
         position = image - self.interior[1:]
@@ -195,7 +195,7 @@ class LineModel:
         by_camera = np.zeros((len(c), 2, 3), np.result_type(c, f))
         by_camera[:, 0, 0] = by_camera[:, 1, 1] = f / c
         by_camera[:, :, 2] = (-f / c)[:, None] * along
-        slopes = np.concatenate(self._turned_slopes, axis=1)
+        slopes = np.concatenate(self._rotated_slopes, axis=1)
         slopes = (mounted @ slopes).reshape(-1, 3, 3).swapaxes(1, 2)
         by_drift = np.concatenate([by_camera @ slopes, along[:, :, None]], axis=2)
         return Seen(
@@ -203,12 +203,12 @@ class LineModel:
         )
 
     @cached_property
-    def _turned(self) -> Array:
+    def _rotated(self) -> Array:
         """Rotation matrix (3, 3) of the camera's drift: Rx(d_beta) Ry(d_alpha) Rz(d_gamma)."""
         return bias_rotation(self._angles)
 
     @cached_property
-    def _turned_slopes(self) -> tuple[Array, ...]:
+    def _rotated_slopes(self) -> tuple[Array, ...]:
         """Derivatives of the drift's rotation matrix with respect to d_alpha, d_beta, d_gamma, per radian."""
         slopes = _rotation_slopes(self._angles)
         return tuple(slopes[axis] for axis in _DRIFT_AXIS)

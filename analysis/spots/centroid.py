@@ -177,10 +177,10 @@ def _gauss(image: Array, frames: int, noise: NoiseModel, radius: float, elliptic
     count, full_height, full_width = image.shape
     row, column, background, peak, area = spot_image.coarse(image, frames, noise)
     spot_image.check_edge(np.stack([row, column], axis=1), full_height, full_width, radius)
-    reach = int(np.ceil(radius)) + _GAUSS_MOVE_PX + 2
+    half_width = int(np.ceil(radius)) + _GAUSS_MOVE_PX + 2
     full = np.array([full_height, full_width])
-    height, width = np.minimum(2 * reach + 1, full).tolist()
-    corner = np.stack([row, column], axis=1).round().astype(np.intp) - reach
+    height, width = np.minimum(2 * half_width + 1, full).tolist()
+    corner = np.stack([row, column], axis=1).round().astype(np.intp) - half_width
     corner = np.clip(corner, 0, full - [height, width])
     rows = (corner[:, :1] + np.arange(height))[:, :, None]
     columns = (corner[:, 1:] + np.arange(width))[:, None, :]

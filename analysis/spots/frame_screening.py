@@ -207,7 +207,7 @@ def position_scatter(offset: Array, spread: Array, count: int) -> Array:
 
 
 Released = Callable[[NDArray[Any]], None]
-_HELD = 1 << 25
+_BATCH_BYTES = 1 << 25
 """Number of bytes of frames that are processed at a time, to limit memory."""
 GROWTH_SIGMAS = 3.5
 """Residual, in sigmas, above which a pixel next to a transient (cosmic ray) counts as part of it."""
@@ -228,7 +228,7 @@ _NOISE_OFF, _MOST_SIGMAS = 0.15, 4.0
 
 The limit excludes cosmic rays from the estimate of the noise.
 """
-_LIT = 0.02
+_ILLUMINATED = 0.02
 """Fraction of the peak from which a pixel is illuminated, so that movement and smear look like noise there."""
 _LEAST_LEVEL_DN = 1.0
 """Smallest difference of the frames' level below the dark level, DN, that counts as a subtracted dark level."""
@@ -361,7 +361,7 @@ class _Stack:
         each = self.frames.itemsize * self.frames[0].size
         for k, number in enumerate(self.numbers[::-1] if backwards else self.numbers):
             yield self._read(self.frames[number], self.bad)
-            if (k + 1) * each // _HELD != k * each // _HELD:
+            if (k + 1) * each // _BATCH_BYTES != k * each // _BATCH_BYTES:
                 self.released(self.frames)
         self.released(self.frames)
 
@@ -394,8 +394,8 @@ class _Stack:
             True to replace undefined values by that median instead of 0.
         """
         out = np.empty(self.shape)
-        rows = max(1, _HELD // (24 * len(self) * self.shape[1]))
-        batch = max(1, _HELD // (self.frames.itemsize * self.frames[0].size))
+        rows = max(1, _BATCH_BYTES // (24 * len(self) * self.shape[1]))
+        batch = max(1, _BATCH_BYTES // (self.frames.itemsize * self.frames[0].size))
         for start in range(0, self.shape[0], rows):
             band = slice(start, start + rows)
             values = np.empty((len(self), *out[band].shape))
@@ -674,7 +674,7 @@ def noise_ratio(
     if noise.frame_variance_dn2(low) < MEASURABLE**2 + ROUNDING_VARIANCE:
         # the variance of the grey values depends on the level between two steps
         return None
-    beside = middle < low + _LIT * (float(middle.max()) - low) if where is None else where
+    beside = middle < low + _ILLUMINATED * (float(middle.max()) - low) if where is None else where
     beside = beside & ~stack.bad
     sigma = np.sqrt(2.0 * noise.frame_variance_dn2(middle))
     squares, fewest = [], middle.size

@@ -46,7 +46,7 @@ _MOST_DAMPED = 100
 # Median of the square of a standard normal number.
 _MEDIAN_SQUARE = 0.4549364231195724
 # Of so many pixels one is in that median, which then scatters by 5 %.
-_EVERY = 4
+_STRIDE = 4
 _HALVINGS = 6
 
 EDGE_PX = 10.0
@@ -159,7 +159,7 @@ def _score(
         light_dn=noise.light_signal_dn(level).reshape(count, height, width) if keep_maps else None,
         core_chi_square=np.sum(square * core, axis=1) / many,
         degrees=degrees,
-        median_square=np.median(square[:, ::_EVERY], axis=1) / _MEDIAN_SQUARE,
+        median_square=np.median(square[:, ::_STRIDE], axis=1) / _MEDIAN_SQUARE,
     )
 
 
@@ -250,12 +250,12 @@ class _Rule:
             end = np.where(worse[:, None], 0.5 * (start + end), end)
         return end
 
-    def deviance(self, found: _Scored) -> Array:
+    def deviance(self, fit: _Scored) -> Array:
         """Return minus twice the log-likelihood of each spot at the last step, (B,).
 
         Dimensions: B spots.
         """
-        return np.asarray(np.sum(found.residual**2 * found.weight - np.log(found.weight), axis=1))
+        return np.asarray(np.sum(fit.residual**2 * fit.weight - np.log(fit.weight), axis=1))
 
 
 def _second_start(
@@ -305,10 +305,10 @@ def _second_start(
         if not resting[k] or gain > 0.0:
             out[k] = second.theta[0]
         if resting[k] and apart > _AGREE_PX and abs(gain) < _DECISIVE * max(1.0, least):
-            places = ", ".join(
+            positions = ", ".join(
                 f"({row:.2f}, {column:.2f})" for row, column in (first.theta[k, :2], second.theta[0, :2])
             )
-            unclear[k] = f"its shape fits equally well at two positions, {places} px, so that neither is reliable"
+            unclear[k] = f"its shape fits equally well at two positions, {positions} px, so that neither is reliable"
     if unclear:
         raise SpotError(unclear)
     return out
@@ -323,7 +323,7 @@ def _start(rule: _Rule, image: Array, theta: Array, which: NDArray[np.intp]) -> 
     size = (min(_NEAR_PX, height), min(_NEAR_PX, width))
     corner = np.rint(theta[:, :2] - 0.5 * (np.array(size) - 1)).astype(np.intp)
     corner = np.clip(corner, 0, np.array([height, width]) - size)
-    near = np.stack([one[r : r + size[0], c : c + size[1]] for one, (r, c) in zip(image, corner, strict=True)])
+    near = np.stack([mean[r : r + size[0], c : c + size[1]] for mean, (r, c) in zip(image, corner, strict=True)])
     flat = near.reshape(len(image), -1)
     for _ in range(_NEAR_STEPS):
         design, level = spot_image.template_model(theta, which, rule.template, (corner, size))

@@ -246,9 +246,9 @@ def photon_transfer(dark: NDArray[Any], flat: NDArray[Any]) -> PhotonTransfer:
         noise_sigma = math.hypot(noise_sigma, _square_root_sigma(dark_rest, dark_doubt) / gain)
     left, dark_left = variance / len(day), dark_variance / len(night)
     stays, dark_stays = ROUNDING_VARIANCE - steps, ROUNDING_VARIANCE - dark_steps
-    hidden = float(systematic_variance(0.0, low, 1.0))
-    dsnu, dsnu_sigma = _pattern(level, good, (dark_left, dark_stays), hidden)
-    prnu, prnu_sigma = _pattern(light - level, good, (left, dark_left, stays + dark_stays), hidden)
+    rounding = float(systematic_variance(0.0, low, 1.0))
+    dsnu, dsnu_sigma = _pattern(level, good, (dark_left, dark_stays), rounding)
+    prnu, prnu_sigma = _pattern(light - level, good, (left, dark_left, stays + dark_stays), rounding)
     return PhotonTransfer(
         gain_dn_per_e=gain,
         gain_sigma=gain * spread / shot,
@@ -267,17 +267,17 @@ def _pattern_square(image: Array, good: Mask) -> float:
     return float(np.square(rest[good]).sum() / max(np.count_nonzero(good) - 6, 1))
 
 
-def _pattern(image: Array, good: Mask, noise: tuple[float, ...], hidden: float) -> tuple[float, float]:
+def _pattern(image: Array, good: Mask, noise: tuple[float, ...], rounding: float) -> tuple[float, float]:
     """Return the standard deviation over pixels of a fixed pattern, corrected for noise, and its uncertainty.
 
-    ``hidden`` is the variance by which rounding may have changed the pattern, in either direction.
+    ``rounding`` is the variance by which rounding may have changed the pattern, in either direction.
     """
     square = whole = _pattern_square(image, good)
     for part in noise:
         square -= part
     spread = whole * math.sqrt(2.0 / int(np.count_nonzero(good)))
-    if hidden > _NOTHING:
-        spread = math.hypot(spread, hidden)
+    if rounding > _NOTHING:
+        spread = math.hypot(spread, rounding)
     return math.sqrt(max(square, 0.0)), _square_root_sigma(square, spread)
 
 

@@ -175,7 +175,7 @@ class ScreenedFit:
         return float(max(np.sqrt(value / (noisier * spread)), 1.0 + 1e-9))
 
 
-def one_shape(template: SpotTemplate, index: int, shape: tuple[int, int]) -> SpotTemplate:
+def single_template(template: SpotTemplate, index: int, shape: tuple[int, int]) -> SpotTemplate:
     """Return one of the shapes of a template, for images of another size.
 
     Parameters
@@ -298,7 +298,7 @@ def fit_screened(
     return ScreenedFit(
         positions=positions,
         terms=terms,
-        others=np.array([place for place, _ in fits_of_others]).reshape(-1, 3),
+        others=np.array([position for position, _ in fits_of_others]).reshape(-1, 3),
         others_sigma=np.array([sigma for _, sigma in fits_of_others]).reshape(-1, 3),
         smear=model.smear_of(theta),
         level=level.reshape(shape),
@@ -384,9 +384,9 @@ class _Model:
     def _smear(self) -> int:
         return self._others + 3 * len(self.terms.others)
 
-    def first(self, place: tuple[float, float], flux: float, level: float) -> Array:
+    def first(self, position: tuple[float, float], flux: float, level: float) -> Array:
         theta = np.zeros(self._smear + 3 * self.terms.smear)
-        theta[:4] = *place, flux, level
+        theta[:4] = *position, flux, level
         for k, (row, column) in enumerate(self.terms.others):
             theta[self._others + 3 * k : self._others + 3 * k + 3] = row, column, 0.01 * flux
         return theta
@@ -417,7 +417,7 @@ class _Model:
 
     def moved(self, theta: Array, step: Array) -> Array:
         """Return the next parameters: no position moves by more than a pixel, and the spot's flux stays positive."""
-        length = max(float(np.abs(step[self._places]).max()), 1e-300)
+        length = max(float(np.abs(step[self._position_indices]).max()), 1e-300)
         short = min(1.0, 1.0 / length)
         if step[2] < -0.9 * theta[2]:
             short = min(short, -0.9 * theta[2] / step[2])
@@ -434,13 +434,13 @@ class _Model:
         return out
 
     @cached_property
-    def _places(self) -> list[int]:
+    def _position_indices(self) -> list[int]:
         """Indices of the parameters that are positions: the spot's, then the further spots'."""
         return [0, 1, *(self._others + 3 * k + axis for k in range(len(self.terms.others)) for axis in (0, 1))]
 
     def rests(self, change: Array, inverse: Array) -> bool:
         """Return True if the last iteration step has changed all positions by less than their tolerance."""
-        others = self._places[2:]
+        others = self._position_indices[2:]
         sigma = np.sqrt(np.maximum(np.diag(inverse)[others], 0.0))
         return bool(
             np.all(np.abs(change[:2]) < _REST_PX)

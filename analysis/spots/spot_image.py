@@ -155,14 +155,14 @@ def difference_covariance(before: SpotPositions, after: SpotPositions, noise: No
     total = after.covariance + np.tile(before.covariance, (count // first, 1, 1))
     g_before = before.gain_maps.reshape(first, 2, -1)
     # one side carries both terms, so that the other one is worked on once per spot
-    lit_before = (g_before * (noise.prnu**2 * before.light_dn.reshape(first, 1, -1))).transpose(0, 2, 1)
+    signal_before = (g_before * (noise.prnu**2 * before.light_dn.reshape(first, 1, -1))).transpose(0, 2, 1)
     dark_before = (noise.dsnu_variance_dn2 * g_before).transpose(0, 2, 1)
     g_after = after.gain_maps.reshape(count, 2, -1)
     light_after = after.light_dn.reshape(count, 1, -1)
     # One state at a time keeps the work in the processor's cache; the loop is over states, not over spots.
     for start in range(0, count, first):
         part = slice(start, start + first)
-        cross = (g_after[part] * light_after[part]) @ lit_before + g_after[part] @ dark_before
+        cross = (g_after[part] * light_after[part]) @ signal_before + g_after[part] @ dark_before
         total[part] -= cross + cross.transpose(0, 2, 1)
     return total
 
@@ -220,12 +220,12 @@ class SeriesNoise:
     ----------
     before : NoiseParts
         Noise of the C spots before.
-    reach : int
+    most_apart : int
         Greatest separation, in images, of two differences for which a covariance is kept, which bounds memory.
     """
 
-    def __init__(self, before: NoiseParts, reach: int) -> None:
-        self._before, self._reach = before, reach
+    def __init__(self, before: NoiseParts, most_apart: int) -> None:
+        self._before, self._most_apart = before, most_apart
         self._maps: list[NDArray[np.float32]] = []
         self._rows: list[Array] = []
 
@@ -252,7 +252,7 @@ class SeriesNoise:
             raise ValueError(f"series noise: {len(after.temporal)} positions of {count} spots")
         for start in range(0, len(after.temporal), count):
             pattern = after.pattern[start : start + count] - self._before.pattern
-            self._maps = [*self._maps, pattern][-1 - self._reach :]
+            self._maps = [*self._maps, pattern][-1 - self._most_apart :]
             row = np.stack([pattern @ earlier.transpose(0, 2, 1) for earlier in self._maps]).astype(np.float64)
             row += self._before.temporal
             row[-1] += after.temporal[start : start + count]
@@ -275,8 +275,8 @@ class SeriesNoise:
         ValueError
             Images are farther apart than the kept separation.
         """
-        if np.ptp(images) > self._reach:
-            raise ValueError(f"series noise: images {np.ptp(images)} apart, {self._reach} are kept")
+        if np.ptp(images) > self._most_apart:
+            raise ValueError(f"series noise: images {np.ptp(images)} apart, at most {self._most_apart} are kept")
         count, n = len(self._before.temporal), len(images)
         out = np.zeros((n, count, 2, n, count, 2))
         for i, late in enumerate(images):
@@ -319,7 +319,7 @@ def as_images(mean: ArrayLike) -> Array:
     if image.ndim != 3 or image.shape[0] < 1 or min(image.shape[1:]) < LEAST_SIDE:
         raise ValueError(f"spots: mean images must be (B, H, W) of at least 6 x 6 px, found shape {image.shape}")
     if not np.isfinite(image.sum()):
-        raise ValueError("spots: mean images hold values that are not finite")
+        raise ValueError("spots: mean images contain values that are not finite")
     return image
 
 
@@ -394,9 +394,9 @@ def check_edge(position: Array, height: int, width: int, distance: float) -> Non
     bad = ~np.all((position >= distance) & (position <= high), axis=1)
     if np.any(bad):
         where = f"px is less than {distance:g} px from the edge of the {height} x {width} image"
-        places = {n: position[n] for n in np.flatnonzero(bad).tolist()}
+        positions = {n: position[n] for n in np.flatnonzero(bad).tolist()}
         raise SpotError(
-            {n: f"too near the edge: ({row:.2f}, {column:.2f}) {where}" for n, (row, column) in places.items()}
+            {n: f"too near the edge: ({row:.2f}, {column:.2f}) {where}" for n, (row, column) in positions.items()}
         )
 
 
@@ -427,8 +427,8 @@ def coarse(image: Array, frames: int, noise: NoiseModel) -> tuple[Array, Array, 
     rows, columns = height // size, width // size
     brightest = image.reshape(count, -1).max(axis=1)
     # The mean of frames of which some are clipped lies below the clipping level, hence the allowance of a few sigmas.
-    reach = brightest + _SATURATION_SIGMAS * np.sqrt(noise.temporal_variance_dn2(brightest, 1))
-    if saturated := np.flatnonzero(reach >= noise.saturation_dn).tolist():
+    highest = brightest + _SATURATION_SIGMAS * np.sqrt(noise.temporal_variance_dn2(brightest, 1))
+    if saturated := np.flatnonzero(highest >= noise.saturation_dn).tolist():
         limit = f"DN, is within {_SATURATION_SIGMAS:g} sigma of saturation at {noise.saturation_dn:.0f} DN"
         why = f"{limit}; lower the light or the exposure"
         raise SpotError({n: f"saturated: its brightest pixel, {brightest[n]:.0f} {why}" for n in saturated})
@@ -441,7 +441,7 @@ def coarse(image: Array, frames: int, noise: NoiseModel) -> tuple[Array, Array, 
     peak = bins.reshape(count, -1).max(axis=1) - background
     variance = noise.temporal_variance_dn2(background, frames) + noise.fixed_variance_dn2(background)
     absent = peak < _DETECTION_SIGMAS * np.sqrt(variance) / size
-    reject(absent, f"no spot: nothing stands {_DETECTION_SIGMAS:g} sigma above the background")
+    reject(absent, f"no spot: no pixel is {_DETECTION_SIGMAS:g} sigma above the background")
     i, j = np.arange(rows), np.arange(columns)
     bright = bins - background[:, None, None]
     bright *= bright > 0.5 * peak[:, None, None]
@@ -642,9 +642,9 @@ def propagate(maps: Array, level: Array, noise: NoiseModel, frames: int) -> tupl
     frames : int
         Number of frames averaged into an image.
     """
-    turned = maps.transpose(0, 2, 1)
-    temporal = (maps * noise.temporal_variance_dn2(level, frames)[:, None]) @ turned
-    fixed = (maps * noise.fixed_variance_dn2(level)[:, None]) @ turned
+    transposed = maps.transpose(0, 2, 1)
+    temporal = (maps * noise.temporal_variance_dn2(level, frames)[:, None]) @ transposed
+    fixed = (maps * noise.fixed_variance_dn2(level)[:, None]) @ transposed
     return temporal, fixed
 
 

@@ -169,7 +169,7 @@ class SpotTemplate:
         flux = float(data.sum()) / oversampling**2
         if not flux > 0:
             raise UndeterminedError(
-                f"spot template: image holds no flux after background {background} is taken off (sum {flux:g})"
+                f"spot template: image contains no flux after background {background} is taken off (sum {flux:g})"
             )
         coefficients = ndimage.spline_filter(data / flux, order=_DEGREE, mode="mirror", output=np.float64)
         u, s, vt = np.linalg.svd(coefficients, full_matrices=False)
@@ -421,9 +421,9 @@ class SmearedShape:
         self._template = template
         coefficients = template.row_factors[0] @ template.column_factors[0].T
         self._spectrum = fft.rfft2(coefficients)
-        turns = 2.0 * np.pi * template.oversampling
-        self._rows = turns * np.fft.fftfreq(template.grid[0])[:, None]
-        self._columns = turns * np.fft.rfftfreq(template.grid[1])[None, :]
+        angular = 2.0 * np.pi * template.oversampling
+        self._rows = angular * np.fft.fftfreq(template.grid[0])[:, None]
+        self._columns = angular * np.fft.rfftfreq(template.grid[1])[None, :]
 
     def smeared(self, covariance: Array) -> Array:
         """Return the spline coefficients (M, N) of the smeared shape, for `evaluate`.

@@ -98,7 +98,7 @@ MOST_OTHERS = 3
 """Greatest number of further spots (reflections) that are fitted in one image."""
 NEAREST_PX = 4.0
 """Distance, px, below which a second source of light is not distinguished from the spot."""
-_REACH = 2
+_NEAR = 2
 _MISFIT = 0.05
 """Allowed error of the prediction of a residual from those around it, relative to the residual."""
 _ROUGH_SIGMAS, _ROUGH_PX = 12.0, 6.0
@@ -123,12 +123,12 @@ _STEEP = 0.15
 
 def _prediction() -> Array:
     """Return the weights (5, 5) that predict a pixel from those about it by a quadratic surface."""
-    row, column = np.mgrid[-_REACH : _REACH + 1, -_REACH : _REACH + 1].reshape(2, -1).astype(np.float64)
+    row, column = np.mgrid[-_NEAR : _NEAR + 1, -_NEAR : _NEAR + 1].reshape(2, -1).astype(np.float64)
     around = (row != 0) | (column != 0)
     design = np.stack([np.ones_like(row), row, column, row * row, row * column, column * column])[:, around]
     out = np.zeros(row.size)
     out[around] = np.linalg.pinv(design.T)[0]
-    return out.reshape(2 * _REACH + 1, -1)
+    return out.reshape(2 * _NEAR + 1, -1)
 
 
 _PREDICTION = _prediction()
@@ -172,7 +172,7 @@ def examine(
     noise: NoiseModel,
     template: SpotTemplate,
     vibration: bool = False,
-    own: bool = False,
+    same_image: bool = False,
     searched: bool = True,
     first: tuple[int, int] = (0, 0),
     learnt: bool = False,
@@ -189,7 +189,7 @@ def examine(
         Template with the spot's one shape.
     vibration : bool
         True to fit smear.
-    own : bool
+    same_image : bool
         True if the shape was learnt from this very image, so that its residuals show nothing.
     searched : bool
         True to search for defects; otherwise only known ones are excluded or fitted.
@@ -207,7 +207,7 @@ def examine(
     mean = screened.mean
     rough = _rough(mean, screened, noise) if searched else np.zeros_like(screened.good)
     good = screened.good & ~rough
-    smeared = (vibration or bool(np.any(screened.jitter))) and not own
+    smeared = (vibration or bool(np.any(screened.jitter))) and not same_image
     terms = FitTerms(learnt=learnt)
     lines, edges = np.zeros_like(good), np.zeros_like(good)
     limit = float(norm.isf(FALSE_ALARM / (2.0 * mean.size)))
@@ -232,7 +232,7 @@ def examine(
             dirty = dirty or not np.array_equal(good | edges, screened.good)
             if not np.array_equal(good, before[0]):
                 fit = fitted(good, terms, fit)
-            if not own and not gross:
+            if not same_image and not gross:
                 terms, fit = _uneven(fitted, mean, good, terms, fit)
                 terms, fit, edge = _others(fitted, mean, template, good, terms, fit)
                 edges, good = edges | edge, good & ~edge
@@ -340,7 +340,7 @@ def _off(residual: Array, variance: Array, good: Mask, limit: float) -> Mask:
         # where most neighbours are missing there is no prediction
         alone = ndimage.convolve((~use).astype(np.float64), np.abs(_PREDICTION), mode="nearest") > _ALONE
         z[alone] = 0.0
-        new = (z > limit) & (z >= ndimage.maximum_filter(z, 2 * _REACH + 1))
+        new = (z > limit) & (z >= ndimage.maximum_filter(z, 2 * _NEAR + 1))
         if not np.any(new):
             break
         bad |= new
@@ -470,8 +470,8 @@ def _second_light(
     height, width = mean.shape
     middle = (height // 2, width // 2)
     stamp = template.evaluate(float(middle[0]), float(middle[1]))[0][0]
-    reach = min(20, *middle)
-    stamp = stamp[middle[0] - reach : middle[0] + reach + 1, middle[1] - reach : middle[1] + reach + 1]
+    half = min(20, *middle)
+    stamp = stamp[middle[0] - half : middle[0] + half + 1, middle[1] - half : middle[1] + half + 1]
     weight = np.where(fit.used, 1.0 / fit.variance, 0.0)
     flipped = stamp[::-1, ::-1]
     amplitude = signal.fftconvolve((mean - fit.level) * weight, flipped, mode="same")
@@ -515,10 +515,10 @@ def _static_findings(bad: Mask, edges: Mask, fit: ScreenedFit, first: tuple[int,
         rise = float(np.ptp(fit.level[[0, 0, -1, -1], [0, -1, 0, -1]]))
         out.append(Finding("uneven background", f"{description} fitted, {rise:.2g} DN between the corners"))
     for (row, column, share), (_, _, sigma) in zip(fit.others, fit.others_sigma, strict=True):
-        place = f"at row {row + first[0]:.1f}, column {column + first[1]:.1f}"
+        location = f"at row {row + first[0]:.1f}, column {column + first[1]:.1f}"
         light = f"{100.0 * abs(share):.2g} ± {100.0 * sigma:.1g} % of the light"
         description = "; fitted" if share > 0.0 else ", in the frames before but not here; fitted"
-        out.append(Finding("second spot", f"{place} with {light}{description}"))
+        out.append(Finding("second spot", f"{location} with {light}{description}"))
     if np.any(edges):
         out.append(Finding("second spot", "near the edge of the frames; its surroundings are excluded"))
     if fit.terms.smear:

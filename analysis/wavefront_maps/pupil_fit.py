@@ -60,7 +60,7 @@ class Orientation:
 
     def __post_init__(self) -> None:
         if self.quarter_turns not in range(4) or self.sign not in (1, -1):
-            raise ValueError(f"quarter turns are 0 to 3 and signs +1 and -1, not {self.quarter_turns} and {self.sign}")
+            raise ValueError(f"quarter_turns must be 0 to 3, sign +1 or -1, got {self.quarter_turns} and {self.sign}")
 
     @classmethod
     def named(cls, name: str, sign: int = 1) -> Orientation:

@@ -189,12 +189,12 @@ def trace(camera: Camera, position: ArrayLike, direction: ArrayLike) -> TracedRa
     system, elements = camera._systems[0], camera._assembly.sequence("image")
     sent = make_rays(default_backend(), start, np.broadcast_to(light / length, start.shape))
     traced = trace_systems(default_backend(), system, sent, keep=range(len(camera.surfaces)), world=True)
-    place, leaving, path, reached = (array[0] for array in traced.numpy(traced.world))
+    end, leaving, path, reached = (array[0] for array in traced.numpy(traced.world))
     hits = np.stack([traced.hit(k)[0] for k in range(len(camera.surfaces))], axis=1)
     valid = reached
     for k, element in enumerate(elements[:-1]):
         valid = valid & element.clear(hits[:, k, 0], hits[:, k, 1])
-    return TracedRays(place, leaving, path, valid, reached, hits)
+    return TracedRays(end, leaving, path, valid, reached, hits)
 
 
 def trace_stop(camera: Camera, field: Field, points: np.ndarray) -> TracedRays:
@@ -241,14 +241,14 @@ def shadow_pieces(camera: Camera, field: Field, ring: bool = True) -> np.ndarray
         K polygons of V corners (x, y), in units of the stop's radius, with a first axis of length 1 (one camera), as
         the functions on batches of polygons expect it.
     """
-    every = {f"s{k}": s.edges(k != camera.stop, k != camera.stop or ring) for k, s in enumerate(camera.surfaces)}
-    edges = {name: own for name, own in every.items() if own}
+    outlines = {f"s{k}": s.edges(k != camera.stop, k != camera.stop or ring) for k, s in enumerate(camera.surfaces)}
+    edges = {name: outline for name, outline in outlines.items() if outline}
     if not edges:
         return None
     nodes = disk(RINGS)
     hits = trace_stop(camera, field, np.stack([nodes.x, nodes.y], axis=-1)).hits
-    places = {name: hits[None, :, int(name[1:]), :2] for name in edges}
-    pieces, _ = converged_shadows(SurfaceEdges(edges, places, nodes).outlines, 1)
+    crossings = {name: hits[None, :, int(name[1:]), :2] for name in edges}
+    pieces, _ = converged_shadows(SurfaceEdges(edges, crossings, nodes).outlines, 1)
     return pieces if pieces.shape[1] else None
 
 
@@ -666,8 +666,8 @@ def _pupil(camera: Camera, field: Field, origin: np.ndarray) -> PupilFunction:
     traced = _field_at(camera, field, nodes, origin)
     if pieces is None:
         return fit_pupils(traced, nodes)[0]
-    lit = ~covered(pieces, np.stack([nodes.x, nodes.y], axis=-1), SMALLEST)
-    return with_enough_nodes(fit_pupils(traced, nodes, DEGREE, pieces, lit)[0], camera.wavelength)
+    illuminated = ~covered(pieces, np.stack([nodes.x, nodes.y], axis=-1), SMALLEST)
+    return with_enough_nodes(fit_pupils(traced, nodes, DEGREE, pieces, illuminated)[0], camera.wavelength)
 
 
 def mtf(

@@ -179,8 +179,8 @@ class Camera:
 
     Examples
     --------
-    A Ritchey-Chretien telescope of 0.45 m aperture at F/8. M1 is F/2.67, and M2 magnifies 3 times; the shadow of M2
-    stands for a hole in M1:
+    A Ritchey-Chretien telescope of 0.45 m aperture at F/8. M1 is F/2.67, and M2 magnifies 3 times; the hole in
+    M1 has the size of the shadow of M2:
 
     >>> m1 = OpticalSurface(-2.4, -0.88, -1.080808, "mirror", diameter=0.45, inner_diameter=0.12)
     >>> m2 = OpticalSurface(-0.96, 0.96, -5.022727, "mirror")
@@ -219,9 +219,9 @@ class Camera:
         for k, surface in enumerate(self.surfaces):
             ahead = -ahead if surface.material == MIRROR else ahead
             if surface.thickness * ahead < 0.0:
-                wrong, way = ("negative", "+z") if ahead > 0.0 else ("positive", "-z")
+                wrong, axis = ("negative", "+z") if ahead > 0.0 else ("positive", "-z")
                 raise ValueError(
-                    f"the thickness of surface {k} must not be {wrong}: light travels toward {way} there, got "
+                    f"the thickness of surface {k} must not be {wrong}: light travels toward {axis} there, got "
                     f"{surface.thickness}"
                 )
         self.indices  # noqa: B018

@@ -6,7 +6,10 @@ from dataclasses import dataclass
 KORSCH = ((-2.5 / 6, -0.9375 / 6), (-2.5 / 18, 2.39583333333333 / 6), (-1.25 / 6, -1.375 / 6))
 """Radius and distance to the next vertex, in focal lengths, of three mirrors: flat Petzval surface, F/2.5 at F/12."""
 OFF_AXIS = ((-2.14706, -0.416667), (-0.706952, 0.416667), (-1.050288, -0.945003))
-"""As KORSCH: stop at the secondary, flat field, exit pupil far away; the first and the third vertex coincide."""
+"""Radii and distances, like ``KORSCH``, with the stop at the secondary, a flat field and a far exit pupil.
+
+The vertices of the first and the third mirror coincide.
+"""
 OFF_AXIS_BIAS = math.radians(55.2)
 """Field angle of the off-axis layout times its F-number, radians: beams and mirrors pass beside each other."""
 

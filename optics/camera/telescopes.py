@@ -88,8 +88,8 @@ def triplet(
     first = np.array([*(1.0 / _RADII), *_GAPS[list(_AIR)], 0.0])
     size = np.array([*np.full(6, 1.0), 0.05, 0.05, 1e-3])
     low, high = np.array([*np.full(6, -8.0), 0.04, 0.04, -0.1]), np.array([*np.full(6, 8.0), 0.3, 0.3, 0.1])
-    found = least_squares(errors, first, x_scale=size, bounds=(low, high), max_nfev=_STEPS, xtol=1e-10, ftol=1e-8)
-    curvatures, gaps = _unit_lens(found.x, indices[1])
+    fit = least_squares(errors, first, x_scale=size, bounds=(low, high), max_nfev=_STEPS, xtol=1e-10, ftol=1e-8)
+    curvatures, gaps = _unit_lens(fit.x, indices[1])
     return focal_length / curvatures, focal_length * gaps
 
 
@@ -126,18 +126,18 @@ def _traced(
     curvatures: np.ndarray, gaps: np.ndarray, indices: np.ndarray, start: np.ndarray, along: np.ndarray
 ) -> np.ndarray:
     """Trace rays, (fields, rays, 3), at three wavelengths to the image: positions (wavelengths, fields, rays, 2)."""
-    at, way = np.broadcast_to(start, (3, *start.shape)), np.broadcast_to(along, (3, *along.shape))
+    at, direction = np.broadcast_to(start, (3, *start.shape)), np.broadcast_to(along, (3, *along.shape))
     for k, curvature in enumerate(curvatures):
-        half = curvature * np.sum(at * way, axis=-1) - way[..., 2]
+        half = curvature * np.sum(at * direction, axis=-1) - direction[..., 2]
         beyond = curvature * np.sum(at * at, axis=-1) - 2.0 * at[..., 2]
-        at = at + (beyond / (np.sqrt(half**2 - curvature * beyond) - half))[..., None] * way
+        at = at + (beyond / (np.sqrt(half**2 - curvature * beyond) - half))[..., None] * direction
         normal = np.array([0.0, 0.0, 1.0]) - curvature * at
         ratio = (indices[:, k] / indices[:, k + 1])[:, None, None]
-        before = np.sum(normal * way, axis=-1)
+        before = np.sum(normal * direction, axis=-1)
         after = np.sqrt(1.0 - ratio**2 * (1.0 - before**2))
-        way = ratio[..., None] * way + (after - ratio * before)[..., None] * normal
+        direction = ratio[..., None] * direction + (after - ratio * before)[..., None] * normal
         at = at - np.array([0.0, 0.0, gaps[k]])
-    return np.asarray((at - (at[..., 2] / way[..., 2])[..., None] * way)[..., :2])
+    return np.asarray((at - (at[..., 2] / direction[..., 2])[..., None] * direction)[..., :2])
 
 
 def _two_mirrors(aperture: float, f_number: float, primary: float, behind: float) -> list[tuple[float, float]]:
@@ -229,9 +229,9 @@ def first_design(
     return _optimised(camera, what.bias / f_number) if what.stop else camera
 
 
-def _camera(given: Sequence[OpticalSurface], stop: int, aperture: float, wavelength: float) -> Camera:
+def _camera(prescription: Sequence[OpticalSurface], stop: int, aperture: float, wavelength: float) -> Camera:
     """Return the camera of surfaces whose stop is filled by a beam of a diameter on the axis."""
-    surfaces = list(given)
+    surfaces = list(prescription)
     surfaces[stop] = replace(surfaces[stop], diameter=aperture)
     camera = Camera(surfaces, wavelength, stop)
     surfaces[stop] = replace(surfaces[stop], diameter=aperture**2 / camera.entrance_pupil_diameter)

@@ -307,7 +307,7 @@ ITERATIONS = 400
 """Largest number of least-squares iterations at the last step, at which the envelope has its required length."""
 TOLERANCE = 1e-6
 """Relative decrease of the mean square error per iteration below which the search ends."""
-HELD = 2e-6
+MET = 2e-6
 """Largest violation of a constraint, metres, with which it still counts as fulfilled."""
 MIN_GAIN = 1e-3
 """Smallest relative decrease of the rms error that counts as an improvement: the accuracy of the least squares."""
@@ -562,7 +562,7 @@ def _step(
     x0 = start.values(variables) / size
     equal = _equations(merit.operands, len(_values(merit.evaluate(start), merit.operands)))
     low, high = np.array([v.low for v in variables]) / size, np.array([v.high for v in variables]) / size
-    evaluation = constrained_least_squares(evaluate, x0, equal, low, high, iterations, TOLERANCE, 0.1 * HELD)
+    evaluation = constrained_least_squares(evaluate, x0, equal, low, high, iterations, TOLERANCE, 0.1 * MET)
     return start.with_values(variables, evaluation.x * size), evaluation.jacobians, evaluation.converged
 
 
@@ -661,13 +661,13 @@ def _require_fulfilled(merit: MeritFunction, after: Evaluation) -> None:
     g, constraints = _values(after, merit.operands), _limits(after, merit.operands)
     names = [kind for kind, _ in constraints]
     violated = np.where(_equations(merit.operands, len(g)), np.abs(g), g)
-    kinds = tuple(dict.fromkeys(name for value, name in zip(violated, names, strict=True) if not value < 50.0 * HELD))
+    kinds = tuple(dict.fromkeys(name for value, name in zip(violated, names, strict=True) if not value < 50.0 * MET))
     if not kinds:
         return
     worst = {kind: max((k for k, name in enumerate(names) if name == kind), key=violated.__getitem__) for kind in kinds}
     limits = np.abs([limit for _, limit in constraints])
     limits = np.where(np.array(names) == "anamorphism", limits * after.distance_across, limits)
-    kinds = tuple(sorted(kinds, key=lambda kind: -violated[worst[kind]] / max(limits[worst[kind]], HELD)))
+    kinds = tuple(sorted(kinds, key=lambda kind: -violated[worst[kind]] / max(limits[worst[kind]], MET)))
     violation = {
         kind: f"{100.0 * g[k] / after.distance_across:.3g} %" if kind == "anamorphism" else f"{1e3 * g[k]:.3g} mm"
         for kind, k in worst.items()

@@ -232,7 +232,7 @@ def fit(last: int, x: Any, y: Any, values: Any, weights: Any | None = None) -> n
     >>> (1e9 * fit_zernikes(6, nodes.x, nodes.y, surface, nodes.weight)).round(6) + 0.0
     array([ 0.,  0.,  0., 20.,  0.,  5.])
     """
-    known = finite("values", values, "so leave out points without data")
+    known = finite("values", values, "so exclude points without data")
     root = np.sqrt(np.ones_like(x) if weights is None else weights)
     solution, *_ = np.linalg.lstsq(basis(last, x, y) * root[:, None], (known * root).T, rcond=None)
     return np.asarray(solution.T)

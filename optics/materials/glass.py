@@ -174,7 +174,7 @@ class _IndexByTemperature:
         known = self._dispersion
         if known is None:
             raise UnphysicalError(f"{self.name}: no constants for the change of its index with temperature are known")
-        if not known.known.holds(temperature_k, temperature_k):
+        if not known.known.contains(temperature_k, temperature_k):
             raise UnphysicalError(
                 f"{self.name}: its index is known from {known.known.text}, not at {temperature_k:.6g} K"
             )

@@ -57,7 +57,7 @@ class TemperatureRange:
         """Return the range between two temperatures in degrees Celsius."""
         return cls(ZERO_CELSIUS + coldest, ZERO_CELSIUS + hottest, source)
 
-    def holds(self, coldest: float, hottest: float) -> bool:
+    def contains(self, coldest: float, hottest: float) -> bool:
         """Return True when the range from ``coldest`` to ``hottest`` (kelvin) lies inside."""
         return self.coldest <= coldest and hottest <= self.hottest
 

@@ -88,10 +88,10 @@ def ray_matrix(
     """
     zero = np.zeros_like(axes)
     start, heading = (np.repeat(vector[:, None], 4, axis=1) for vector in (position, direction))
-    step, turn = (np.concatenate(pair, axis=1) for pair in ((axes, zero), (zero, axes)))
-    out = jvp(backend, systems, start, heading, step, turn, keep=(stop,))
+    shift, tilt = (np.concatenate(pair, axis=1) for pair in ((axes, zero), (zero, axes)))
+    out = jvp(backend, systems, start, heading, shift, tilt, keep=(stop,))
     # columns are launch steps, rows x and y
-    image, angle, hit = (np.swapaxes(step[..., :2], 1, 2) for step in (out.position, out.direction, out.hits[stop]))
+    image, angle, hit = (np.swapaxes(shift[..., :2], 1, 2) for shift in (out.position, out.direction, out.hits[stop]))
     parts = (image[..., :2], image[..., 2:], angle[..., :2], angle[..., 2:], hit[..., :2], hit[..., 2:])
     return RayMatrix(*parts, out.traced.numpy()[1][:, 0])
 

@@ -209,9 +209,9 @@ def nodal_deformation(
     from scipy.spatial.transform import Rotation
 
     figure = FrozenMap({j: float(a) for j, a in enumerate(fitted, 1)})
-    turn = triple(Rotation.from_matrix(rotation).as_rotvec())
+    rotation_vector = triple(Rotation.from_matrix(rotation).as_rotvec())
     fits = (positions[:, :2], weight, change, residual, lost, between, spacing, len(order) - len(points))
-    return NodalDeformation(turn, triple(shift), size - 1.0, figure, grid, *fits)
+    return NodalDeformation(rotation_vector, triple(shift), size - 1.0, figure, grid, *fits)
 
 
 _CHECK = "displacements in the unit of the column heads, and nodes in the named frame"

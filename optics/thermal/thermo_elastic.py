@@ -128,10 +128,10 @@ class Finder:
             pending = np.flatnonzero(best > enough)
             _, near = self._tree.query(points[pending], np.arange(1, min(count, self._tree.n) + 1))
             for column in near.T:
-                open_points = best[pending] > _INSIDE
-                if not np.any(open_points):
+                unlocated = best[pending] > _INSIDE
+                if not np.any(unlocated):
                     break
-                rows, tried = pending[open_points], column[open_points]
+                rows, tried = pending[unlocated], column[unlocated]
                 local = self._local(points[rows], tried)
                 outside = np.max(np.maximum(-local, local - 1.0), axis=1)
                 if self._simplex:
@@ -460,9 +460,7 @@ class ElasticBody:
         """Return the indices of the nodes that a bond holds."""
         chosen = np.flatnonzero(np.asarray(support.where(self.nodes), bool))
         if len(chosen) < 3 or _on_a_line(self.nodes[chosen]):
-            raise UnphysicalError(
-                f"a bonded support needs three nodes that are not on a line; it holds {len(chosen)} nodes"
-            )
+            raise UnphysicalError(f"a bonded support needs three nodes that are not on a line; it has {len(chosen)}")
         return chosen
 
     def _solved(self, load: np.ndarray, fixed: np.ndarray, values: np.ndarray) -> np.ndarray:

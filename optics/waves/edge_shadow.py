@@ -109,13 +109,13 @@ class StopOutlines:
     def _of_beam(self, number: int, further: Sequence[np.ndarray]) -> np.ndarray:
         """Return the shadows in the pupil of image ``number``: K polygons of W corners without overlap, (K, W, 2)."""
         image = slice(number, number + 1)
-        open_area = _window(1)
+        clear_area = _window(1)
         for polygon in self.clear:
-            open_area = compact(intersect(open_area, *sides(polygon[image])))
+            clear_area = compact(intersect(clear_area, *sides(polygon[image])))
         # shadows matter only inside the clear edges
-        dark = [intersect(polygon[image], *sides(open_area)) for polygon in (*self.blocked, *further)]
+        dark = [intersect(polygon[image], *sides(clear_area)) for polygon in (*self.blocked, *further)]
         dark = [compact(piece) for piece in dark if area_in_disk(piece)[0] > SMALLEST]
-        beyond = [compact(piece[None]) for piece in _outside_of(open_area[0])] if self.clear else []
+        beyond = [compact(piece[None]) for piece in _outside_of(clear_area[0])] if self.clear else []
         pieces, _ = separate(dark, fewest=True)
         all_pieces = [*(pieces[0] if dark else ()), *(piece[0] for piece in beyond)]
         width = max((len(piece) for piece in all_pieces), default=3)

@@ -630,7 +630,7 @@ class VariedTransfer:
         cosines: np.ndarray,
         degree: int,
     ) -> VariedTransfer | None:
-        """Compute the parts of the transfer function that do not vary.
+        """Compute the parts of the transfer function that are the same for all varied wavefronts.
 
         Parameters
         ----------
@@ -663,7 +663,7 @@ class VariedTransfer:
 
     @property
     def known(self) -> float:
-        """MTF (0 to 1) of the known pupil, about which the wavefronts vary."""
+        """MTF (0 to 1) of the pupil before its wavefront is varied: the one from which the object was computed."""
         return float(abs(sum(np.sum(terms.phasors) for terms in self.colours)))
 
     def modulation(self, paths: np.ndarray) -> np.ndarray:

@@ -100,9 +100,9 @@ class StarPupil:
 
 def _spread(x: np.ndarray, axis: np.ndarray) -> csr_array:
     """Return the sparse matrix (Q, n) of the interpolation from n evenly spaced points of an axis to Q positions."""
-    place = (x - axis[0]) / (axis[1] - axis[0])
-    first = np.floor(place).astype(int) - _POINTS // 2 + 1
-    offset, numbers = (place - first)[:, None], np.arange(_POINTS)
+    position = (x - axis[0]) / (axis[1] - axis[0])
+    first = np.floor(position).astype(int) - _POINTS // 2 + 1
+    offset, numbers = (position - first)[:, None], np.arange(_POINTS)
     weights = np.ones((len(x), _POINTS))
     for k in numbers:
         for j in numbers[numbers != k]:

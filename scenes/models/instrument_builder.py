@@ -282,7 +282,7 @@ def _check_temperature(spec: InstrumentSpec, solids: Sequence[Solid]) -> None:
     named = {name: f"materials.{name}" for name in type(spec.materials).model_fields}
     used = {material(getattr(spec.materials, name)): where for name, where in named.items()}
     used |= {material(solid.material): solid.path for solid in solids}
-    unknown = [stuff for stuff in used if not stuff.known.holds(spec.temperature, spec.temperature)]
+    unknown = [stuff for stuff in used if not stuff.known.contains(spec.temperature, spec.temperature)]
     if unknown:
         least = min(unknown, key=lambda stuff: stuff.known.hottest - stuff.known.coldest)
         ends = max(stuff.known.coldest for stuff in used), min(stuff.known.hottest for stuff in used)

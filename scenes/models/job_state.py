@@ -209,7 +209,7 @@ def heated_body(thermal: ThermalModel, job: JobSpec, path: str, spec: TableTempe
             text = f"a node would be at {thermal.reference + values[coldest]:.4g} K"
             raise NodesError(text, "absolute temperatures under 'T [K]' or 'T [degC]', changes under 'dT [K]'")
         known = thermal.known(path)
-        if not known.holds(thermal.reference + float(values[coldest]), thermal.reference + float(np.max(values))):
+        if not known.contains(thermal.reference + float(values[coldest]), thermal.reference + float(np.max(values))):
             low, high = (thermal.reference + float(value) for value in (values[coldest], np.max(values)))
             raise NodesError(
                 f"its nodes are at {low:.6g} K to {high:.6g} K, where {thermal.materials[path].name} is not known",

@@ -382,7 +382,7 @@ class ThermalModel:
         if field == Temperature():
             return
         coldest, hottest, known = self.coldest(path, field), self.hottest(path, field), self.known(path)
-        if not known.holds(coldest, hottest):
+        if not known.contains(coldest, hottest):
             reached = coldest if coldest < known.coldest else hottest
             raise TemperatureError(
                 f"{path} would be at {reached:.6g} K, where the expansion of {self.materials[path].name} is not known",

@@ -435,7 +435,7 @@ class MeasurementsSpec(spec.Spec):
         kinds: dict[str, str] = {}
         for kind, name, _ in self.named():
             if name in kinds:
-                raise Problem("two measurements have one name", name, "a different name for each", within=(kind, name))
+                raise Problem("two measurements with this name", name, "a different name for each", within=(kind, name))
             kinds[name] = kind
         return self
 

@@ -466,7 +466,7 @@ class _FrameTable:
             key = (channel, when == BEFORE)
             if corners.setdefault(key, (corner[0], corner[1])) != (corner[0], corner[1]):
                 text = "the first pixel differs from that in earlier rows"
-                raise InputError(Issue(text, file, line, ("row",), shown(corner), "the same for all after a state"))
+                raise InputError(Issue(text, file, line, ("row",), shown(corner), "the same in all rows of this state"))
 
     def _frames(
         self, states_of: dict[str, dict[float | str, list[str]]], corners: dict[tuple[str, bool], tuple[int, int]]

@@ -188,7 +188,10 @@ def _pure(kind: str, quantity: str, text: str) -> float:
 
 
 def _instead(kind: str, quantity: str, text: str) -> str:
-    """Return what is allowed in place of an amount that is no pure number; for a share, the same change as a number."""
+    """Return a correct amount for an error message on a conic constant or an index, which take numbers without unit.
+
+    A share such as ``10 ppm`` is converted: the message shows the same change as a number.
+    """
     node = text.split()[0]
     try:
         share = parse_quantity(quantity, SCALE)
@@ -290,7 +293,7 @@ class PlainPerturbationSpec(Spec):
     def uses(self) -> tuple[str, ...]:
         """Return the names in ACTIONS of the changes that have an effect.
 
-        A temperature of 0 K has one: it differs from that of a heated carrier.
+        A temperature change of 0 K counts as an effect, because the body then stays cold on a heated carrier.
         """
         done = {
             "rotate": any(self.rotate),
@@ -517,7 +520,10 @@ def _parts(what: PlainPerturbationSpec) -> Iterator[str]:
 
 
 def _heat_parts(heat: job_tables.TemperatureSpec, plain: Mapping[str, Any]) -> Iterator[str]:
-    """Yield a temperature change as text, ``temperature 2 K``; a change of zero only where it is all."""
+    """Yield a temperature change and its gradient as text, such as ``temperature 2 K``.
+
+    A uniform change of zero is written only if there is no gradient, so that the text is never empty.
+    """
     if "table" in plain:
         yield f"temperature {plain['table']}"
     if heat.change or not heat.warms:

@@ -58,7 +58,7 @@ def test_large_motions_are_read_as_they_are() -> None:
     assert np.all(np.max(np.abs(linear - parameters(x)) / sigma, axis=1) > 10.0)
     assert np.max(np.abs(found - parameters(x)) / sigma) < 0.02
     assert told.beyond.all()
-    assert told.holds.all()
+    assert told.valid.all()
     # what is said to be off is, to first order
     assert told.off == pytest.approx(np.abs(linear - parameters(x)) / sigma, rel=0.5, abs=5.0)
     worst, size = told.worst(2)
@@ -75,7 +75,7 @@ def test_states_without_light_and_steps_without_end_do_not_hold() -> None:
 
     linear, found, told = read(x, model(dark))
     assert np.array_equal(linear, found)
-    assert told.holds.tolist() == [False, True]
+    assert told.valid.tolist() == [False, True]
     assert told.worst(0)[1] == np.inf
 
     def wild(states):
@@ -83,7 +83,7 @@ def test_states_without_light_and_steps_without_end_do_not_hold() -> None:
 
     _, _, told = read(x[:1], model(wild))
     assert told.beyond.all()
-    assert not told.holds.any()
+    assert not told.valid.any()
 
 
 def test_estimators_that_trace_alike_are_traced_together_and_keep_their_own() -> None:

@@ -102,8 +102,8 @@ def test_noise_above_the_data_sheet_is_named_as_such(fit, good) -> None:
     told = evidence.doubt()
     assert told.cause == NOISE
     assert "data sheet" in told.text
-    assert evidence.holds.tolist() == [False]
-    assert SpotEvidence.joined([SpotEvidence(before, before), evidence]).holds.tolist() == [True, False]
+    assert evidence.consistent.tolist() == [False]
+    assert SpotEvidence.joined([SpotEvidence(before, before), evidence]).consistent.tolist() == [True, False]
     assert SpotEvidence(before, before).doubt() is None
 
 

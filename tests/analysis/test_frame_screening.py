@@ -45,7 +45,7 @@ def test_pieces_change_nothing(count: int, moving: float, real: bool, monkeypatc
 
     whole, passes = found(), len(told)
     assert any(finding.kind == "cosmic rays" for finding in screen_frames(frames, NOISE, bad).findings)
-    monkeypatch.setattr(frame_screening, "_HELD", 3 * frames[0].nbytes)
+    monkeypatch.setattr(frame_screening, "_BATCH_BYTES", 3 * frames[0].nbytes)
     for one, other in zip(found(), whole, strict=True):
         np.testing.assert_array_equal(one, other)
     assert len(told) > 2 * passes

@@ -112,7 +112,7 @@ def test_noise_of_a_series_is_that_of_its_shifts():
     first = fitted(before, learnt)
     after = [fitted(noisy(FIRST + by), learnt) for by in ((0.0, 0.0), (5.3, 1.2), (5.3, 1.2))]
     found = [learnt_shift(learnt, first, one, NOISE, SHAPE) for one in after]
-    series = SeriesNoise(found[0].parts[0], reach=3)
+    series = SeriesNoise(found[0].parts[0], most_apart=3)
     for one in found:
         series.add(one.parts[1])
     whole = series.covariance(np.arange(3)).reshape(3, 2, 3, 2)

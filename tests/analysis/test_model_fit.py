@@ -83,11 +83,11 @@ def test_observability_report():
     assert tilt.true == pytest.approx(truth * 5e-6, rel=1e-9, abs=1e-20)
     for motion in report.motions[:4]:  # the family is reported as what it is
         assert motion.reported - motion.true == pytest.approx(np.zeros(4), abs=1e-18)
-    said = next(line for line in report.statements if line.startswith("tilt: is not separable from the family"))
+    said = next(line for line in report.sentences if line.startswith("tilt: is not separable from the family"))
     for k, name in enumerate(NAMES):  # only what takes part in the imitation is named, with its amount
         assert (f"{abs(tilt.imitation[k]):.3g} x {name}" in said) == (mix[k] != 0)
     assert f'd_alpha {truth[0] * 5e-6 * 180 * 3600 / np.pi:+.3g}"' in said.split("the true change is")[1]
-    text = "\n".join(report.statements)
+    text = "\n".join(report.sentences)
     assert "piston: moves no spot and is invisible; its true change is d_f +1 um." in text
     assert "nothing: moves no spot and changes no parameter." in text
 
@@ -109,5 +109,5 @@ def test_observability_outside_a_small_family():
     assert one.cosine == two.cosine
     (alone, *_) = observability(NAMES, SPOTS, PARAMETERS, SIZES, COVARIANCE, [0]).motions
     assert (alone.nearest, alone.cosine) == (None, 0.0)
-    assert any("leaves a residual" in line for line in report.statements)
+    assert any("leaves a residual" in line for line in report.sentences)
     refuses(ValueError, "positive scales", observability, NAMES, SPOTS, PARAMETERS, SIZES[:2], COVARIANCE, [0])

@@ -191,8 +191,8 @@ def test_monitor():
     mixed = replace(stated, correlation=np.array([[1.0, 0.5], [0.5, 1.0]]))
     refuses(ValueError, "motions with different laws in time cannot be correlated", StateSpace, mixed)
     still = np.zeros((1, 2, 2))
-    refuses(ValueError, "needs stated disturbances", Posterior().gain, Shifts(still, still, eye[None], {}, None))
-    for looks, said in (((1.3, 0.0), "looks past the Earth"), ((0.1, 0.1), "look the same way")):
+    refuses(ValueError, "needs a prior of disturbances", Posterior().gain, Shifts(still, still, eye[None], {}, None))
+    for looks, said in (((1.3, 0.0), "looks past the Earth"), ((0.1, 0.1), "lines of sight are parallel")):
         refuses(UndeterminedError, said, GroundGeometry, 5e5, ("a", "b"), looks, (0.01, 0.01))
     for family in ([], [0, 0], [5]):
         refuses(ValueError, "family must be", observability, list("ab"), see, see, [1, 1], eye, family)

@@ -97,5 +97,5 @@ def test_sigma_of_the_exact_form_is_propagated():
 
 
 def test_bad_look_angles():
-    refuses(ValueError, "same way", exact, camera(), camera(), 0.1, 0.1)
+    refuses(ValueError, "lines of sight are parallel", exact, camera(), camera(), 0.1, 0.1)
     refuses(ValueError, "forward_look_rad", exact, camera(), camera(), np.nan, 0.1)

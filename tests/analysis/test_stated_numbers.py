@@ -75,7 +75,7 @@ def test_heavy_tails_are_those_of_drawn_states() -> None:
     error = x @ (GAIN @ STATED.spots - STATED.parameters).T + noise @ GAIN.T
     assert tail.rms == pytest.approx(np.sqrt(np.mean(error**2, axis=0)), rel=0.02)
     for k, level in enumerate((0.6827, 0.9545, 0.9973)):
-        assert tail.held[k] == pytest.approx(np.quantile(np.abs(error), level, axis=0), rel=0.06), level
+        assert tail.half_widths[k] == pytest.approx(np.quantile(np.abs(error), level, axis=0), rel=0.06), level
     sigma = posterior_sigma(ROWS, STATED, NOISE)
     assert tail.beyond == pytest.approx(np.mean(np.abs(error) > 3.0 * sigma, axis=0), rel=0.1)
     assert np.all(tail.beyond > 0.0027)
@@ -84,7 +84,7 @@ def test_heavy_tails_are_those_of_drawn_states() -> None:
 def test_many_degrees_of_freedom_are_the_normal_statement() -> None:
     tail, sigma = heavy_tails(ROWS, STATED, NOISE, GAIN, 1e4), posterior_sigma(ROWS, STATED, NOISE)
     for k in range(3):
-        assert tail.held[k] == pytest.approx((k + 1) * sigma, rel=2e-3)
+        assert tail.half_widths[k] == pytest.approx((k + 1) * sigma, rel=2e-3)
     assert tail.beyond == pytest.approx(np.full(4, 0.0027), rel=0.02)
     refuses(ValueError, "more than 2 degrees of freedom", heavy_tails, ROWS, STATED, NOISE, GAIN, 2.0)
 

@@ -113,7 +113,7 @@ def test_there_are_eight_and_sixteen():
     assert len(set(SIGNED_ORIENTATIONS)) == len({str(one) for one in SIGNED_ORIENTATIONS}) == 16
     assert [Orientation.named(one.name, one.sign) for one in SIGNED_ORIENTATIONS] == list(SIGNED_ORIENTATIONS)
     refuses(MapError, "turned 270", Orientation.named, "turned 45")
-    refuses(ValueError, "quarter turns", Orientation, quarter_turns=4)
+    refuses(ValueError, "quarter_turns must be 0 to 3", Orientation, quarter_turns=4)
 
 
 @pytest.mark.parametrize(

@@ -5,7 +5,7 @@ import pytest
 
 from analysis.spots.centroid import energy_centroid, gaussian_fit, mean_frames
 from analysis.spots.noise import NoiseModel
-from analysis.spots.screened_fit import one_shape
+from analysis.spots.screened_fit import single_template
 from optics.geometry.tree import Motion, State
 from optics.numerics.backend import one_blas_thread
 from scenes.specs.instrument import BASE
@@ -92,7 +92,7 @@ def test_shifts_agree_with_those_of_photutils(experiment, kind):
     """
     centroids = pytest.importorskip("photutils.centroids")
     pair = experiment("gf7_pair")
-    template = one_shape(pair.calibration.template, 0, pair.calibration.template.shape)
+    template = single_template(pair.calibration.template, 0, pair.calibration.template.shape)
     noise: NoiseModel = pair.calibration.noise
     ratios = []
     with one_blas_thread():

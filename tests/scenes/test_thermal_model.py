@@ -638,11 +638,11 @@ def test_a_figure_belongs_to_the_footprint_that_the_beam_meets(gf7_pair) -> None
 
 def test_every_material_is_known_about_room_temperature_and_nowhere_near_zero() -> None:
     for stuff in MATERIALS.values():
-        assert stuff.known.holds(278.15, 308.15)
-        assert not stuff.known.holds(100.0, 293.15)
-        assert not stuff.known.holds(293.15, 500.0)
+        assert stuff.known.contains(278.15, 308.15)
+        assert not stuff.known.contains(100.0, 293.15)
+        assert not stuff.known.contains(293.15, 500.0)
         assert stuff.known.source
     for kind in GLASSES.values():
-        assert kind.thermal is None or kind.thermal.known.holds(173.15, 413.15)
+        assert kind.thermal is None or kind.thermal.known.contains(173.15, 413.15)
     with pytest.raises(ValueError, match=r"N-BK7: its index is known from 173\.15 K to 413\.15 K \(-100 to 140 degC\)"):
         GLASSES["N-BK7"].index(650e-9, 150.0)

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from analysis.spots.screened_fit import one_shape
+from analysis.spots.screened_fit import single_template
 from scenes.specs.monitor_frames import MeasurementSpec
 from twin.recover.channel_measurement import ChannelMeasurement
 from twin.recover.measured_frames import ChannelFrames, StateFrames
@@ -236,4 +236,4 @@ def measurement(drawn, template, noise, vibration_fitted=False, shape="template"
     return ChannelMeasurement(spec, frames, template if isinstance(shape, str) else shape)
 
 
-__all__ = ["KINDS", "Drawn", "draw", "measurement", "one_shape", "replace"]
+__all__ = ["KINDS", "Drawn", "draw", "measurement", "replace", "single_template"]

@@ -8,7 +8,7 @@ from scipy.stats import chi2
 
 from analysis.spots.frame_screening import noise_ratio, screen_frames
 from analysis.spots.photon_transfer import pixel_correction
-from analysis.spots.screened_fit import one_shape
+from analysis.spots.screened_fit import single_template
 from analysis.spots.spot_image import SpotError
 from analysis.spots.static_defects import examine, outlier_pixels
 from optics.numerics.backend import one_blas_thread
@@ -43,7 +43,7 @@ def bench(experiment):
     """(shape of one spot, detector, noise)."""
     pair = experiment("gf7_pair")
     calibration = pair.calibration
-    return one_shape(calibration.template, 0, calibration.template.shape), pair.detector, calibration.noise
+    return single_template(calibration.template, 0, calibration.template.shape), pair.detector, calibration.noise
 
 
 def squares(bench, kinds, seeds, centroid="ml", learnt=False):
@@ -196,7 +196,7 @@ def test_findings_tell_places_on_the_ccd(bench):
     part = np.s_[:, 9:93, 6:90]
     with one_blas_thread():
         whole = examine(screen_frames(frames, noise), noise, template)
-        cut = examine(screen_frames(frames[part], noise), noise, one_shape(template, 0, (84, 84)), first=(9, 6))
+        cut = examine(screen_frames(frames[part], noise), noise, single_template(template, 0, (84, 84)), first=(9, 6))
     told = [{one.kind: one.text for one in found.findings} for found in (whole, cut)]
     for texts in told:
         assert "(30, 21)" in texts["bad pixels"]
@@ -229,7 +229,7 @@ def test_perturbed_instruments_are_not_taken_for_dirt(experiment):
         for state in frames:
             for i, spot in enumerate(state):
                 try:
-                    found = examine(screen_frames(spot, noise), noise, one_shape(template, i, spot.shape[1:]))
+                    found = examine(screen_frames(spot, noise), noise, single_template(template, i, spot.shape[1:]))
                 except SpotError:
                     continue  # a spot that left the CCD
                 assert found.clean, [f"{one.kind}: {one.text}" for one in found.findings]

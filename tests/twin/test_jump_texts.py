@@ -50,9 +50,9 @@ def test_what_a_course_says() -> None:
     none, nothing, one = course(None), course(()), course((JUMP,))
     assert "jumps" not in none.to_dict()
     assert "jump" not in course_agrees(none, times)
-    assert nothing.to_dict()["jumps"] == {"false_alarm": 0.01, "found": []}
+    assert nothing.to_dict()["jumps"] == {"false_alarm": 0.01, "detected": []}
     assert course_agrees(nothing, times).endswith("No jump was detected (false-alarm probability at most 0.01).")
     assert course_agrees(one, times).endswith(f"The series shows that {jump_text(JUMP)}.")
-    (found,) = json.loads(json.dumps(one.to_dict()))["jumps"]["found"]
+    (found,) = json.loads(json.dumps(one.to_dict()))["jumps"]["detected"]
     assert found["sizes"][0] == {"name": "base/M2 shift x", "unit": "um", "size": 3.21, "sigma": 0.42}
     assert found["rivals"] == [{"body": "base/M1", "log_ratio": 31.0}, {"body": "base/M3", "log_ratio": 12.0}]

@@ -139,11 +139,11 @@ def test_reference_rotation_cannot_be_told_from_the_cameras(table):
         assert np.all(np.abs(found.true[:, k]) < 1e-6)
         assert found.readings["model"][0, k] == pytest.approx(-1.0, rel=0.02)
         assert found.observability.rank == 4
-        statements = found.principal_distance_statements()
+        statements = found.principal_distance_sentences()
         assert any("whole camera scaled" in s and "the spots show this change." in s for s in statements)
         assert any("(piston)" in s and "the spots show a wrong change" in s for s in statements)
         assert any(
-            s.startswith("central prism about Y") and "not separable" in s for s in found.observability.statements
+            s.startswith("central prism about Y") and "not separable" in s for s in found.observability.sentences
         )
 
 

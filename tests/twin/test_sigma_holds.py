@@ -95,7 +95,7 @@ def test_scripts_studies_and_hands_are_told_the_same(pair, blurred) -> None:
     reader = StateReader(pair.experiment, 2, 1)
     for noise in (True, False):
         reading = reader.read(blurred.run.state, noise)
-        assert reading.recovery.evidence.holds.tolist() == [False]
+        assert reading.recovery.evidence.consistent.tolist() == [False]
         assert reading.recovery.evidence.widening[0, 0] > 20.0
 
 
@@ -223,13 +223,13 @@ def test_no_false_alarm_in_200_clean_runs(orbit) -> None:
             first, fits = judged_spots(before, frames, calibration)
             second, more = judged_spots(after, frames, calibration)
             told = SpotEvidence(fits, more)
-            bad = ~told.holds
+            bad = ~told.consistent
             if not draw:
                 spread = difference_covariance(first, second, noise)
                 again = experiment.motion_models
                 found = recovery_of(first, second, spread, calibration, known, evidence=told, motions=again)
                 for curvature in found.curvature.values():
-                    bad |= curvature.beyond | ~curvature.holds
+                    bad |= curvature.beyond | ~curvature.valid
                 contradictions += sum(not found.consistency(known, k, {}).agrees for k in range(each))
                 own_noise = joint(spread.reshape(each, spots, 2, 2))[0]
                 error = rows @ (known.best_gain(own_noise) @ known.spots - known.parameters)

@@ -75,7 +75,7 @@ def identity() -> LocalMap:
 @pytest.fixture(scope="module")
 def perfect() -> View:
     ccd = line_ccd()
-    pupil = BandPupils.alike(circular_pupil(F_NUMBER), ccd.band)
+    pupil = BandPupils.achromatic(circular_pupil(F_NUMBER), ccd.band)
     return View(ccd, pupil, identity(), np.zeros(2), 1000, np.array([2.3e-6, -1.1e-6]), REGION)
 
 
@@ -166,7 +166,7 @@ def test_against_brute_force(before_gf7, backend):
     assert 0.0 < lost < 0.01
 
     seen = before_gf7.views(ABERRATED)["left"]
-    light = BandPupils.alike(seen.light.shortest, ccd.band)
+    light = BandPupils.achromatic(seen.light.shortest, ccd.band)
     view = replace(seen, ccd=ccd, light=light, offset=np.zeros(2), region=window)
     for way in DIRECTIONS:
         imager = view.edge(way, np.radians(5.0))

@@ -190,7 +190,7 @@ def test_counts_of_random_states_are_held_against_the_binomial_distribution():
     assert good.ratio(BEST) == pytest.approx(np.linalg.norm(errors / sigmas, axis=0) / 20.0)
     for level, share in enumerate((0.68, 0.95)):
         width = norm.ppf(0.5 + 0.5 * share)
-        assert good.held(BEST, level).tolist() == np.sum(np.abs(errors / sigmas) <= width, axis=0).tolist()
+        assert good.covered(BEST, level).tolist() == np.sum(np.abs(errors / sigmas) <= width, axis=0).tolist()
         # a chance of 1 % for all counts of two levels, with two ends each
         count = errors.shape[1]
         low, high = binom.interval(1.0 - 0.01 / (2 * count), 400, share)
@@ -199,7 +199,7 @@ def test_counts_of_random_states_are_held_against_the_binomial_distribution():
     assert good.alarm_limit == binom.ppf(0.99, 400, 1e-3) == 2
     assert good.sigma_holds
     told = STATES(good)["estimators"][BEST][good.quantities[1].group][good.quantities[1].key]
-    assert (told["held_68"], told["held_95"]) == (good.held(BEST, 0)[1] / 400.0, good.held(BEST, 1)[1] / 400.0)
+    assert (told["held_68"], told["held_95"]) == (good.covered(BEST, 0)[1] / 400.0, good.covered(BEST, 1)[1] / 400.0)
     assert (told["rms"], told["rms_over_sigma"]) == (good.rms(BEST)[1], good.ratio(BEST)[1])
     for other in (counted(1.25), counted(0.8), counted(alarms=3), counted(doubted=1)):
         assert not other.sigma_holds

@@ -32,7 +32,7 @@ from twin.laboratory.autocollimator_bench import Reader, run_autocollimator_test
 from twin.validation.check import REPRODUCED, UNDECIDED
 from twin.validation.group import Context
 from twin.validation.paper_001 import budget, formulas, table2
-from twin.validation.paper_001.formulas import GROUP, JOINT, JointMotions, mirror_turns
+from twin.validation.paper_001.formulas import GROUP, JOINT, JointMotions, mirror_rotations
 from twin.validation.registry import Selection, select
 from twin.validation.runner import run_checks
 
@@ -225,7 +225,7 @@ def test_the_same_seed_gives_the_same_numbers_and_another_other_noise(single_and
 
 def test_a_mirror_turns_the_ray_by_twice_its_turn(backend):
     turns = np.array([1e-6, 0.01, 0.3])
-    turned, moved = mirror_turns(backend, turns)
+    turned, moved = mirror_rotations(backend, turns)
     assert turned == pytest.approx(2 * turns, rel=1e-9)
     assert moved == pytest.approx(np.tan(2 * turns), rel=1e-9)
 

@@ -63,7 +63,7 @@ def false_on(scene: Pass, lines: Sequence[str] = LINES) -> set[Sentence]:
     """Sentences that do not hold for a pass made by hand, without the orbit of the library's test."""
     strips = dict(zip(lines, scene.strips(1.5), strict=True))
     found = Answers.of(sensitivity(Station.of(scene.station, 0.5), strips, usual_angles(LINES)))
-    return {sentence for sentence in SENTENCES if not sentence.holds(found.rises, found.growth)}
+    return {sentence for sentence in SENTENCES if not sentence.agrees(found.rises, found.bend)}
 
 
 @pytest.mark.second
@@ -112,7 +112,7 @@ def quick(drawn, monkeypatch):
     monkeypatch.setattr(results, "make_passes", lambda *_, **__: drawn["figures"])
     monkeypatch.setattr(method, "height_passes", lambda _: drawn["uses"])
     monkeypatch.setattr(method, "off_axis_passes", lambda _: drawn["off_axis"])
-    monkeypatch.setattr(results, "_places", lambda _: {})
+    monkeypatch.setattr(results, "_sites", lambda _: {})
     monkeypatch.setattr(results, "_show", lambda *_: None)
     return monkeypatch
 

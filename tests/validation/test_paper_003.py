@@ -185,13 +185,13 @@ def alone(campaign, one):
 
 
 SEEN = {}
-PLACES_SEEN = model.places_seen
+IMAGE_POSITIONS = model.image_positions
 
 
-def places_seen(setup, one, line, interior, bias):
+def image_positions(setup, one, line, interior, bias):
     key = line, *interior, *bias
     if key not in SEEN:
-        SEEN[key] = PLACES_SEEN(setup, one, line, interior, bias)
+        SEEN[key] = IMAGE_POSITIONS(setup, one, line, interior, bias)
     return SEEN[key]
 
 
@@ -201,7 +201,7 @@ def turned(monkeypatch):
     exact_passes(), campaigns()  # before anything is patched
     monkeypatch.setattr(model, "exact_and_images", lambda: exact_passes()[0])
     monkeypatch.setattr(model, "exact_campaign", lambda *_: exact_passes()[1])
-    monkeypatch.setattr(model, "places_seen", places_seen)
+    monkeypatch.setattr(model, "image_positions", image_positions)
     monkeypatch.setattr(model, "rendered_marks", lambda *_: exact_passes()[2])
     monkeypatch.setattr(fields, "flown", lambda *_: campaigns())
     monkeypatch.setattr(fields, "calibrated_alone", alone)

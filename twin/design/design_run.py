@@ -265,7 +265,7 @@ def _held_text(held: tuple[optimiser.ActiveConstraint, ...], start: str, across:
         if _anamorphism(constraint):
             limit, step, unit = f"{100 * constraint.limit:.4g} %", 1e-2 * across, "%"
         text = f"the {constraint.name} ({limit}"
-        if constraint.start > optimiser.HELD:
+        if constraint.start > optimiser.MET:
             text += f", violated by {start} by {constraint.start / step:.3g} {unit}"
         parts.append(f"{text}; easing it by 1 {unit} reduces the error by {step * constraint.sensitivity:.2g} waves)")
     return " and ".join(parts)

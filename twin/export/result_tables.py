@@ -77,7 +77,7 @@ NESTED = (
 DESCRIPTIONS: Mapping[str, tuple[str, str]] = FrozenMap(
     {
         "camera": ("", "name of the camera in the instrument"),
-        "channel": ("", "end of the line at which the area CCD stands: left is +Y of the focal plane"),
+        "channel": ("", "end of the line at which the area CCD is: left is +Y of the focal plane"),
         "state": ("", "before the disturbance or after it"),
         "estimator": ("", "estimator of the reading"),
         "row": ("px", "row of the spot's centre on the area CCD; 0 is the centre of the first"),
@@ -158,7 +158,7 @@ def result_tables(folder: Path, files: Sequence[str]) -> list[DataTable]:
 
 
 def _frames_of(data: Any) -> dict[str, str]:
-    """Return "frame of QUANTITY" -> its reference frame, as a JSON file lists them for its numbers."""
+    """Return the reference frames of quantities, by "frame of QUANTITY", as a JSON file lists them for its numbers."""
     frames = data.get("reference_frames", {}) if isinstance(data, Mapping) else {}
     return {f"frame of {quantity}": str(text) for quantity, text in frames.items()}
 

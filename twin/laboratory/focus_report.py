@@ -174,7 +174,7 @@ def edges_figure(run: SimulatedFocus) -> Figure:
 
 
 MOVED = {"image": "image, along the light", "target": "target, along the light", "focal_plane": "CCD, along the light"}
-"""What was moved through focus (image or target) -> its description in reports."""
+"""Description in reports of the part that was moved through focus, by its name in the file."""
 
 
 def focus_report(run: FocusRun) -> Report:

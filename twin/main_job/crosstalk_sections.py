@@ -55,8 +55,8 @@ def motion_section(run: RenderRun, drawn: Mapping[str, str]) -> Section:
     parts: list[Artefact] = [figure(drawn, "motions", caption, full=_motions(run))]
     for k, (name, table) in enumerate(run.crosstalk.items()):
         labels = {f"{m.label} [{m.unit}]" for m in table.motions} | {m.label for m in table.motions}
-        first = _pretty(table.observability.statements[0].split(": ", 1), labels)
-        points = [_pretty(s.split(": ", 1), labels, keep=True) for s in table.principal_distance_statements()]
+        first = _pretty(table.observability.sentences[0].split(": ", 1), labels)
+        points = [_pretty(s.split(": ", 1), labels, keep=True) for s in table.principal_distance_sentences()]
         title = f"Three ways to change the principal distance of {name}: piston, despace, scale"
         parts.append(Text(f"focal-{k}", title, first, points, within=IN_PAGE))
     return Section("Response of the spots to motions", (), tuple(parts), len(run.crosstalk), "motions")

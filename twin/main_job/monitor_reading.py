@@ -107,7 +107,7 @@ class MonitorReading:
         if doubt is not None and not texts:
             texts.append(doubt.text)
         for name, curvature in self.recovery.curvature.items():
-            if not curvature.holds[0]:
+            if not curvature.valid[0]:
                 texts.append(
                     f"σ does not hold: the motions read by the {self.estimators[name].title} are too large for a "
                     f"linear estimate, and the estimated state cannot be retraced ({self._error_text(name)}); "
@@ -127,7 +127,7 @@ class MonitorReading:
             f"the motions read by the {self.estimators[name].title} are too large for a linear estimate "
             f"({self._error_text(name)} against the retraced state): its readings are Gauss-Newton iterates"
             for name, curvature in self.recovery.curvature.items()
-            if curvature.beyond[0] and curvature.holds[0]
+            if curvature.beyond[0] and curvature.valid[0]
         )
 
     @cached_property
@@ -260,7 +260,7 @@ class MonitorReading:
         for name, curvature in self.recovery.curvature.items():
             size = curvature.worst()[1]
             if math.isfinite(size):
-                state = "relinearised" if curvature.beyond[0] and curvature.holds[0] else "linear"
+                state = "relinearised" if curvature.beyond[0] and curvature.valid[0] else "linear"
                 limit = f"above {NONLINEAR_SIGMAS:g} sigma relinearised, else sigma does not hold"
                 meaning = f"readings are {state}; {limit}"
                 yield SelfCheck(f"linear readings of {name} against the retraced state", size, None, "sigma", meaning)
@@ -291,8 +291,8 @@ class MonitorReading:
         return {
             "off_in_sigma": round(size, OFF_DECIMALS) if math.isfinite(size) else None,
             "of": quantity.name if size >= 1.0 else "",
-            "relinearised": bool(curvature.beyond[0] and curvature.holds[0]),
-            "holds": bool(curvature.holds[0]),
+            "relinearised": bool(curvature.beyond[0] and curvature.valid[0]),
+            "holds": bool(curvature.valid[0]),
         }
 
     def _consistency_plain(self, test: Consistency | None) -> dict[str, Any]:

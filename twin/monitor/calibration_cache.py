@@ -200,18 +200,18 @@ class _Writer(pickle.Pickler):
         super().__init__(file, pickle.HIGHEST_PROTOCOL)
         self._known = entry.backend, *entry.specs
 
-    def persistent_id(self, thing: Any) -> int | None:
-        if not isinstance(thing, Backend | Spec):
+    def persistent_id(self, value: Any) -> int | None:
+        if not isinstance(value, Backend | Spec):
             return None
         for number, reference in enumerate(self._known):
             # equal instruments share their parts in one process, those of the first job's specification
-            if thing is reference or (thing == reference and repr(thing) == repr(reference)):
+            if value is reference or (value == reference and repr(value) == repr(reference)):
                 return number
-        raise pickle.PicklingError(f"{type(thing).__name__} is not one of the entry's specifications")
+        raise pickle.PicklingError(f"{type(value).__name__} is not one of the entry's specifications")
 
-    def reducer_override(self, thing: Any) -> Any:
+    def reducer_override(self, value: Any) -> Any:
         """Write members of an enumeration by value: Python before 3.11.4 would write a call of `getattr`."""
-        return (type(thing), (thing.value,)) if isinstance(thing, Enum) else NotImplemented
+        return (type(value), (value.value,)) if isinstance(value, Enum) else NotImplemented
 
 
 class _Reader(pickle.Unpickler):
@@ -350,8 +350,8 @@ def _words(value: Any) -> Iterator[str]:
             yield from _words(sorted(attribute) if isinstance(attribute, set | frozenset) else attribute)
 
 
-def _name(thing: Any) -> str:
+def _name(value: Any) -> str:
     """Return the module and qualified name of a class or function of the program, as one text."""
-    if (not _of_program(thing.__module__) and thing.__module__ != "builtins") or "<" in thing.__qualname__:
-        raise _UnnamedError(f"{thing!r} is no part of the program")
-    return f"{thing.__module__}.{thing.__qualname__}"
+    if (not _of_program(value.__module__) and value.__module__ != "builtins") or "<" in value.__qualname__:
+        raise _UnnamedError(f"{value!r} is no part of the program")
+    return f"{value.__module__}.{value.__qualname__}"

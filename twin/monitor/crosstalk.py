@@ -113,11 +113,11 @@ class CameraCrosstalk:
         return {
             "motions": rows,
             "factors": [vars(factor) for factor in self.factors],
-            "observability": list(self.observability.statements),
-            "principal_distance": list(self.principal_distance_statements()),
+            "observability": list(self.observability.sentences),
+            "principal_distance": list(self.principal_distance_sentences()),
         }
 
-    def principal_distance_statements(self) -> tuple[str, ...]:
+    def principal_distance_sentences(self) -> tuple[str, ...]:
         """Return sentences on how changes of focus, spacing and size appear as changes of the principal distance."""
         out = []
         for k, motion in enumerate(self.motions):

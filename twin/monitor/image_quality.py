@@ -109,8 +109,8 @@ class PupilMean:
                 values = np.where(self._free, values, terms @ self._on_stop.T)
             values = np.concatenate([values, np.squeeze(self._added @ terms[..., None], -1)], axis=1)
         weighted = self._tilts * self._share[..., None]
-        turned = np.swapaxes(weighted, 1, 2)
-        level = np.linalg.solve(turned @ self._tilts, turned @ values[..., None])
+        transposed = np.swapaxes(weighted, 1, 2)
+        level = np.linalg.solve(transposed @ self._tilts, transposed @ values[..., None])
         return np.asarray(values - np.squeeze(self._tilts @ level, -1))
 
 
@@ -254,7 +254,7 @@ class ImageQuality:
         )
 
     def state(self, number: int) -> dict[str, CameraState]:
-        """Return camera -> its image quality in the state with index ``number``, for result files."""
+        """Return the image quality of each camera in the state with index ``number``, for result files."""
         positions = {
             position: self.fields.index(field) for position, field in POSITIONS.items() if field in self.fields
         }
@@ -270,7 +270,7 @@ class CameraState:
     positions: Mapping[str, int]
 
     def named(self, values: np.ndarray) -> dict[str, float | None]:
-        """Return name of the field point -> value in this state.
+        """Return the value at each field point in this state, by the name of the point.
 
         ``values`` holds the values in S states at F field points, (S, F).
         """
@@ -313,7 +313,7 @@ def _at_positions(quantity: Quantity[CameraQuality]) -> Quantity[CameraState]:
     return Quantity(
         quantity.key,
         lambda camera_state: camera_state.named(quantity.of(camera_state.camera)),
-        f"{quantity.meaning}, at places of the line",
+        f"{quantity.meaning}, at positions of the line",
     )
 
 
@@ -546,7 +546,7 @@ class _CameraBench:
                     )
 
     def bodies(self, count: int) -> dict[str, np.ndarray]:
-        """Return each body in a beam -> fraction of the stop's area that it blocks, (S, F).
+        """Return the fraction of the stop's area that each body in a beam blocks, (S, F).
 
         The fraction is NaN where the light is lost.
 
@@ -648,7 +648,7 @@ class _CameraBench:
         if shadows is not None:
             self._taken.append((which, shadows.shares()))
         values = np.stack([light_lost, wfe, refocused, defocus, *mtf])
-        self._hold(values, dark, shadows)
+        self._require_possible(values, dark, shadows)
         return values, dark, np.isnan(mtf[0])
 
     def _pupils(
@@ -743,7 +743,7 @@ class _CameraBench:
                 known[k] = False
         return total, known
 
-    def _hold(self, values: np.ndarray, dark: np.ndarray, shadows: shadow.Shadows | None) -> None:
+    def _require_possible(self, values: np.ndarray, dark: np.ndarray, shadows: shadow.Shadows | None) -> None:
         """Raise UnphysicalError if a computed value is physically impossible; the message names camera and quantity.
 
         Parameters

@@ -768,7 +768,7 @@ class Information:
         return 2.0 * weights.T @ residual / scale, weights.T @ weights / scale
 
     def shares(self, name: str, measured: bool = True) -> dict[str, float]:
-        """Return cause -> its contribution to the variance of a quantity, in SI units squared.
+        """Return the contribution of each cause to the variance of a quantity, in SI units squared.
 
         A cause is a motion of the prior, or the noise of the images.
 
@@ -842,7 +842,7 @@ def information_of(
 
 
 def quantity_rows(instrument: Instrument, ground: GroundGeometry | None) -> dict[str, np.ndarray]:
-    """Return name of a quantity -> its coefficients on the parameters of all cameras, (n, 4 K).
+    """Return the coefficients of each quantity, by name, on the parameters of all cameras, (n, 4 K).
 
     The quantities are d_alpha, d_beta, d_gamma (rad) and d_f (m) of every camera, as ``camera/d_alpha``; the
     intersection angle of the first two cameras (rad); and the height (m) at the line's centre.

@@ -239,7 +239,7 @@ class MonitorExperiment:
         return on_deformed(self.instrument, self.deformed(job), motions_of(job, time), self.heated(job))
 
     def fields(self, job: JobSpec, time: int | None = None) -> dict[str, Temperature]:
-        """Return body -> its linear temperature field at the time with index ``time``, including those of tables.
+        """Return the linear temperature field of each body at the time with index ``time``, including those of tables.
 
         Raises
         ------
@@ -249,7 +249,7 @@ class MonitorExperiment:
         return with_heat(job.fields(time), self.heated(job))
 
     def heated(self, job: JobSpec) -> Mapping[str, HeatedBody]:
-        """Return body -> its table of temperatures from the job's files.
+        """Return the table of temperatures of each body from the job's files.
 
         The tables are read once, since many states may share them.
 
@@ -261,7 +261,7 @@ class MonitorExperiment:
         return heated_bodies(job, self.thermal, self._heated)
 
     def deformed(self, job: JobSpec) -> Mapping[str, NodalDeformation]:
-        """Return body -> its deformation from a table of nodes in the job's files.
+        """Return the deformation of each body from a table of nodes in the job's files.
 
         The tables are read once, since many states may share them.
 
@@ -585,7 +585,7 @@ class MonitorSize:
         return self.spots * NodeClasses(self.phase, (0.5 * self.rows, 0.5 * self.columns)).sharp_count
 
     def parts(self, detector: EmvaDetector) -> Mapping[str, float]:
-        """Return name of a part of the job -> its memory in bytes: CCDs, frames, times and other pictures.
+        """Return the memory in bytes that each part of the job needs: CCDs, frames, times and other pictures.
 
         Parameters
         ----------

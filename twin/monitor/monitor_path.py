@@ -371,7 +371,7 @@ class MonitorPath(monitor_beams.MonitorBeams):
             if number + 2 <= last:
                 wanted[np.any(difference > monitor_beams.GOOD, axis=0)] += 2
             wanted[~np.all(rays.valid.reshape(len(self.channels), len(states), -1), axis=(0, 2))] = last
-            self._require_alike(np.where(wanted == number, difference, 0.0), rays)
+            self._require_accurate(np.where(wanted == number, difference, 0.0), rays)
         photons = response.apply(waves)
         if self._sized:
             light = self._require_energy(photons, rays, beams.nodes.share, margin, wanted > number)
@@ -380,7 +380,7 @@ class MonitorPath(monitor_beams.MonitorBeams):
         photons *= self.light_per_pixel[:, None, None, None]
         return np.swapaxes(photons, 0, 1), wanted
 
-    def _require_alike(self, difference: np.ndarray, rays: monitor_beams.CcdRays) -> None:
+    def _require_accurate(self, difference: np.ndarray, rays: monitor_beams.CcdRays) -> None:
         """Raise UncertainImageError if two quadratures over the pupil give images that differ too much.
 
         ``difference`` is relative to the images' peaks, (C, S).

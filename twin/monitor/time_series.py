@@ -107,7 +107,7 @@ class TimeSeries:
         """
         agrees = self.agrees & (self.smoothed is None or self.smoothed.consistency.agrees)
         return agrees & np.all(
-            [self.evidence.holds, *(curvature.holds for curvature in self.curvature.values())], axis=0
+            [self.evidence.consistent, *(curvature.valid for curvature in self.curvature.values())], axis=0
         )
 
     def doubts(self, spots: Sequence[str]) -> tuple[str, ...]:
@@ -123,8 +123,8 @@ class TimeSeries:
         if doubt is not None:
             out.append(f"course {doubt}")
         for name, curvature in self.curvature.items():
-            untraceable = np.flatnonzero(~curvature.holds)
-            recomputed = np.flatnonzero(curvature.beyond & curvature.holds)
+            untraceable = np.flatnonzero(~curvature.valid)
+            recomputed = np.flatnonzero(curvature.beyond & curvature.valid)
             if len(untraceable):
                 out.append(
                     f"course: σ does not hold at {len(untraceable)} times, first at "
@@ -202,7 +202,7 @@ COURSE: Record[TimeSeries] = Record(
     Quantity("motions", lambda course: course.motions or None, "motions by body", record=_MOTIONS, where_known=True),
     Quantity("intersection_angle", _angle, "the angle between two cameras", where_known=True),
     Quantity("ground", lambda course: course.group("ground"), "errors of points on the ground", where_known=True),
-    Quantity("sigma_holds", lambda course: course.sigma_holds, "whether sigmas hold at each time"),
+    Quantity("sigma_holds", lambda course: course.sigma_holds, "true at the times at which the sigmas are valid"),
     Quantity("disturbances", _consistency, "whether all measurements agree with the prior", where_known=True),
     Quantity("between", _between, "filtered and smoothed changes between the times", where_known=True),
 )
@@ -453,7 +453,7 @@ class SmoothedCourse:
         searched: dict[str, Any] = {}
         if self.jumps is not None:
             jumps = [jump.to_dict() for jump in self.jumps]
-            searched = {"jumps": {"false_alarm": self.jump_false_alarm, "found": jumps}}
+            searched = {"jumps": {"false_alarm": self.jump_false_alarm, "detected": jumps}}
         return {
             "name": self.name,
             "chi_square": test.chi_square,

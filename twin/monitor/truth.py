@@ -215,7 +215,7 @@ class Truth:
 
 
 def half_fields(instrument: Instrument, distance: Mapping[str, float]) -> dict[str, float]:
-    """Return camera -> tangent of half the field along its line CCD.
+    """Return the tangent of half of each camera's field along its line CCD.
 
     Parameters
     ----------

@@ -180,7 +180,9 @@ class ClearSegments:
         return self._apertures.get(family or next(iter(self._apertures), ""), [])
 
     def from_source(self, start: Patch, family: str | None = None) -> Segment | None:
-        """Return the segment from a source to the first surface of a detector's nominal light, None if not clear.
+        """Return the straight path from a source to the first surface that the nominal light of a detector meets.
+
+        The result is None if another surface may block this path.
 
         Parameters
         ----------

@@ -50,7 +50,7 @@ def decode(number: int) -> tuple[int, Event, bool]:
 def signature(codes: Iterable[int]) -> int:
     """Return the signature of a list of events: the FNV-1a hash of their codes, as the kernel computes it.
 
-    Two different families of a run of a thousand share a signature with a probability of 3e-14.
+    Among a thousand families of a run, the probability that two share a signature is 3e-14.
     """
     value = START
     for number in codes:

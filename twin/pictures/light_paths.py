@@ -78,7 +78,7 @@ class LightPaths:
         return tuple(b for b in self.beams if b.camera == camera and b.is_monitor == monitor)
 
 
-def trace_light_paths(instrument: Instrument, backend: Backend, state: State, reach: float = 0.0) -> LightPaths:
+def trace_light_paths(instrument: Instrument, backend: Backend, state: State, length: float = 0.0) -> LightPaths:
     """Trace the beams of an instrument.
 
     Parameters
@@ -89,15 +89,15 @@ def trace_light_paths(instrument: Instrument, backend: Backend, state: State, re
         Array backend of the trace.
     state : State
         Perturbed state.
-    reach : float
+    length : float
         Length of the imaging beams beyond the first mirror toward the scene, metres; 0 takes the distance of the
         farthest 180-deg prism, without a monitor the longest camera's length.
     """
     placed = instrument.assembly.place([state])
     spec = instrument.spec
     distances = [c.prism_180.distance for name in spec.cameras for c in spec.channels_of(name).values()]
-    reach = reach or max(distances, default=0.0) or _length(instrument, placed)
-    beams = _imaging(instrument, backend, state, placed, reach)
+    length = length or max(distances, default=0.0) or _length(instrument, placed)
+    beams = _imaging(instrument, backend, state, placed, length)
     if instrument.channels:
         beams += _monitor(instrument, backend, state, placed)
     return LightPaths(tuple(beams), placed)
@@ -107,8 +107,8 @@ def _length(instrument: Instrument, placed: PlacedBodies) -> float:
     """Return the largest distance between two surfaces of a camera, metres."""
     lengths = []
     for name, model in instrument.cameras.items():
-        places = np.array([placed.pose(f"{BASE}/{name}/{surface}").translation for surface in model.mirrors])
-        lengths.append(float(np.max(np.linalg.norm(places[:, None] - places, axis=-1))))
+        vertices = np.array([placed.pose(f"{BASE}/{name}/{surface}").translation for surface in model.mirrors])
+        lengths.append(float(np.max(np.linalg.norm(vertices[:, None] - vertices, axis=-1))))
     return max(lengths) or float(max(model.spec.entrance_pupil for model in instrument.cameras.values()))
 
 
@@ -123,7 +123,7 @@ def _radius(aperture: Aperture | None) -> float:
     return aperture.inscribed
 
 
-def _imaging(instrument: Instrument, backend: Backend, state: State, placed: PlacedBodies, reach: float) -> list[Beam]:
+def _imaging(instrument: Instrument, backend: Backend, state: State, placed: PlacedBodies, length: float) -> list[Beam]:
     """Trace the imaging beams of all cameras backward, from points of the line CCDs through the edge of the stops."""
     assembly, names = instrument.assembly, list(instrument.cameras)
     rays = 1 + RIM
@@ -152,7 +152,7 @@ def _imaging(instrument: Instrument, backend: Backend, state: State, placed: Pla
         path = [placed.pose(assembly.elements[n].body).apply(h) for n, h in zip(chain, hits, strict=True)]
         # end on a plane perpendicular to the middle ray
         normal = leaving[i, rays]
-        along = (path[-1][rays] + reach * normal - path[-1]) @ normal / (leaving[i] @ normal)
+        along = (path[-1][rays] + length * normal - path[-1]) @ normal / (leaving[i] @ normal)
         vertices = np.stack([path[-1] + along[:, None] * leaving[i], *path[::-1], position[i]], axis=1)
         for j, field in enumerate(FIELDS):
             field_rows = slice(j * rays, (j + 1) * rays)

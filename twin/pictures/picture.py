@@ -156,11 +156,11 @@ class Studio:
         """Return rays through pixels, displaced from the pixels' middles by x, y, in pixels."""
         mi, view = self._mi, self._view
         row, column = np.divmod(pixels, view.width)
-        place = mi.Point2f(
+        position = mi.Point2f(
             (mi.Float(column.astype(np.float32) + 0.5) + x) / view.width,
             (mi.Float(row.astype(np.float32) + 0.5) + y) / view.height,
         )
-        ray, _ = self._sensor.sample_ray_differential(mi.Float(0.0), mi.Float(0.5), place, mi.Point2f(0.5, 0.5))
+        ray, _ = self._sensor.sample_ray_differential(mi.Float(0.0), mi.Float(0.5), position, mi.Point2f(0.5, 0.5))
         return ray
 
 
@@ -333,10 +333,10 @@ def write_pictures(
     for k, shot in enumerate(shots):
         before, weight = sum(pixels[:k]) / sum(pixels), pixels[k] / sum(pixels)
 
-        def say(share: float, before: float = before, weight: float = weight) -> None:
+        def report(share: float, before: float = before, weight: float = weight) -> None:
             advance(PICTURE, round(100.0 * (before + weight * share)), 100)
 
-        image = render_shot(instrument, paths, backend, shot, seed, say)
+        image = render_shot(instrument, paths, backend, shot, seed, report)
         write(shot.name, partial(_save, image))
 
 

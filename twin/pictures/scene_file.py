@@ -98,7 +98,7 @@ def scene_bytes(instrument: Instrument, state: State, paths: LightPaths, tube: f
 
 
 def motions(instrument: Instrument, state: State, placed: PlacedBodies) -> dict[str, dict[str, Any]]:
-    """Return path of each moved body -> its motion relative to its parent, as in the scene's ``extras``.
+    """Return the motion of each moved body relative to its parent, by its path, as in the scene's ``extras``.
 
     Parameters
     ----------
@@ -113,11 +113,11 @@ def motions(instrument: Instrument, state: State, placed: PlacedBodies) -> dict[
     bodies = instrument.assembly.tree.bodies
     rest, moved = (_all_in_parents(bodies, poses) for poses in (nominal, placed))
     back = np.swapaxes(rest[:, :3, :3], -1, -2)
-    turn = back @ moved[:, :3, :3]
+    rotation = back @ moved[:, :3, :3]
     offset = np.einsum("bij,bj->bi", back, moved[:, :3, 3] - rest[:, :3, 3])
     pivots = np.array([body.pivots[state.get(body.path, AT_REST).pivot] for body in bodies])
-    rotate = Rotation.from_matrix(turn).as_rotvec()
-    shift = np.einsum("bij,bj->bi", turn, pivots) + offset - pivots
+    rotate = Rotation.from_matrix(rotation).as_rotvec()
+    shift = np.einsum("bij,bj->bi", rotation, pivots) + offset - pivots
     out = {}
     for k in np.flatnonzero(np.maximum(np.abs(rotate), np.abs(shift)).max(axis=1) > MIN_MOTION):
         vectors = {"rotate": rotate[k].tolist(), "shift": shift[k].tolist(), "pivot": pivots[k].tolist()}
@@ -167,7 +167,7 @@ def build_scene(instrument: Instrument, paths: LightPaths, tube: float = TUBE) -
 
 
 def _body_meshes(instrument: Instrument, paths: LightPaths) -> dict[str, trimesh.Trimesh]:
-    """Return path of each body -> mesh in the body's frame, metres, without thermal expansion."""
+    """Return the mesh of each body by its path, in the body's frame, metres, without thermal expansion."""
     out: dict[str, trimesh.Trimesh] = {}
     for camera, model in instrument.cameras.items():
         lens_of = lenses(model.spec)
@@ -181,9 +181,9 @@ def _body_meshes(instrument: Instrument, paths: LightPaths) -> dict[str, trimesh
         plane = f"{BASE}/{camera}/focal_plane"
         line = model.spec.line.pixels * model.spec.line.pitch
         channels = [c for c in instrument.channels if c.camera == camera]
-        reach_x, reach_y = board_size(model, [p for c in channels for p in (c.pinhole, c.ccd)])
+        width, height = board_size(model, [p for c in channels for p in (c.pinhole, c.ccd)])
         # light arrives along +Z of the focal plane, so the board that carries the detectors is on the +Z side
-        out[plane] = _painted(_box((reach_x, reach_y, BOARD), 2.0 * CHIP + 0.5 * BOARD), DARK)
+        out[plane] = _painted(_box((width, height, BOARD), 2.0 * CHIP + 0.5 * BOARD), DARK)
         out[f"{plane}/line"] = _painted(_box((LINE_WIDTH, line, CHIP), 0.5 * CHIP), SILICON)
         for channel in channels:
             out.update(_channel_meshes(instrument, channel))
@@ -208,7 +208,7 @@ def _material(solid: Solid) -> PBRMaterial:
 
 
 def _baffle_meshes(plates: tuple[Plate, ...]) -> dict[str, tuple[str, trimesh.Trimesh]]:
-    """Return name of a baffle -> the body that carries it, and its plates in that body's frame, metres."""
+    """Return for each baffle, by name, the body that carries it, and its plates in that body's frame, metres."""
     parts: dict[str, tuple[str, list[trimesh.Trimesh]]] = {}
     for plate in plates:
         outline = plate.outline

@@ -21,7 +21,7 @@ from analysis.spots.frame_screening import (
 from analysis.spots.likelihood import widened
 from analysis.spots.noise import NoiseModel
 from analysis.spots.photon_transfer import PixelCorrection
-from analysis.spots.screened_fit import CORE_SHARE, ScreenedFit, one_shape
+from analysis.spots.screened_fit import CORE_SHARE, ScreenedFit, single_template
 from analysis.spots.spot_image import NoiseParts, SpotError, SpotPositions, difference_covariance, noise_parts
 from analysis.spots.spot_template import SpotTemplate
 from analysis.spots.static_defects import Examined, examine, outlier_pixels, refit, repaired_centroid
@@ -174,7 +174,7 @@ class ChannelMeasurement:
     def _template(self, state: StateFrames) -> SpotTemplate:
         assert self.shape is not None
         if state.shape not in self._templates:
-            self._templates[state.shape] = one_shape(self.shape, 0, state.shape)
+            self._templates[state.shape] = single_template(self.shape, 0, state.shape)
         return self._templates[state.shape]
 
     def search(self) -> list[Issue]:

@@ -165,9 +165,9 @@ def _spots(run: RecoverRun) -> Section:
             digits = decimals_for(float(sigma[0, i].min()))
             artefacts = "; ".join(f"{finding.kind}: {finding.text}" for finding in spot.findings) or "none"
             rms_sigma = significant(float(np.sqrt(np.mean(np.square(sigma[0, i])))), 2, floor=0.0)
-            places = [fixed(float(coordinate), digits) for coordinate in position[0, i]]
+            coordinates = [fixed(float(coordinate), digits) for coordinate in position[0, i]]
             frames: list[Cell] = [result.channel.name, state_name(run.times, k), len(spot.frames.frames)]
-            rows.append([*frames, *places, rms_sigma, artefacts, fixed(100.0 * spot.cost, 1)])
+            rows.append([*frames, *coordinates, rms_sigma, artefacts, fixed(100.0 * spot.cost, 1)])
     caption = (
         "Rows and columns count on the whole CCD, from the centre of its first pixel. The increase of σ is that of the "
         "spot's position, relative to the same light without excluded pixels or fitted artefacts."
@@ -227,9 +227,9 @@ def _series(run: RecoverRun) -> Section:
         heads += ["filtered", "σ, filtered", "smoothed", "σ, smoothed"]
         reads = run.last.table.of(run.last.judged)
         for number, row in enumerate(rows):
-            k, one = divmod(number, len(reads))
+            k, j = divmod(number, len(reads))
             for estimator in ("filtered", "smoothed"):
-                row_of_change = smoothed.changes.row(reads[one].group, reads[one].parameter.key, estimator)
+                row_of_change = smoothed.changes.row(reads[j].group, reads[j].parameter.key, estimator)
                 row += [float(row_of_change.value[k]), float(row_of_change.sigma[k])]
         caption += " Filtered: from all times up to it; smoothed: from all times."
         legend += (
@@ -318,9 +318,9 @@ def spots_svg(run: RecoverRun, camera: str) -> str:
     """Draw the mean frames of one camera, a row for each channel."""
     norm = asinh_scale(np.concatenate([s.mean.ravel() for _, states in _panels(run, camera) for _, s, _ in states]))
 
-    def draw(axes: Axes, name: str, spot: SpotResult, place: np.ndarray) -> AxesImage:
+    def draw(axes: Axes, name: str, spot: SpotResult, position: np.ndarray) -> AxesImage:
         shown = axes.imshow(spot.mean, cmap=svg.GRAY, norm=norm, interpolation="none", extent=_extent(spot))
-        cross(axes, place, svg.BEFORE if name == "before" else svg.AFTER, 0.11 * spot.mean.shape[1])
+        cross(axes, position, svg.BEFORE if name == "before" else svg.AFTER, 0.11 * spot.mean.shape[1])
         return shown
 
     return _images_svg(run, camera, "measured", "mean frame [DN], asinh stretch", draw)
@@ -329,7 +329,7 @@ def spots_svg(run: RecoverRun, camera: str) -> str:
 def residuals_svg(run: RecoverRun, camera: str) -> str:
     """Draw the fit residuals of one camera's spots in standard deviations, a row for each channel."""
 
-    def draw(axes: Axes, _name: str, spot: SpotResult, _place: np.ndarray) -> AxesImage:
+    def draw(axes: Axes, _name: str, spot: SpotResult, _position: np.ndarray) -> AxesImage:
         residual = np.zeros_like(spot.mean) if spot.residual is None else spot.residual
         return svg.signed_map(axes, residual, LIMIT, interpolation="none", extent=_extent(spot))
 
@@ -345,8 +345,8 @@ def _images_svg(
         figure = svg.new_figure(0.7 + 4.3 * len(panels), {"w_pad": 0.03, "h_pad": 0.03})
         grid = figure.subplots(len(panels), 2, squeeze=False)
         for line, (channel, states) in enumerate(panels):
-            for axes, (state, spot, place) in zip(grid[line], states, strict=True):
-                shown = draw(axes, state, spot, place)
+            for axes, (state, spot, position) in zip(grid[line], states, strict=True):
+                shown = draw(axes, state, spot, position)
                 _mark_unused(axes, spot)
                 _labels(axes, f"{channel}, {state}", line == len(panels) - 1)
         figure.colorbar(shown, ax=list(grid.ravel()), label=label, fraction=0.03, pad=0.02)

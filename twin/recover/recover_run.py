@@ -16,7 +16,7 @@ from analysis.monitor.monitor_formulas import MonitorGeometry, coefficients
 from analysis.monitor.parameters import CameraCalibration, MonitorCalibration
 from analysis.monitor.recovery import MotionModel, Recovery, judged_spots, recover_monitor, recovery_of
 from analysis.spots.noise import NoiseModel
-from analysis.spots.screened_fit import one_shape
+from analysis.spots.screened_fit import single_template
 from analysis.spots.spot_image import NoiseParts, SpotError, SpotPositions
 from optics.numerics.backend import Backend, one_blas_thread
 from scenes.models.camera_sharpness import blur_warnings
@@ -261,7 +261,7 @@ def _measured(
         shape = None
         if test.template == "twin":
             assert bench.calibration is not None
-            shape = one_shape(bench.calibration.template, number, channel.ccd)
+            shape = single_template(bench.calibration.template, number, channel.ccd)
         measurement = ChannelMeasurement(setup.test, channel, shape)
         issues += measurement.search()
         measurements.append(measurement)
@@ -514,8 +514,8 @@ def _spot_numbers(spot: SpotResult) -> dict[str, Any]:
     return {
         "frames": len(spot.frames.frames),
         "first_pixel": list(spot.frames.offset),
-        "pixels_left_out": int(np.count_nonzero(~spot.used)),
-        "found": [
+        "excluded_pixels": int(np.count_nonzero(~spot.used)),
+        "defects": [
             {"kind": finding.kind, "text": finding.text, "corrected": finding.corrects} for finding in spot.findings
         ],
         "sigma_cost": round(spot.cost, 6),

@@ -57,7 +57,7 @@ from twin.monitor.crosstalk import estimator_gains
 from twin.monitor.monitor_derivative import spot_jacobian
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.monitor.truth import ElementaryMotion, truth_jacobian
-from twin.scripting.results import Found, Shot, as_frames, found_table, name_html
+from twin.scripting.results import Recovered, Shot, as_frames, name_html, recovered_of
 from twin.scripting.results import shot_of as _shot_of
 from twin.sensors.area_detector import coarse_warnings
 
@@ -306,27 +306,27 @@ class InstrumentTwin:
             No such node, a motion that it does not allow, or one that cannot be added: a rotation about another pivot.
         """
         twin = self
-        for asked in self._given(perturb):
+        for addition in self._additions(perturb):
             before = twin.resolved.job.perturb
-            twin = twin.with_perturbations(asked)
-            own = twin.resolved.job.perturb
-            twice = {path: _sum_of(path, before[path], own[path]) for path in asked if path in before}
+            twin = twin.with_perturbations(addition)
+            added = twin.resolved.job.perturb
+            twice = {path: _sum_of(path, before[path], added[path]) for path in addition if path in before}
             twin = twin.with_perturbations(twice) if twice else twin
         return twin
 
-    def _given(self, perturb: Sequence[Perturbation | Sequence[Perturbation]]) -> list[dict[str, Any]]:
+    def _additions(self, perturb: Sequence[Perturbation | Sequence[Perturbation]]) -> list[dict[str, Any]]:
         """Return the requested perturbations by the bodies' full paths: all texts together, then each mapping."""
-        asked = [one for item in perturb for one in (item if isinstance(item, list | tuple) else [item])]
+        asked = [entry for item in perturb for entry in (item if isinstance(item, list | tuple) else [item])]
         try:
-            wrong = [one for one in asked if not isinstance(one, str | Mapping)]
+            wrong = [entry for entry in asked if not isinstance(entry, str | Mapping)]
             if wrong:
                 raise Problem(
                     "not a perturbation", shown(wrong[0]), f"{FORMS}, or a mapping as below perturb in a file"
                 )
-            words = perturbation_in_words(one for one in asked if isinstance(one, str))
+            words = perturbation_in_words(entry for entry in asked if isinstance(entry, str))
         except Problem as problem:
             raise InputError(problem.at("", key=("perturb",))) from None
-        return [self._by_path(one) for one in (words, *asked) if isinstance(one, Mapping) and one]
+        return [self._by_path(entry) for entry in (words, *asked) if isinstance(entry, Mapping) and entry]
 
     def _by_path(self, perturb: Mapping[str, Any]) -> dict[str, Any]:
         """Return a perturbation by the bodies' full paths; unknown names stay and are reported later."""
@@ -420,12 +420,12 @@ class InstrumentTwin:
             A key is wrong, or a perturbation is so large that light misses the mirrors or a spot its CCD.
         """
         arguments = {"frames": frames, "seed": seed}
-        own = {key: value for key, value in arguments.items() if value is not None}
-        job = self._with_job({**self._plain, "render": {**self._plain.get("render", {}), **own, **render}}).resolved
+        chosen = {key: value for key, value in arguments.items() if value is not None}
+        job = self._with_job({**self._plain, "render": {**self._plain.get("render", {}), **chosen, **render}}).resolved
         started, backend = time.time(), self._bench.backend
         return _shot_of(render_job(job, backend, experiment=self._bench.experiment), backend, started)
 
-    def recover(self, before: Any, after: Any, centroid: str | None = None) -> Found:
+    def recover(self, before: Any, after: Any, centroid: str | None = None) -> Recovered:
         """Estimate the changes of the cameras from images, by every estimator.
 
         The changes are rotations d_alpha, d_beta, d_gamma and the change d_f of the principal distance of each camera.
@@ -470,7 +470,7 @@ class InstrumentTwin:
             centroid=method,
         )
         warnings = (*blur_warnings(self.resolved, self._bench.backend), *coarse_warnings(self.resolved))
-        return found_table(reading, warnings)
+        return recovered_of(reading, warnings)
 
     def jacobian(self, motions: Sequence[str]) -> xr.Dataset:
         """Return exact derivatives of spots and camera parameters with respect to elementary motions of bodies.
@@ -523,7 +523,7 @@ class InstrumentTwin:
                 "channel": keys,
                 "axis": ["row", "column"],
                 "camera": names,
-                "parameter": [one.key for one in parameters.CAMERA_PARAMETERS.values()],
+                "parameter": [parameter.key for parameter in parameters.CAMERA_PARAMETERS.values()],
                 "estimator": list(gains),
             },
             attrs={"reference_frames": frames_text("crosstalk")},
@@ -580,10 +580,10 @@ class InstrumentTwin:
             return InstrumentTwin.of(resolved.model_copy(update={"cameras": cameras}), self._bench.name)
         optics = self.camera(name)
         plane = focal_plane_body(optics.path.root)
-        own = motions_of(checked_nodes(resolved.job, self._nodes)).get(plane)
+        plane_motion = motions_of(checked_nodes(resolved.job, self._nodes)).get(plane)
         others = {node: keys for node, keys in dict(self._plain.get("perturb") or {}).items() if node != plane}
-        unmoved = self._with_job({**self._plain, "perturb": others}) if own is not None else self
-        return unmoved.perturbed(*find_focus(optics, tilt, name, own).words)
+        unmoved = self._with_job({**self._plain, "perturb": others}) if plane_motion is not None else self
+        return unmoved.perturbed(*find_focus(optics, tilt, name, plane_motion).words)
 
     def to_yaml(self) -> str:
         """Return the text of a self-contained job file for this instrument, for `load` and the commands."""
@@ -619,10 +619,10 @@ def _pivot(uses: Sequence[str], plain: Mapping[str, Any]) -> tuple[str, ...]:
     return ("pivot",) if {"rotate", "scale"} & set(uses) and "pivot" in plain else ()
 
 
-def _sum_of(path: str, one: PerturbationSpec, other: PerturbationSpec) -> dict[str, Any]:
+def _sum_of(path: str, first: PerturbationSpec, second: PerturbationSpec) -> dict[str, Any]:
     """Return the sum of two perturbations of a body as plain data; raise `InputError` where there is none."""
     try:
-        return one.plus(other).plain()
+        return first.plus(second).plain()
     except Problem as problem:
         raise InputError(problem.below(path).at("", key=("perturb",))) from None
 
@@ -730,6 +730,6 @@ def _motion_named(text: str, nodes: Mapping[str, NodeInfo]) -> ElementaryMotion:
     return ElementaryMotion(node, kind, number, pivot, text)
 
 
-def _wrong(problem: str, found: str, allowed: str, suggestion: str | None = None) -> InputError:
+def _wrong(problem: str, value: str, allowed: str, suggestion: str | None = None) -> InputError:
     """Return an error about a motion's text, with what is allowed and the nearest valid name as suggestion."""
-    return InputError(Issue(problem, found=repr(found), allowed=allowed, suggestion=suggestion))
+    return InputError(Issue(problem, found=repr(value), allowed=allowed, suggestion=suggestion))

@@ -108,10 +108,10 @@ class Shot:
         """
         cameras = self.run.targets.cameras if self.run.targets is not None else {}
         rows = {
-            (camera, name, direction): _edge_row(place, direction)
+            (camera, name, direction): _edge_row(targets_at, direction)
             for camera, targets in cameras.items()
-            for name, place in targets.places.items()
-            for direction in place.before.edges
+            for name, targets_at in targets.places.items()
+            for direction in targets_at.before.edges
         }
         return _indexed(rows, ["camera", "place", "direction"])
 
@@ -125,7 +125,7 @@ class Shot:
         """
         quality = self.run.quality
         rows = {
-            (name, when, field): {one.key: one.value(camera)[s, k] for one in AT_FIELDS}
+            (name, when, field): {quantity.key: quantity.value(camera)[s, k] for quantity in AT_FIELDS}
             for name, camera in ({} if quality is None else quality.cameras).items()
             for s, when in enumerate(("before", "after"))
             for k, field in enumerate(() if quality is None else quality.fields)
@@ -139,7 +139,7 @@ class Shot:
 
 
 @dataclass(frozen=True, eq=False)
-class Found:
+class Recovered:
     """Changes of the cameras that every estimator computes from images ("readings").
 
     Attributes
@@ -260,31 +260,31 @@ def _indexed(rows: Mapping[tuple[Any, ...], Mapping[str, float]], names: list[st
     return table
 
 
-def _edge_row(place: PlaceTargets, direction: str) -> dict[str, float]:
+def _edge_row(targets: PlaceTargets, direction: str) -> dict[str, float]:
     """Return one row of ``Shot.mtf``: MTF of a knife edge before and after, with sigma and true value."""
     out: dict[str, float] = {}
-    for when, shots in place.shots.items():
+    for when, shots in targets.shots.items():
         edge = shots.edges[direction]
         value, sigma = edge.nyquist or (np.nan, np.nan)
         out |= {when: value, f"{when}_sigma": sigma, f"{when}_true": edge.true_nyquist}
     return out
 
 
-def _reading_frame(found: Found) -> pd.DataFrame:
+def _reading_frame(recovered: Recovered) -> pd.DataFrame:
     """Return a table of the estimated changes by camera and parameter, with a column for each estimator.
 
-    Sigmas are those of the estimator ``Found.judged``.
+    Sigmas are those of the estimator ``Recovered.judged``.
     """
-    values = found.values.stack(row=("camera", "parameter")).transpose("row", "estimator").to_pandas()
+    values = recovered.values.stack(row=("camera", "parameter")).transpose("row", "estimator").to_pandas()
     values.columns.name = None
-    sigmas = {"sigma": found.sigma, "sigma_noise": found.sigma_noise}
-    own = {name: s.sel(estimator=found.judged).stack(row=("camera", "parameter")) for name, s in sigmas.items()}
-    return values.assign(**{name: column.to_pandas() for name, column in own.items()})
+    sigmas = {"sigma": recovered.sigma, "sigma_noise": recovered.sigma_noise}
+    spreads = {name: s.sel(estimator=recovered.judged).stack(row=("camera", "parameter")) for name, s in sigmas.items()}
+    return values.assign(**{name: column.to_pandas() for name, column in spreads.items()})
 
 
 def _truth_frame(truth: xr.Dataset) -> pd.DataFrame:
     """Return a table of the true changes of the cameras (rotations, principal distance), one row per camera."""
-    return truth[[one.key for one in parameters.CAMERA_PARAMETERS.values()]].to_dataframe()
+    return truth[[parameter.key for parameter in parameters.CAMERA_PARAMETERS.values()]].to_dataframe()
 
 
 def shot_of(run: JobRun, backend: Backend, started: float) -> Shot:
@@ -328,7 +328,7 @@ def _truth(run: JobRun) -> xr.Dataset:
     return xr.Dataset(data, coords={"camera": list(cameras)}, attrs=attributes)
 
 
-def found_table(reading: MonitorReading, warnings: Sequence[str] = ()) -> Found:
+def recovered_of(reading: MonitorReading, warnings: Sequence[str] = ()) -> Recovered:
     """Convert the estimated changes of one perturbed state to the labelled arrays that a script gets.
 
     Parameters
@@ -342,12 +342,12 @@ def found_table(reading: MonitorReading, warnings: Sequence[str] = ()) -> Found:
     channels = ["/".join(channel) for channel in reading.channels]
     disturbances = "" if reading.disturbances is None else reading.disturbances.name
     texts = (*warnings, *reading.doubts, *reading.notes, *reading.unobserved)
-    shares = {(group, key): v for group, own in reading.from_statement.items() for key, v in own.items()}
+    shares = {(group, key): v for group, named in reading.from_statement.items() for key, v in named.items()}
     from_statement = pd.Series(shares, dtype=float, name="from_statement")
     if shares:
         from_statement.index = pd.MultiIndex.from_tuples(shares, names=["camera", "parameter"])
     estimators = list(recovery.parameters[cameras[0]])
-    table, keys = reading.table, [one.key for one in parameters.CAMERA_PARAMETERS.values()]
+    table, keys = reading.table, [parameter.key for parameter in parameters.CAMERA_PARAMETERS.values()]
     values = [[[table.row(camera, key, name).value for key in keys] for name in estimators] for camera in cameras]
     coords = {"camera": list(cameras), "estimator": estimators, "parameter": keys}
     dims = ("camera", "estimator", "parameter")
@@ -379,10 +379,10 @@ def found_table(reading: MonitorReading, warnings: Sequence[str] = ()) -> Found:
         variables = {name: ("estimator", numbers) for name, numbers in data.items()}
         return xr.Dataset(variables, coords={"estimator": estimators} if data else {}, attrs=about)
 
-    return Found(
+    return Recovered(
         values=xr.DataArray(np.array(values), dims=dims, coords=coords, name="reading", attrs=about),
-        covariance=spread(lambda found: found.error_covariance),
-        covariance_noise=spread(lambda found: found.covariance),
+        covariance=spread(lambda estimate: estimate.error_covariance),
+        covariance_noise=spread(lambda estimate: estimate.covariance),
         angle=by_estimator(ANGLE_GROUP),
         ground=by_estimator(GROUND_GROUP),
         spots=xr.Dataset(
@@ -397,7 +397,7 @@ def found_table(reading: MonitorReading, warnings: Sequence[str] = ()) -> Found:
     )
 
 
-def as_frames(given: Any, name: str, channels: Sequence[str], shape: tuple[int, int]) -> np.ndarray:
+def as_frames(images: Any, name: str, channels: Sequence[str], shape: tuple[int, int]) -> np.ndarray:
     """Return a script's frames as (channels, frames, rows, columns), with the channels in the instrument's order.
 
     Raises
@@ -405,12 +405,12 @@ def as_frames(given: Any, name: str, channels: Sequence[str], shape: tuple[int, 
     ValueError
         Dimensions, channels or numbers of pixels differ from those of the instrument.
     """
-    if isinstance(given, xr.DataArray) and "channel" in given.coords:
-        missing = [key for key in channels if key not in given.channel.values]
+    if isinstance(images, xr.DataArray) and "channel" in images.coords:
+        missing = [key for key in channels if key not in images.channel.values]
         if missing:
             raise ValueError(f"{name}: no frames of the channels {', '.join(missing)}")
-        given = given.sel(channel=list(channels)).transpose("channel", "frame", "row", "column")
-    frames = np.asarray(given)
+        images = images.sel(channel=list(channels)).transpose("channel", "frame", "row", "column")
+    frames = np.asarray(images)
     if frames.ndim != 4 or frames.shape[0] != len(channels) or frames.shape[2:] != tuple(shape):
         wanted = f"({len(channels)}, frames, {shape[0]}, {shape[1]})"
         raise ValueError(f"{name}: frames are (channel, frame, row, column) = {wanted}, found {frames.shape}")

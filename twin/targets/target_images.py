@@ -67,7 +67,7 @@ class BandPupils:
     weights: np.ndarray
 
     @classmethod
-    def alike(cls, pupil: PupilFunction, band: BandSpec) -> BandPupils:
+    def achromatic(cls, pupil: PupilFunction, band: BandSpec) -> BandPupils:
         """Return the pupils of a mirror system, the same at all wavelengths of a band."""
         return cls((pupil,), *band_wavelengths(band))
 
@@ -210,7 +210,7 @@ class EdgeOptics:
 
         A single pupil serves all wavelengths of the band.
         """
-        light = BandPupils.alike(light, band) if isinstance(light, PupilFunction) else light
+        light = BandPupils.achromatic(light, band) if isinstance(light, PupilFunction) else light
         cutoff = float(light.shortest.cutoff(normal[None], band.spectrum.ends[0])[0])
         steps = max(int(np.ceil(extent / DEFOCUS_STEP)), 3)
         defocus = np.linspace(-extent, extent, 2 * steps + 1)
@@ -516,7 +516,7 @@ class TargetCamera:
         self.directions = path.directions(self.positions)
 
     def views(self, state: State) -> dict[str, View]:
-        """Return name of each position on the line (left, centre, right) -> its view in a state of the camera.
+        """Return the view of each position on the line (left, centre, right), by its name, in a state of the camera.
 
         Raises
         ------
@@ -541,7 +541,7 @@ class TargetCamera:
         """
         band = self.ccd.band
         if not lenses(self.path.model.spec):
-            return [BandPupils.alike(pupil, band) for pupil in self.path.pupils(state, self.directions, hits)]
+            return [BandPupils.achromatic(pupil, band) for pupil in self.path.pupils(state, self.directions, hits)]
         wavelengths, weights = band.spectrum.rule(self._wavelengths if count is None else count)
         by_wavelength = [
             self.path.pupils(state, self.directions, hits, wavelength=float(colour)) for colour in wavelengths

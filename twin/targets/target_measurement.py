@@ -258,7 +258,7 @@ class TargetRun:
 
 
 def _directions(targets: PlaceTargets, plain: Any) -> dict[str, Any]:
-    """Return direction -> state (before, after) -> plain data of its measurement, as made by the function ``plain``.
+    """Return the measurements by direction and state (before, after), as plain data that ``plain`` makes of each.
 
     ``plain`` is called with the knife edge's and the bars' measurement, either of which may be None.
     """

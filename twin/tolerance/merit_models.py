@@ -37,7 +37,7 @@ _MOST_DRAWS, _MOST_WORK = 50_000, 1_500_000_000
 
 With 50 000 draws the standard error of a share is about 0.3 %.
 """
-_MOST_HELD, _FEWEST = 25_000_000, 500
+_MOST_VALUES, _FEWEST = 25_000_000, 500
 """Largest number of array elements of a scaled model in memory, and smallest number of draws that it uses."""
 
 
@@ -152,8 +152,8 @@ class VarianceShares:
 def model_draws(bench: ToleranceBench, model: MeritModel) -> int:
     """Return the number of random draws of the second-order model from which the shares of variance follow."""
     parts, count = model.slope.shape
-    held = _MOST_HELD // max(len(bench.entries) * len(bench.merits), count)
-    return int(np.clip(_MOST_WORK // (parts * count**2), _FEWEST, min(_MOST_DRAWS, held)))
+    affordable = _MOST_VALUES // max(len(bench.entries) * len(bench.merits), count)
+    return int(np.clip(_MOST_WORK // (parts * count**2), _FEWEST, min(_MOST_DRAWS, affordable)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -190,7 +190,7 @@ class ScaledModel:
             Indices of the parameters of each of E tolerances.
         """
         count, parts = len(entries), len(model.nominal)
-        draws = x[: max(_FEWEST, _MOST_HELD // (parts * count**2))]
+        draws = x[: max(_FEWEST, _MOST_VALUES // (parts * count**2))]
         first = np.stack([draws[:, indices] @ model.slope[:, indices].T for indices in map(list, entries)], axis=-1)
         second = np.zeros((len(draws), parts, count, count))
         for e, indices in enumerate(map(list, entries)):
@@ -353,12 +353,12 @@ def inverse_limits(bench: ToleranceBench, sensitivity: Sensitivities, advance: A
     guess = np.array(
         [[_model_ratio(bench, sensitivity, indices, m, losses) for m in range(len(losses))] for indices in entries]
     )
-    open_ = [
+    undetermined = [
         (e, m) for e, indices in enumerate(entries) for m in range(len(losses)) if len(indices) == 1 and losses[m] > 0.0
     ]
     shares = guess.copy()
-    if open_:
-        pairs = np.array(open_)
+    if undetermined:
+        pairs = np.array(undetermined)
 
         def excess(rows: np.ndarray, level: np.ndarray) -> np.ndarray:
             """Return the logarithm of the larger loss of both signs over the allowed one, at ratios exp(level)."""

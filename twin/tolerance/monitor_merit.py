@@ -155,7 +155,7 @@ class MonitorMerit:
         return cls(experiment, path, images, disturbances, noise, (per_unit[0], per_unit[1]), asked)
 
     def variances(self, amounts: np.ndarray, states: Sequence[State]) -> dict[str, np.ndarray]:
-        """Return name of each merit -> variances of its Q estimated quantities in S states, (S, Q), SI units squared.
+        """Return the variances of the Q estimated quantities of each merit in S states, (S, Q), SI units squared.
 
         Parameters
         ----------
@@ -185,7 +185,7 @@ class MonitorMerit:
         return self._read(changes[0] @ root, changes[1] @ root, self._noise(states))
 
     def interpolation_errors(self, amounts: np.ndarray, states: Sequence[State]) -> dict[str, float]:
-        """Return merit -> largest relative error of its sigma due to interpolated instead of traced derivatives.
+        """Return the largest relative error of each merit's sigma due to interpolated instead of traced derivatives.
 
         Parameters
         ----------

@@ -270,20 +270,20 @@ class Adjustments:
         normal = normal + 1e-12 * np.trace(normal, axis1=-2, axis2=-1)[:, None, None] * np.eye(len(size))
         pull = -(across @ residuals[..., None])[..., 0]
         start = moves / size
-        held = np.broadcast_to(~free | (self.ranges == 0.0), start.shape).copy()
+        fixed = np.broadcast_to(~free | (self.ranges == 0.0), start.shape).copy()
         target = start.copy()
         for _ in range(len(size) + 1):
             # the change of the fixed compensators is known, and the others compensate it
-            known = np.where(held, target - start, 0.0)
-            rest = np.where(held, 0.0, pull - (normal @ known[..., None])[..., 0])
-            mask = ~held
-            matrix = normal * mask[:, :, None] * mask[:, None, :] + np.eye(len(size)) * held[:, :, None]
+            known = np.where(fixed, target - start, 0.0)
+            rest = np.where(fixed, 0.0, pull - (normal @ known[..., None])[..., 0])
+            mask = ~fixed
+            matrix = normal * mask[:, :, None] * mask[:, None, :] + np.eye(len(size)) * fixed[:, :, None]
             change = known + np.linalg.solve(matrix, rest[..., None])[..., 0] * mask
             target = np.clip(start + change, -1.0, 1.0)
             beyond = mask & (np.abs(start + change) > 1.0)
             if not beyond.any():
                 break
-            held |= beyond
+            fixed |= beyond
         return np.asarray(target * size)
 
     def corrected(self, slopes: np.ndarray, change: np.ndarray, miss: np.ndarray) -> np.ndarray:

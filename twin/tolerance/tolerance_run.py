@@ -329,7 +329,7 @@ def worst_cameras(bench: ToleranceBench, samples: Samples) -> np.ndarray:
 
 
 def _interpolation_errors(bench: ToleranceBench, samples: Samples) -> dict[str, float]:
-    """Return merit -> largest relative error of its sigma due to interpolated derivatives, in the first cameras."""
+    """Return the largest relative error of each merit's sigma due to interpolated derivatives, in the first cameras."""
     known = np.flatnonzero(np.all(np.isfinite(samples.values), axis=1))[:EXACT]
     if bench.monitor is None or not known.size:
         return {}
@@ -580,7 +580,7 @@ def _tolerance_plain(run: ToleranceRun) -> dict[str, Any]:
 
 
 def _moves_at(run: ToleranceRun, entry: int, end: int) -> dict[str, str | float | None]:
-    """Return compensator -> its move (quantity with unit) with a tolerance at its lower or upper limit.
+    """Return the move of each compensator (quantity with unit) with a tolerance at its lower or upper limit.
 
     The moves are None for a figure error.
     """

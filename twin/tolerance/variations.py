@@ -160,7 +160,7 @@ class ParameterMaker:
         return self.instrument.assembly.tree[path]
 
     def _heat(self, body: str, kind: str, axis: str, key: KeyPath, limit: float) -> FrozenMap[str, BodyMove]:
-        """Return body -> its motion per kelvin or K/m of a temperature change.
+        """Return the motion of each body per kelvin or K/m of a temperature change.
 
         It is the mean slope between zero and ``limit``.
         """
@@ -179,7 +179,7 @@ def heat_moves(
     amount: float,
     others: Mapping[str, Temperature] = FrozenMap(),
 ) -> FrozenMap[str, BodyMove]:
-    """Return body -> the motion and shape change due to a change of temperature, per kelvin or K/m.
+    """Return the motion and shape change of each body due to a change of temperature, per kelvin or K/m.
 
     It is the effect of ``amount`` divided by ``amount``.
 

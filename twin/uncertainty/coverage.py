@@ -101,7 +101,7 @@ class Coverage:
         """Return, for each of the Q quantities, the (Q,) RMS of error over sigma; 1 where the sigmas are right."""
         return np.asarray(np.sqrt(np.mean((self.errors[estimator] / self.sigmas[estimator]) ** 2, axis=0)))
 
-    def held(self, estimator: str, level: int) -> np.ndarray:
+    def covered(self, estimator: str, level: int) -> np.ndarray:
         """Return, for each of the Q quantities, the (Q,) number of states whose interval contains the truth.
 
         Parameters
@@ -155,7 +155,7 @@ class Coverage:
         for name in self.errors:
             for k, level in enumerate(LEVELS):
                 ends = self.limits(name, k).T
-                for quantity, count, (low, high) in zip(self.quantities, self.held(name, k), ends, strict=True):
+                for quantity, count, (low, high) in zip(self.quantities, self.covered(name, k), ends, strict=True):
                     if not low <= count <= high:
                         out.append((name, quantity.group, quantity.key, level, int(count)))
         return tuple(out)
@@ -230,9 +230,9 @@ def run_states(
                 test = observation.recovery.consistency(disturbances, k)
                 squares.append(test.chi_square)
                 alarms += not test.agrees
-                fits = observation.recovery.evidence is None or bool(observation.recovery.evidence.holds[k])
+                fits = observation.recovery.evidence is None or bool(observation.recovery.evidence.consistent[k])
                 doubted += not (
-                    fits and all(curvature.holds[k] for curvature in observation.recovery.curvature.values())
+                    fits and all(curvature.valid[k] for curvature in observation.recovery.curvature.values())
                 )
     advance(STATES, count, count)
     truth = np.concatenate(true) if true else np.empty((0, len(quantities)))
@@ -282,7 +282,7 @@ def _exposed(
 def _probabilities(
     recovery: Recovery, experiment: MonitorExperiment, quantities: tuple[Quantity, ...]
 ) -> dict[str, np.ndarray]:
-    """Return estimator -> probability that an interval contains the truth, given the spot shifts.
+    """Return the probability, by estimator, that an interval contains the truth, given the spot shifts.
 
     Each is a (levels, N, Q) array for the confidence levels, N states and Q quantities. Errors of the posterior are
     independent of the shifts; the estimate of another estimator differs from the posterior's by the difference of their
@@ -329,7 +329,7 @@ class UncertaintyRun:
     coverage : Coverage or None
         Coverage in the random states, None if none were asked for.
     warnings : tuple of str
-        Warnings of blurred cameras, coarse grey values, and motions of the prior that no spot shows.
+        Warnings of blurred cameras, coarse grey values, and motions of the prior that the spots do not observe.
     images : ImageChecks
         Checks of its images.
     """

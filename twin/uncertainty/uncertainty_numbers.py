@@ -57,8 +57,8 @@ class _Limited:
             (disturbances.labels[k], float(amounts[k] * disturbances.sigmas[k]), disturbances.units[k]) for k in order
         ]
 
-    def held(self, level: int) -> float:
-        return float(self.limits.heavy_tail.held[level, self.q])
+    def half_width(self, level: int) -> float:
+        return float(self.limits.heavy_tail.half_widths[level, self.q])
 
     @property
     def followed(self) -> list[tuple[Elasticity, int]]:
@@ -116,9 +116,9 @@ _HEAVY_TAIL: Record[_Limited] = Record(
     "Errors of the posterior if each number of the prior is the scale of Student's t distribution.",
     Quantity("degrees", lambda r: r.limits.heavy_tail.degrees, "degrees of freedom of that distribution"),
     Quantity("rms", lambda r: float(r.limits.heavy_tail.rms[r.q]), "root mean square of the error"),
-    Quantity("held_68", lambda r: r.held(0), "half-width of the interval that contains 68.3 % of the errors"),
-    Quantity("held_95", lambda r: r.held(1), "half-width of the interval that contains 95.4 % of the errors"),
-    Quantity("held_997", lambda r: r.held(2), "half-width of the interval that contains 99.7 % of the errors"),
+    Quantity("held_68", lambda r: r.half_width(0), "half-width of the interval that contains 68.3 % of the errors"),
+    Quantity("held_95", lambda r: r.half_width(1), "half-width of the interval that contains 95.4 % of the errors"),
+    Quantity("held_997", lambda r: r.half_width(2), "half-width of the interval that contains 99.7 % of the errors"),
     Quantity(
         "beyond_3_sigma",
         lambda r: float(r.limits.heavy_tail.beyond[r.q]),
@@ -175,8 +175,8 @@ class _Counted:
     q: int
     estimator: str
 
-    def held(self, level: int) -> float:
-        return float(self.coverage.held(self.estimator, level)[self.q]) / self.coverage.measured
+    def covered(self, level: int) -> float:
+        return float(self.coverage.covered(self.estimator, level)[self.q]) / self.coverage.measured
 
     def limits(self, level: int) -> np.ndarray:
         return self.coverage.limits(self.estimator, level)[:, self.q] / self.coverage.measured
@@ -193,8 +193,8 @@ COUNT: Record[_Counted] = Record(
         lambda c: float(c.coverage.ratio(c.estimator)[c.q]),
         "root mean square of the errors over their sigmas",
     ),
-    Quantity("held_68", lambda c: c.held(0), "share of the 68 % intervals that contain the truth"),
-    Quantity("held_95", lambda c: c.held(1), "share of the 95 % intervals that contain the truth"),
+    Quantity("held_68", lambda c: c.covered(0), "share of the 68 % intervals that contain the truth"),
+    Quantity("held_95", lambda c: c.covered(1), "share of the 95 % intervals that contain the truth"),
     Quantity("expected_68", lambda c: c.expected(0), "expected share of the 68 % intervals that contain the truth"),
     Quantity("expected_95", lambda c: c.expected(1), "expected share of the 95 % intervals that contain the truth"),
     Quantity("limits_68", lambda c: c.limits(0), "limits of held_68 if every sigma is right"),
@@ -234,7 +234,7 @@ STATES: Record[Coverage] = Record(
 def _by_quantity(
     quantities: Sequence[limits.Quantity], values: Sequence[Any] | np.ndarray
 ) -> dict[str, dict[str, Any]]:
-    """Return values by quantity, as group -> key -> value.
+    """Return values by quantity, as nested mappings from group and key to value.
 
     Parameters
     ----------

@@ -248,7 +248,7 @@ def _prior_section(limits: MonitorLimits) -> Section:
     heavy: list[Sequence[Cell]] = []
     for q, quantity in enumerate(limits.quantities):
         share, sigma = 100.0 * float(limits.from_prior[q]), float(split.sigma[q])
-        widths = (float(tail.rms[q]), *(float(width) for width in tail.held[:, q]))
+        widths = (float(tail.rms[q]), *(float(width) for width in tail.half_widths[:, q]))
         heavy.append((quantity_text(quantity), sigma, share, *widths, 100.0 * float(tail.beyond[q])))
     tails = Table(
         "limits-heavy-tails",
@@ -326,7 +326,7 @@ def _states(coverage: Coverage) -> Section:
             cells: list[Cell] = []
             for level in range(len(LEVELS)):
                 low, high = (100.0 * float(end[k]) / n for end in coverage.limits(name, level))
-                cells += [100.0 * float(coverage.held(name, level)[k]) / n, f"{low:.1f} to {high:.1f}"]
+                cells += [100.0 * float(coverage.covered(name, level)[k]) / n, f"{low:.1f} to {high:.1f}"]
             rows.append((quantity_text(quantity), name, rms, ratio, *cells))
     drawn_text = f"{coverage.drawn} states were drawn from the prior, rendered, exposed and recovered"
     widths = " and ".join(f"{width:.3f}" for width in HALF_WIDTHS)

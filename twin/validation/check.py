@@ -56,7 +56,7 @@ class InputRange:
         Limits of the range; None if there is none within a factor of `FARTHEST`, or if the check does not agree.
     agrees : bool
         True if the simulation agrees with the paper's statement.
-    said : str
+    alternatives : str
         Other choices for which they agree, if the input is not a number.
     """
 
@@ -66,13 +66,13 @@ class InputRange:
     low: float | None
     high: float | None
     agrees: bool
-    said: str = ""
+    alternatives: str = ""
 
     @property
     def text(self) -> str:
         """Text for the report: the chosen value, and the limits of its range to two digits."""
         if self.value is None:
-            return f"{self.name}, {self.said}"
+            return f"{self.name}, {self.alternatives}"
         unit = "" if self.unit == "1" else f" {self.unit}"
         if not self.agrees:
             return f"{self.name} {plain(self.value, 4)}{unit}"
@@ -116,35 +116,35 @@ class Chosen:
         """Return an input on which the simulated value depends as a power; exponent 1 for simple proportionality."""
         return cls(name, value, unit, lambda factor: measured * factor**exponent)
 
-    def range(self, holds: Callable[[float], bool], agrees: bool) -> InputRange:
+    def range(self, confirms: Callable[[float], bool], agrees: bool) -> InputRange:
         """Return the range of the input over which the simulation agrees with the paper's statement.
 
         Parameters
         ----------
-        holds : callable
+        confirms : callable
             Function that returns True if a simulated value agrees.
         agrees : bool
             True if the simulated value of the check agrees; otherwise no limits are searched.
         """
         low = high = None
         if agrees:
-            low, high = (self._limit(holds, step) for step in (1.0 / _STEP, _STEP))
+            low, high = (self._limit(confirms, step) for step in (1.0 / _STEP, _STEP))
         low, high = (None if end is None else self.value * end for end in (low, high))
         return InputRange(self.name, self.value, self.unit, low, high, agrees)
 
-    def _limit(self, holds: Callable[[float], bool], step: float) -> float | None:
+    def _limit(self, confirms: Callable[[float], bool], step: float) -> float | None:
         """Return the factor on the input at which the check begins to fail; None if it does not fail.
 
         ``step`` is the ratio between two trial values.
         """
         inside, outside = 1.0, step
-        while holds(self.response(outside)):
+        while confirms(self.response(outside)):
             if not 1.0 / FARTHEST <= outside <= FARTHEST:
                 return None
             inside, outside = outside, outside * step
         for _ in range(_HALVINGS):
             middle = 0.5 * (inside + outside)
-            inside, outside = (middle, outside) if holds(self.response(middle)) else (inside, middle)
+            inside, outside = (middle, outside) if confirms(self.response(middle)) else (inside, middle)
         return inside
 
 
@@ -156,16 +156,16 @@ class Supposed:
     ----------
     name : str
         Name of the input with the choice, a phrase.
-    said : str
+    alternatives : str
         Other choices for which the simulation agrees with the statement, determined by trying them.
     """
 
     name: str
-    said: str
+    alternatives: str
 
-    def range(self, holds: Callable[[float], bool], agrees: bool) -> InputRange:
+    def range(self, confirms: Callable[[float], bool], agrees: bool) -> InputRange:
         """Return this choice as an input without limits of a range, because it is not a number."""
-        return InputRange(self.name, None, "1", None, None, agrees, self.said)
+        return InputRange(self.name, None, "1", None, None, agrees, self.alternatives)
 
 
 def mean_of(values: NDArray[Any]) -> tuple[float, float]:

@@ -125,19 +125,19 @@ class Context:
 
     def figure(self, name: str, drawing: str | bytes, **facts: object) -> None:
         """Add a drawing (SVG or PNG) to the report, with the title and caption from the group's file."""
-        texts = self._said(name, facts)
+        texts = self._worded(name, facts)
         self.add(SvgFigure(name, *texts, drawing) if isinstance(drawing, str) else PngFigure(name, *texts, drawing))
 
     def table(self, name: str, rows: Sequence[Sequence[Cell]], **facts: object) -> None:
         """Add a table to the report, with the title, caption and column names from the group's file."""
         text = self.texts[name]
-        self.add(Table(name, *self._said(name, facts), text.heads, rows, text.decimals))
+        self.add(Table(name, *self._worded(name, facts), text.heads, rows, text.decimals))
 
     def data(self, name: str, content: dict[str, Any]) -> None:
         """Add data to the report's downloads, with the title and caption from the group's file."""
-        self.add(Data(name, *self._said(name, {}), content))
+        self.add(Data(name, *self._worded(name, {}), content))
 
-    def _said(self, name: str, facts: Mapping[str, Any]) -> tuple[str, str]:
+    def _worded(self, name: str, facts: Mapping[str, Any]) -> tuple[str, str]:
         text = self.texts[name]
         return sentence(text.title, facts), sentence(text.caption, facts)
 
@@ -262,11 +262,11 @@ class Printed:
         return self._column(_path(key), self._at(key))
 
     def numbers(self, key: str) -> Mapping[str, float]:
-        """Return name -> printed number for all entries below a key, in the order of the file."""
+        """Return the printed numbers of all entries below a key, by name, in the order of the file."""
         return FrozenMap({k: self._number((*_path(key), k), v) for k, v in self._mapping(key).items()})
 
     def columns(self, key: str) -> Mapping[str, tuple[float, ...]]:
-        """Return name -> printed list of numbers for all entries below a key, in the order of the file."""
+        """Return the printed lists of numbers of all entries below a key, by name, in the order of the file."""
         return FrozenMap({k: self._column((*_path(key), k), v) for k, v in self._mapping(key).items()})
 
     @cached_property
@@ -324,13 +324,13 @@ class Printed:
         for depth, part in enumerate(path):
             if not isinstance(value, dict) or part not in value:
                 known = value if isinstance(value, dict) else {}
-                place = path[:depth]
+                parent = path[:depth]
                 raise InputError(
                     Issue(
                         f"nothing is printed as {part!r}",
                         self.content.file,
-                        self.content.lines.get(place),
-                        place,
+                        self.content.lines.get(parent),
+                        parent,
                         suggestion=nearest(str(part), known),
                     )
                 )
@@ -353,8 +353,8 @@ class Printed:
             raise self._error(path, "no number", value)
         return float(value)
 
-    def _error(self, path: KeyPath, problem: str, found: Any) -> InputError:
-        return InputError(Issue(problem, self.content.file, self.content.lines.get(path), path, found=repr(found)))
+    def _error(self, path: KeyPath, problem: str, value: Any) -> InputError:
+        return InputError(Issue(problem, self.content.file, self.content.lines.get(path), path, found=repr(value)))
 
 
 @cache

@@ -17,7 +17,7 @@ from twin.validation.row_names import REAL, matches
 
 
 def published() -> dict[str, tuple[str, str]]:
-    """Return path in the data's folder -> SHA-256 checksum and place of publication of each file."""
+    """Return the SHA-256 checksum and the place of publication of each file, by its path in the data's folder."""
     printed = load_printed(REAL)
     data = printed.content.data["files"]
     return {path: (entry["sha256"], entry["published"]) for path, entry in data.items()}

@@ -52,7 +52,7 @@ class GroupRun:
     seconds: float
     files: tuple[str, ...] = ()
 
-    def place(self, artefact: Artefact) -> str:
+    def path_of(self, artefact: Artefact) -> str:
         """Return the path, in the run folder, of a figure, table or data file of the group."""
         return f"{FILES}/{self.group.prefix}/{artefact.name}.{artefact.kind}"
 
@@ -104,8 +104,8 @@ class Validation:
     def unexpected(self) -> tuple[tuple[CheckResult, Verdict], ...]:
         """Results whose verdict differs from the expected one, and the expected verdict, failed checks included."""
         expected = {check.id: check.expected for run in self.runs for check in run.group.checks}
-        found = (r for r in self.results if r.verdict != SKIPPED)
-        return tuple((r, expected[r.id]) for r in found if r.verdict != expected[r.id])
+        results = (r for r in self.results if r.verdict != SKIPPED)
+        return tuple((r, expected[r.id]) for r in results if r.verdict != expected[r.id])
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain data for validation.json."""
@@ -125,7 +125,7 @@ class Validation:
                     "title": run.group.title,
                     "seconds": run.seconds,
                     "artefacts": [
-                        {"name": a.name, "title": a.title, "file": run.place(a) if self.written else None}
+                        {"name": a.name, "title": a.title, "file": run.path_of(a) if self.written else None}
                         for a in run.artefacts
                     ],
                     "files": list(run.files),
@@ -255,8 +255,8 @@ def _keep(result: CheckResult, results: dict[str, CheckResult], group: CheckGrou
 def _sentence(error: Exception) -> str:
     """Return the message of an error, with the line of code that raised it, for the report."""
     text = " ".join(str(error).split()) or "no message"
-    place = traceback.extract_tb(error.__traceback__)[-1]
-    return f"{type(error).__name__}: {text} (in {place.name}, {Path(place.filename).name}:{place.lineno})"
+    frame = traceback.extract_tb(error.__traceback__)[-1]
+    return f"{type(error).__name__}: {text} (in {frame.name}, {Path(frame.filename).name}:{frame.lineno})"
 
 
 def _files(group_folder: Path | None) -> tuple[str, ...]:
@@ -267,7 +267,7 @@ def _files(group_folder: Path | None) -> tuple[str, ...]:
         sorted(p.relative_to(group_folder.parents[1]).as_posix() for p in group_folder.rglob("*") if p.is_file())
     )
     if not files:
-        for place in (group_folder, group_folder.parent):
-            if not any(place.iterdir()):
-                place.rmdir()
+        for folder in (group_folder, group_folder.parent):
+            if not any(folder.iterdir()):
+                folder.rmdir()
     return files

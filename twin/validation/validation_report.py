@@ -25,7 +25,7 @@ PAGE = "README.md"
 
 
 def summary_files(validation: Validation) -> dict[str, bytes]:
-    """Return name -> contents of the files of the summary: the page and the figures that it shows."""
+    """Return the files of the summary, content by name: the page and the figures that it shows."""
     figures = {
         f"{run.group.prefix}-{a.name}.{a.kind}": a
         for run in validation.runs
@@ -163,7 +163,7 @@ def _measured_data(validation: Validation) -> Iterator[str]:
     yield from ("## Where the data are published", "")
     yield "None of these files is part of the project; `--real DIR` names a folder that contains them."
     yield ""
-    files = ((f"`{name}`", place, f"`{checksum}`") for name, (checksum, place) in published().items())
+    files = ((f"`{name}`", source, f"`{checksum}`") for name, (checksum, source) in published().items())
     yield from _table_lines(("file", "published in", "SHA-256"), files)
     yield from ("## Choices that were made on these files", "")
     yield from (f"- {choice}" for choice in load_printed(REAL).content.data["choices"])
@@ -363,7 +363,7 @@ def _angles(page: str) -> str:
 
 
 def _group(run: GroupRun) -> Section:
-    shown = tuple(replace(artefact, within=run.place(artefact)) for artefact in run.artefacts)
+    shown = tuple(replace(artefact, within=run.path_of(artefact)) for artefact in run.artefacts)
     files = tuple(Data(f"file-{k}", "", "", None, within=file) for k, file in enumerate(run.files))
     return Section(f"{run.group.title} ({run.group.prefix})", (), (*shown, *files), name=f"group-{run.group.prefix}")
 
@@ -372,7 +372,7 @@ def write_validation(validation: Validation, folder: RunFolder) -> None:
     """Write validation.json, validation.html, summary/, the groups' artefacts and the manifest."""
     for run in validation.runs:
         for artefact in run.artefacts:
-            folder.write_bytes(run.place(artefact), artefact.content())
+            folder.write_bytes(run.path_of(artefact), artefact.content())
     folder.write_json("validation.json", {**validation.to_dict(), "verdict": verdict(validation)})
     folder.write_text("validation.html", render_report(validation))
     for name, content in summary_files(validation).items():

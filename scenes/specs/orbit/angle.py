@@ -43,7 +43,7 @@ Angles = Annotated[Named[tuple[Name, Name]] | None, AfterValidator(_angles)]
 
 
 def usual_angles(lines: Sequence[str]) -> Mapping[str, tuple[str, str]] | None:
-    """Return name of each default intersection angle -> its two lines; None for cameras without defaults.
+    """Return the two lines of each default intersection angle, by its name; None for cameras without defaults.
 
     Cameras with the lines forward, nadir and backward, and cameras with two lines, have defaults.
     """

@@ -302,7 +302,7 @@ class LoopImagesSpec(Spec):
     @model_validator(mode="after")
     def _has_ties(self) -> "LoopImagesSpec":
         if not self.points.tie:
-            raise Problem("there are no tie points", "tie: 0", "some", None, ("points", "tie"))
+            raise Problem("there are no tie points", "tie: 0", "at least 1", None, ("points", "tie"))
         return self
 
 

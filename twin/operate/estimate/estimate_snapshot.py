@@ -486,7 +486,7 @@ class Violation:
     chance: float
 
     def appended_to(self, earlier: tuple[Violation, ...]) -> tuple[Violation, ...]:
-        """Return earlier violations with this one, joined to the span of the same requirement that it continues."""
+        """Return earlier violations with this one; the spans of a continued violation of one requirement are joined."""
         for k, span in enumerate(earlier):
             same = (span.quantity, span.limit) == (self.quantity, self.limit)
             if same and self.since_us - span.until_us < SAME_SPAN:

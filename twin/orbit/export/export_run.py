@@ -574,4 +574,4 @@ def _image(folder: Path, name: str) -> np.ndarray:
         return np.asarray(tifffile.imread(path, key=0)).squeeze()
     # readers of damaged files raise many kinds of errors
     except Exception as error:
-        raise InputError(Issue(f"cannot be read: {error}", str(path), allowed="as the run wrote it")) from None
+        raise InputError(Issue(f"cannot be read: {error}", str(path), allowed="the file as the run wrote it")) from None

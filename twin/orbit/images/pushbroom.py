@@ -105,8 +105,8 @@ class LookMap:
             if error <= tolerance:
                 return cls(frame, terrain, span, east, north, error)
         raise UnphysicalError(
-            f"an attitude so rough that {_JITTERING[-1]} nodes along the lines leave {error:.2g} m, more than "
-            f"{tolerance:g} m"
+            f"the attitude varies too fast: interpolation between {_JITTERING[-1]} nodes along the lines errs by "
+            f"{error:.2g} m on the ground, allowed are {tolerance:g} m"
         )
 
     def ground(self, lines: np.ndarray, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

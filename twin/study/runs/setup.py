@@ -60,7 +60,7 @@ class StudySetup:
 
     @cached_property
     def job(self) -> BaseJob:
-        """Base job of the study: the command that its runs repeat."""
+        """Command that every run of the study repeats, such as ``twin.render``, with its way of computing a run."""
         return _job(self.study.base.command)
 
     def to_yaml(self) -> str:

@@ -97,14 +97,14 @@ class Passes:
         return np.asarray(look / np.linalg.norm(look))
 
     def pitch_error(self, normals: Mapping[str, np.ndarray]) -> dict[str, tuple[float, float]]:
-        """Return line -> mean error of fitted plane normals toward the line of sight, and its sigma, in arcsec.
+        """Return, for each line, the mean error of plane normals toward the line of sight and its sigma, in arcsec.
 
         ``normals`` has for each line the unit normals of all measurements, (passes, 3).
         """
         out = {}
         for line, normal in normals.items():
-            turns = (normal - self.normal(line)) @ self.ahead(line) / ARCSEC
-            out[line] = mean_of(turns)
+            rotations = (normal - self.normal(line)) @ self.ahead(line) / ARCSEC
+            out[line] = mean_of(rotations)
         return out
 
 
@@ -120,10 +120,10 @@ def setup_of(name: str, **changes: object) -> AngleSetup:
     """
     setup = AngleSetup.read(name)
     test = setup.test
-    place: dict[str, Any] = {key: changes.pop(key) for key in ("latitude", "longitude", "direction") if key in changes}
-    if place:
+    at: dict[str, Any] = {key: changes.pop(key) for key in ("latitude", "longitude", "direction") if key in changes}
+    if at:
         assert test.orbit.passing is not None
-        passing = test.orbit.passing.model_copy(update=place)
+        passing = test.orbit.passing.model_copy(update=at)
         test = test.model_copy(update={"orbit": test.orbit.model_copy(update={"passing": passing})})
     if changes:
         test = test.model_copy(update={"errors": test.errors.model_copy(update=changes)})
@@ -135,7 +135,7 @@ def repeated(
     seed: np.random.SeedSequence,
     count: int,
     backend: Backend | None = None,
-    turns: Mapping[str, tuple[float, float, float]] = FrozenMap(),
+    rotations: Mapping[str, tuple[float, float, float]] = FrozenMap(),
     corrected: bool = True,
 ) -> Passes:
     """Simulate a pass of the satellite over ground points and ``count`` measurements of it.
@@ -150,22 +150,22 @@ def repeated(
         Number of measurements.
     backend : Backend | None
         Backend that traces an instrument's lines; None for lines without an instrument.
-    turns : Mapping[str, tuple[float, float, float]]
+    rotations : Mapping[str, tuple[float, float, float]]
         Line -> its rotation vector in body axes since the laboratory calibration, radians.
     corrected : bool
         True if the analysis removes aberration, light time and refraction from the points.
     """
     terrain, errors = seed.spawn(2)
-    flight = fly(setup, _turned(angle_camera(setup, backend), turns), terrain)
+    flight = fly(setup, _rotated(angle_camera(setup, backend), rotations), terrain)
     ground = flight.ground(flight.effects)
     removed = flight.effects if corrected else NO_EFFECTS
     return Passes(flight, tuple(flight.measure(ground, stream, removed) for stream in errors.spawn(count)))
 
 
-def _turned(camera: AngleCamera, turns: Mapping[str, tuple[float, float, float]]) -> AngleCamera:
+def _rotated(camera: AngleCamera, rotations: Mapping[str, tuple[float, float, float]]) -> AngleCamera:
     lines = dict(camera.cameras)
-    for name, turn in turns.items():
-        lines[name] = replace(lines[name], directions=lines[name].directions @ rotation_matrix(np.array(turn)).T)
+    for name, rotation in rotations.items():
+        lines[name] = replace(lines[name], directions=lines[name].directions @ rotation_matrix(np.array(rotation)).T)
     return replace(camera, cameras=FrozenMap(lines))
 
 
@@ -215,20 +215,20 @@ def least_slopes(points: Array, station: Array) -> Array:
     They are the vertex of a parabola through values of S. It is computed twice, the second time from values nearer to
     the vertex, which keep more digits.
     """
-    place, size = np.zeros(2), 1.0
+    position, size = np.zeros(2), 1.0
     for _ in range(3):
         step = size * np.eye(2)
 
-        def value(shift: Array, place: Array = place) -> float:
-            return sum_of_squares(place + shift, points, station)
+        def value(shift: Array, position: Array = position) -> float:
+            return sum_of_squares(position + shift, points, station)
 
         middle = value(np.zeros(2))
         up, down = ([value(sign * e) for e in step] for sign in (1.0, -1.0))
         slope = (np.array(up) - np.array(down)) / (2.0 * size)
         curve = np.diag((np.array(up) + np.array(down) - 2.0 * middle) / size**2)
         curve[0, 1] = curve[1, 0] = (value(step[0] + step[1]) - up[0] - up[1] + middle) / size**2
-        place, size = place - np.linalg.solve(curve, slope), _STEP
-    return place
+        position, size = position - np.linalg.solve(curve, slope), _STEP
+    return position
 
 
 class Planes:
@@ -265,7 +265,7 @@ def twisted_passes(context: Context) -> tuple[Passes, Passes]:
     look, setup, count = np.radians(25.0), setup_of(TEST), context.count(full=300, fast=80)
     streams = np.random.SeedSequence([context.seed, 2]).spawn(2)
     positive, negative = (
-        repeated(setup, stream, count, turns={"forward": (twist * np.sin(look), 0.0, twist * np.cos(look))})
+        repeated(setup, stream, count, rotations={"forward": (twist * np.sin(look), 0.0, twist * np.cos(look))})
         for twist, stream in zip((TWIST, -TWIST), streams, strict=True)
     )
     return positive, negative
@@ -351,16 +351,16 @@ def _derivatives(planes: Planes) -> CheckResult:
 
 def _printed_plane(planes: Planes) -> CheckResult:
     passes = planes.passes
-    turn, away = {}, {}
+    rotation, away = {}, {}
     for k, line in enumerate(LINES):
         true = passes.normal(line)
         plane_normals = np.array([fits[k].normal for fits in planes.printed])
-        turn[line] = np.degrees(np.arccos(np.clip(np.abs(plane_normals @ true), 0.0, 1.0)))
+        rotation[line] = np.degrees(np.arccos(np.clip(np.abs(plane_normals @ true), 0.0, 1.0)))
         arm = passes.points[line] - passes.flight.station
         away[line] = f"{np.sqrt(np.mean((arm @ plane_normals[0]) ** 2)) / 1e3:.0f} km"
     true = passes.normal("forward")
     half = float(np.degrees(np.arccos(abs(true @ (np.array([-1.0, -1.0, 1.0]) * true)))))
-    return planes.row("000.eq5", *mean_of(turn["forward"]), 0.0, [half], away=away)
+    return planes.row("000.eq5", *mean_of(rotation["forward"]), 0.0, [half], away=away)
 
 
 def _printed_angles(planes: Planes) -> CheckResult:
@@ -373,18 +373,18 @@ def _vertical(planes: Planes) -> CheckResult:
     across, along, look = flight.line_axes
     errors = flight.spec.errors
     noise = errors.points**2 + errors.station**2
-    reach = float(np.mean(((passes.points["nadir"] - flight.station) @ look) ** 2))
-    tilt = float(np.arctan(np.sqrt(noise / reach)))
+    distance = float(np.mean(((passes.points["nadir"] - flight.station) @ look) ** 2))
+    tilt = float(np.arctan(np.sqrt(noise / distance)))
     c, s = np.cos(tilt), np.sin(tilt)
     axes = np.stack([c * across + s * look, along, c * look - s * across])
     slopes = []
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", NearVerticalWarning)
         for m in passes.measured:
-            turned = m.in_frame(axes, flight.station)
-            slopes.append(fit_plane(turned.station, turned.strips["nadir"], "corrected").coefficients[0])
+            rotated = m.in_frame(axes, flight.station)
+            slopes.append(fit_plane(rotated.station, rotated.strips["nadir"], "corrected").coefficients[0])
     measured = mean_of(np.array(slopes) * np.tan(tilt))
-    expected = reach * np.tan(tilt) ** 2 / (reach * np.tan(tilt) ** 2 + noise)
+    expected = distance * np.tan(tilt) ** 2 / (distance * np.tan(tilt) ** 2 + noise)
     return planes.row("000.eq5.vertical", *measured, None, [expected], tilt=tilt)
 
 
@@ -511,8 +511,8 @@ def _seen(passes: Passes, line: str) -> float:
     ahead = np.cross(look[0] - look[-1], middle)
     ahead = ahead / np.linalg.norm(ahead)
     ahead = ahead * np.copysign(1.0, ahead[0])
-    reach = np.linalg.norm(passes.points[line] - flight.station, axis=1)
-    return float(np.mean(origin @ ahead) / np.mean(reach))
+    distance = np.linalg.norm(passes.points[line] - flight.station, axis=1)
+    return float(np.mean(origin @ ahead) / np.mean(distance))
 
 
 def height_passes(context: Context) -> Passes:

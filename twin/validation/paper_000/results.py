@@ -103,14 +103,14 @@ class Data:
     ----------
     same : Passes
         Measurements of ground points with 1.5 m error, light effects removed, for both methods.
-    own : Passes
+    passes : Passes
         Measurements of ground points with an error of `POINT_SIGMA`, light effects removed, for the resection.
     light : Passes
         Further measurements with the same projection centres and the light effects left in, for the planes.
     """
 
     same: Passes
-    own: Passes
+    passes: Passes
     light: Passes
 
 
@@ -126,8 +126,8 @@ def make_data(context: Context) -> Data:
     return Data(repeated(setup_of(TEST), first, count), independent, Passes(repeats.flight, moved))
 
 
-def _at(measured: Measurement, position: Array) -> Measurement:
-    return replace(measured, station=replace(measured.station, position=position))
+def _at(measured: Measurement, site: Array) -> Measurement:
+    return replace(measured, station=replace(measured.station, position=site))
 
 
 @one_blas_thread()
@@ -135,7 +135,7 @@ def run_table_1(context: Context) -> Iterator[CheckResult]:
     """Yield the results of all checks of Table 1 of paper 000 (Liu and Huang 2014)."""
     context.progress(0.1, "measure ground points for both methods")
     data = make_data(context)
-    same, independent = differences(data.same, data.same), differences(data.light, data.own)
+    same, independent = differences(data.same, data.same), differences(data.light, data.passes)
     for k, (name, printed) in enumerate(PRINTED_ARCSEC.items()):
         sigma = float(same.spread[k])
         variance = same.planes_sigma[k] ** 2 - same.resection_sigma[k] ** 2
@@ -154,16 +154,16 @@ def run_table_1(context: Context) -> Iterator[CheckResult]:
             len(independent.values),
         )
         noise = spread * np.sqrt(1.0 / count + SIGMAS**2 / (2.0 * (count - 1)))
-        reach = partial(_reach, abs(bias), SIGMAS * spread)
-        facts = {"own": independent, "point": POINT_SIGMA, "bias": bias, "spread": spread}
-        yield context.row(f"000.table1.{name}_own", reach(1.0), noise, inputs=_points(reach), **facts)
+        exceedance = partial(_exceedance, abs(bias), SIGMAS * spread)
+        facts = {"independent": independent, "point": POINT_SIGMA, "bias": bias, "spread": spread}
+        yield context.row(f"000.table1.{name}_own", exceedance(1.0), noise, inputs=_points(exceedance), **facts)
     yield _pair(context, data, independent)
     yield from _accuracy(context, data)
     context.progress(0.9, "draw")
     context.figure("table1", differences_svg(same.values, independent.values, (ALPHA, BETA)), point=POINT_SIGMA)
 
 
-def _reach(bias: float, spread: float, factor: float) -> float:
+def _exceedance(bias: float, spread: float, factor: float) -> float:
     return bias + factor * spread
 
 
@@ -197,7 +197,7 @@ def _pair(context: Context, data: Data, independent: Differences) -> CheckResult
     pair = np.array([ALPHA, BETA])
     facts: dict[str, Any] = {
         "correlation": covariance[0, 1] / np.sqrt(covariance[0, 0] * covariance[1, 1]),
-        "own": independent,
+        "independent": independent,
         "distance": _distance(pair - np.mean(independent.values, axis=0), np.cov(independent.values.T)),
         "pair": (ALPHA, BETA),
         "apart": _distance(pair * [-1.0, 1.0] - bias, covariance),
@@ -213,8 +213,8 @@ def _pitch_variance(passes: Passes, line: str) -> float:
     It follows from the number of points, their error and their distance.
     """
     points = passes.points[line]
-    reach = float(np.mean(np.linalg.norm(points - passes.flight.station, axis=1)))
-    return (passes.flight.spec.errors.points / reach / ARCSEC) ** 2 / len(points)
+    distance = float(np.mean(np.linalg.norm(points - passes.flight.station, axis=1)))
+    return (passes.flight.spec.errors.points / distance / ARCSEC) ** 2 / len(points)
 
 
 def _distance(off: Array, covariance: Array) -> float:
@@ -224,7 +224,7 @@ def _distance(off: Array, covariance: Array) -> float:
 
 def _accuracy(context: Context, data: Data) -> Iterator[CheckResult]:
     for identifier, passes, light in (
-        ("000.accuracy", data.own, "taken out of the points"),
+        ("000.accuracy", data.passes, "taken out of the points"),
         ("000.accuracy.light", data.light, "left in"),
     ):
         angles = np.array([intersection_angles(*planes_of(m, "tls")).values for m in passes.measured])
@@ -239,15 +239,15 @@ def _accuracy(context: Context, data: Data) -> Iterator[CheckResult]:
 
 Kind = Literal["signs", "largest", "far", "alike", "little", "grows", "opposite"]
 Angle = Literal["alpha", "beta"]
-Place = tuple[float, float]
+Site = tuple[float, float]
 """Latitude and longitude of a simulated pass, degrees."""
 Rises = Mapping[tuple[str, Angle, str], float]
 """(moved object, angle, axis) -> change of the angle for a displacement of 10 m, arcsec."""
 AXES = ("x", "y", "z")
-FAR, ALIKE, LITTLE, GROWS = 2.0, 1.25, 0.25, 0.05
+FAR, EQUAL, LITTLE, GROWS = 2.0, 1.25, 0.25, 0.05
 GREEK: Mapping[str, str] = {"alpha": "α", "beta": "β"}
 _STYLES = {"x": (BLUE, "o"), "y": (GREEN, "s"), "z": (VERMILION, "^")}
-REACH = 10.0
+LARGEST = 10.0
 """Largest displacement of the projection centre (station) or of ground points in the figures, metres."""
 ELSEWHERE = (45.0, 120.0)
 """Latitude and longitude, degrees, of another pass, at which the paper's position-dependent statements are true."""
@@ -296,17 +296,17 @@ class Sentence:
     def implied(self) -> float:
         """Value of the number that `measure` returns, as the statement implies it."""
         return {
-            "signs": 0.0, "largest": 1.0, "far": FAR, "alike": ALIKE, "little": LITTLE, "grows": GROWS, "opposite": 1.0,
+            "signs": 0.0, "largest": 1.0, "far": FAR, "alike": EQUAL, "little": LITTLE, "grows": GROWS, "opposite": 1.0,
         }[self.kind]  # fmt: skip
 
-    def measure(self, rises: Rises, growth: Rises) -> float:
+    def measure(self, rises: Rises, bend: Rises) -> float:
         """Return the number that decides the statement.
 
         Parameters
         ----------
         rises : Rises
             Changes of the angles at the largest displacement, arcsec.
-        growth : Rises
+        bend : Rises
             Relative increase of the slope of each curve from its first to its last step.
         """
 
@@ -323,12 +323,12 @@ class Sentence:
         if self.kind == "little":
             return max(size[axis] for axis in self.axes) / max(size[axis] for axis in self.others)
         if self.kind == "grows":
-            return min(growth[self.what, self.angle, axis] for axis in AXES)
+            return min(bend[self.what, self.angle, axis] for axis in AXES)
         return max((-rise(axis, "beta") / rise(axis, "alpha") for axis in AXES), key=lambda ratio: abs(ratio - 1.0))
 
-    def holds(self, rises: Rises, growth: Rises) -> bool:
+    def agrees(self, rises: Rises, bend: Rises) -> bool:
         """Return True if the number confirms the statement, with the tolerance of its check."""
-        return self.row.outside(self.measure(rises, growth), self.implied) <= self.row.tolerance
+        return self.row.outside(self.measure(rises, bend), self.implied) <= self.row.tolerance
 
 
 YZ, XZ, XY = ("y", "z"), ("x", "z"), ("x", "y")
@@ -382,18 +382,18 @@ def sensitivity_svg(
 
 
 @drawing("places-000", 3.6)
-def places_svg(figure: Figure, held: Mapping[Place, int], total: int, marked: Sequence[Place]) -> None:
+def positions_svg(figure: Figure, counts: Mapping[Site, int], total: int, marked: Sequence[Site]) -> None:
     """Draw a map of the number of statements that are confirmed at each position of the pass."""
     axes = figure.subplots()
-    lat, lon = (np.unique([place[k] for place in held]) for k in (0, 1))
-    grid = np.array([[held[a, b] for b in lon] for a in lat])
+    lat, lon = (np.unique([site[k] for site in counts]) for k in (0, 1))
+    grid = np.array([[counts[a, b] for b in lon] for a in lat])
     span: dict[str, Any] = {"vmin": grid.min() - 0.5, "vmax": total + 0.5}
     mesh = axes.pcolormesh(lon, lat, grid, cmap="cividis", shading="nearest", **span)
-    for (a, b), count in held.items():
+    for (a, b), count in counts.items():
         colour = "white" if (count - grid.min()) / (total - grid.min()) < 0.55 else INK
         axes.text(b, a, str(count), ha="center", va="center", fontsize=8, color=colour)
-    for place in marked:
-        axes.plot(place[1], place[0], "o", ms=19, mfc="none", mec=VERMILION, mew=1.8)
+    for site in marked:
+        axes.plot(site[1], site[0], "o", ms=19, mfc="none", mec=VERMILION, mew=1.8)
     axes.set(xlabel="longitude, ° E", ylabel="latitude, ° N")
     figure.colorbar(mesh, ax=axes, label=f"sentences that hold, of {total}")
 
@@ -432,7 +432,7 @@ class Answers:
         return {key: float(change[-1]) for key, change in self.change.items()}  # type: ignore[misc]
 
     @property
-    def growth(self) -> Rises:
+    def bend(self) -> Rises:
         """(moved object, angle, axis) -> relative increase of the curve's slope from the first to the last step."""
         out = {}
         for key, change in self.change.items():
@@ -442,12 +442,12 @@ class Answers:
 
 
 def make_passes(
-    context: Context, place: Place | None = None, count: int | None = None, direction: str = "descending"
+    context: Context, site: Site | None = None, count: int | None = None, direction: str = "descending"
 ) -> Passes:
-    """Simulate measurements at the position of the library's test, or at ``place``: latitude and longitude, degrees."""
+    """Simulate measurements at the library test's position, or at ``site``: latitude and longitude, degrees."""
     at: dict[str, Any] = {"direction": direction}
-    if place is not None:
-        at |= {"latitude": np.radians(place[0]), "longitude": np.radians(place[1])}
+    if site is not None:
+        at |= {"latitude": np.radians(site[0]), "longitude": np.radians(site[1])}
     many = context.count(full=60, fast=10) if count is None else count
     return repeated(setup_of(TEST, **at), np.random.SeedSequence([context.seed, 8]), many)
 
@@ -457,7 +457,7 @@ def answers(measured: Measurement, flight: AnglePass, steps: int = 10, method: M
 
     The planes are fitted again for each displacement; ``steps`` is the number of displacements.
     """
-    amount = np.linspace(0.0, REACH, steps + 1)
+    amount = np.linspace(0.0, LARGEST, steps + 1)
     return Answers.of(sensitivity(measured.station, measured.strips, flight.pairs, method=method, amounts=amount))
 
 
@@ -470,75 +470,75 @@ def run_figures(context: Context) -> Iterator[CheckResult]:
     context.progress(0.4, "the same elsewhere")
     there = make_passes(context, ELSEWHERE, 1)
     other = answers(there.measured[0], there.flight)
-    places = _places(context)
+    sites = _sites(context)
     for sentence in SENTENCES:
         if sentence.row.id in context.selected:
-            yield _row(sentence, passes, all_answers, other, places)
-    yield _ordinate(context, all_answers, places)
+            yield _row(sentence, passes, all_answers, other, sites)
+    yield _ordinate(context, all_answers, sites)
     if "000.fig4.single" in context.selected:
         yield _single(context, passes)
     context.progress(0.9, "draw")
-    _show(context, all_answers[0], places)
+    _show(context, all_answers[0], sites)
 
 
 def _row(
-    sentence: Sentence, passes: Passes, all_answers: list[Answers], other: Answers, places: Mapping[Place, Answers]
+    sentence: Sentence, passes: Passes, all_answers: list[Answers], other: Answers, sites: Mapping[Site, Answers]
 ) -> CheckResult:
-    values = np.array([sentence.measure(a.rises, a.growth) for a in all_answers])
+    values = np.array([sentence.measure(a.rises, a.bend) for a in all_answers])
     mean = {axis: np.mean([a.rises[sentence.what, sentence.angle, axis] for a in all_answers]) for axis in AXES}
-    place = _place([sentence], places)
+    site = _site([sentence], sites)
     facts: dict[str, Any] = {
-        "found": all_answers,
+        "simulated": all_answers,
         "mean": {axis: f"{value:+.3f}″" for axis, value in mean.items()},
-        "place": place,
-        "other": sentence.measure(other.rises, other.growth),
+        "position": site,
+        "other": sentence.measure(other.rises, other.bend),
         "north": ELSEWHERE[0],
         "east": ELSEWHERE[1],
-        "alike": ALIKE,
+        "similar": EQUAL,
     }
     value, sigma = (float(values[0]), None) if sentence.kind == "grows" else mean_of(values)
-    inputs = [place] if sentence.row.basis == "chosen" else []
+    inputs = [site] if sentence.row.basis == "chosen" else []
     explained = _explained(sentence, passes, other)
     return sentence.row.evaluate(value, sigma, "", sentence.implied, explained, inputs, facts)
 
 
-def _place(sentences: Sequence[Sentence], places: Mapping[Place, Answers]) -> Supposed:
+def _site(sentences: Sequence[Sentence], sites: Mapping[Site, Answers]) -> Supposed:
     """Return the position of the pass as an input that the paper does not print.
 
     It comes with other positions where the statements are confirmed.
     """
-    held = sum(all(s.holds(a.rises, a.growth) for s in sentences) for a in places.values())
-    text = f"holds at {held} of {len(places)} places from 25° to 50° N and 80° to 130° E"
+    confirmed = sum(all(s.agrees(a.rises, a.bend) for s in sentences) for a in sites.values())
+    text = f"holds at {confirmed} of {len(sites)} places from 25° to 50° N and 80° to 130° E"
     return Supposed("a descending pass over 40° N 116° E", text)
 
 
 def _explained(sentence: Sentence, passes: Passes, other: Answers) -> list[float]:
     """Return the values that the explanations of a statement's check would give; empty if it has none."""
     if sentence.kind == "grows":
-        return [REACH / float(np.linalg.norm(passes.flight.station - passes.flight.middle_point))]
-    if sentence.kind == "alike" and sentence.holds(other.rises, other.growth):
+        return [LARGEST / float(np.linalg.norm(passes.flight.station - passes.flight.middle_point))]
+    if sentence.kind == "alike" and sentence.agrees(other.rises, other.bend):
         normal = np.abs(passes.normal("forward"))
         return [float(normal[2] / normal[0])]
     return []
 
 
-def _ordinate(context: Context, all_answers: list[Answers], places: Mapping[Place, Answers]) -> CheckResult:
+def _ordinate(context: Context, all_answers: list[Answers], sites: Mapping[Site, Answers]) -> CheckResult:
     signs = [s for s in SENTENCES if s.kind == "signs"]
     share, other = (
         float(
-            np.mean([s.holds({k: sign * v for k, v in a.rises.items()}, a.growth) for s in signs for a in all_answers])
+            np.mean([s.agrees({k: sign * v for k, v in a.rises.items()}, a.bend) for s in signs for a in all_answers])
         )
         for sign in (1.0, -1.0)
     )
     count = sum(len(s.axes + s.others) for s in signs)
-    facts: dict[str, Any] = {"sentences": signs, "signs": count, "found": all_answers, "other": other}
-    return context.row("000.fig3.ordinate", share, None, 1.0, inputs=[_place(signs, places)], **facts)
+    facts: dict[str, Any] = {"sentences": signs, "signs": count, "simulated": all_answers, "other": other}
+    return context.row("000.fig3.ordinate", share, None, 1.0, inputs=[_site(signs, sites)], **facts)
 
 
 def _single(context: Context, passes: Passes) -> CheckResult:
     m = passes.measured[0]
     base = intersection_angles(*planes_of(m, "corrected")).values[0]
-    shift = np.array([0.0, REACH, 0.0])
+    shift = np.array([0.0, LARGEST, 0.0])
 
     def moved(strip: Strip) -> float:
         planes = planes_of(replace(m, strips={**m.strips, "forward": strip}), "corrected")
@@ -556,16 +556,16 @@ def _single(context: Context, passes: Passes) -> CheckResult:
     return context.row("000.fig4.single", value, implied=0.0, inputs=inputs, each=each, whole=whole)
 
 
-def _places(context: Context) -> dict[Place, Answers]:
-    """Return position of the pass -> changes of the angles over the displacements, for one measurement there."""
+def _sites(context: Context) -> dict[Site, Answers]:
+    """Return, for each position of the pass, the changes of the angles over the displacements in one measurement."""
     step = 5.0 if context.fast else 2.5
     out = {}
     grid = [(lat, lon) for lat in np.arange(25.0, 50.1, step) for lon in np.arange(80.0, 130.1, 2.0 * step)]
-    for k, place in enumerate(grid):
+    for k, site in enumerate(grid):
         if k % 10 == 0:
             context.progress(0.4 + 0.45 * k / len(grid), "the same elsewhere")
-        passes = make_passes(context, place, 1)
-        out[place] = answers(passes.measured[0], passes.flight, 2)
+        passes = make_passes(context, site, 1)
+        out[site] = answers(passes.measured[0], passes.flight, 2)
     return out
 
 
@@ -588,16 +588,16 @@ def _readings(context: Context) -> list[tuple[str, str, int, int]]:
             # two of the frames have a nearly vertical plane
             a = answers(seen, flight, 2, "tls")
             minus = {key: -value for key, value in a.rises.items()}
-            counts = [sum(s.holds(r, a.growth) for s in SENTENCES) for r in (a.rises, minus)]
+            counts = [sum(s.agrees(r, a.bend) for s in SENTENCES) for r in (a.rises, minus)]
             rows.append((frame, direction, counts[0], counts[1]))
     return rows
 
 
-def _show(context: Context, shown: Answers, places: Mapping[Place, Answers]) -> None:
+def _show(context: Context, shown: Answers, sites: Mapping[Site, Answers]) -> None:
     for name, panels in PANELS.items():
         context.figure(name, sensitivity_svg(shown.amount, shown.change, panels))
-    held = {place: sum(s.holds(a.rises, a.growth) for s in SENTENCES) for place, a in places.items()}
-    context.figure("places", places_svg(held, len(SENTENCES), ((40.0, 116.0), ELSEWHERE)), total=len(SENTENCES))
+    counts = {site: sum(s.agrees(a.rises, a.bend) for s in SENTENCES) for site, a in sites.items()}
+    context.figure("places", positions_svg(counts, len(SENTENCES), ((40.0, 116.0), ELSEWHERE)), total=len(SENTENCES))
     context.table("readings", _readings(context), total=len(SENTENCES))
     moved = ((what, axis) for what in ("station", "forward", "nadir", "backward") for axis in AXES)
     rows = [(w, a, float(shown.rises[w, "alpha", a]), float(shown.rises[w, "beta", a])) for w, a in moved]

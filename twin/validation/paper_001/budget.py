@@ -223,9 +223,9 @@ def centroid_scatter(budget: ErrorBudget, groups: int) -> tuple[tuple[float, flo
         single.append(_positions(budget, frames, 1))
         mean.append(_positions(budget, grouped, FRAMES))
     out = []
-    for places in (np.concatenate(single), np.concatenate(mean)):
-        freedom = (len(places) - 1) * places[0].size
-        variance = float(np.sum((places - places.mean(axis=0)) ** 2)) / freedom
+    for positions in (np.concatenate(single), np.concatenate(mean)):
+        freedom = (len(positions) - 1) * positions[0].size
+        variance = float(np.sum((positions - positions.mean(axis=0)) ** 2)) / freedom
         value = 3.0 * float(np.sqrt(variance)) * budget.radians_per_pixel
         out.append((value, value / float(np.sqrt(2.0 * freedom))))
     return out[0], out[1]
@@ -239,8 +239,8 @@ def _positions(budget: ErrorBudget, images: np.ndarray, frames: int) -> np.ndarr
     count, spots = images.shape[1], images.shape[0]
     flat = np.swapaxes(images, 0, 1).reshape(-1, *images.shape[2:]).astype(np.float64)
     with one_blas_thread():
-        found = measure_spots(flat, frames, budget.experiment.calibration, "energy", cores())
-    return np.asarray(found.position.reshape(count, spots, 2))
+        measured = measure_spots(flat, frames, budget.experiment.calibration, "energy", cores())
+    return np.asarray(measured.position.reshape(count, spots, 2))
 
 
 def line_end_shift(budget: ErrorBudget) -> float:

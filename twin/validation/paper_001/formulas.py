@@ -41,18 +41,18 @@ from twin.validation.group import Context, drawing, group_of
 Value = TypeVar("Value", float, np.ndarray)
 Measured = tuple[float, float]
 """Pair of a measured value and its standard deviation, in the same unit."""
-MIRROR_TURNS = tuple(math.radians(angle) for angle in (1 / 3600, 1 / 60, 0.5, 2.0, 10.0))
+MIRROR_ROTATIONS = tuple(math.radians(angle) for angle in (1 / 3600, 1 / 60, 0.5, 2.0, 10.0))
 INSTRUMENT = "monitor_pair"
 """Name of the instrument with the camera that Table 5 implies: f = 7.7 m, area CCDs 0.73 m apart."""
 FRAMES = 9
 PARAMETERS = ("d_alpha", "d_beta", "d_gamma", "d_f")
-SHIFT, TURN, SCALE, PISTON, FACE = 50e-6, 20 * ARCSEC, 20e-6, 50e-6, 4 * ARCSEC
+SHIFT, ROTATION, SCALE, PISTON, FACE = 50e-6, 20 * ARCSEC, 20e-6, 50e-6, 4 * ARCSEC
 """Sizes of the motions that test the formulas, in metres, radians, and as a fraction.
 
 They are shifts of the line CCD along X or Y, its rotation about Z, the expansion of the camera, the shift of the line
 CCD along Z, and the rotation of a reflecting face.
 """
-AMOUNTS = {"d_alpha": SHIFT, "d_beta": SHIFT, "d_gamma": TURN, "d_f": SCALE}
+AMOUNTS = {"d_alpha": SHIFT, "d_beta": SHIFT, "d_gamma": ROTATION, "d_f": SCALE}
 """Parameter of a camera -> size of the motion that changes it in the simulated states.
 
 The line CCD moves along X (d_alpha) and Y (d_beta), in metres, and rotates about Z (d_gamma), in radians; the camera is
@@ -248,7 +248,7 @@ class SingleMotions(MonitorImages):
         moved = {
             "along X": (planes, Motion(shift=(SHIFT, 0.0, 0.0))),
             "along Y": (planes, Motion(shift=(0.0, SHIFT, 0.0))),
-            "about Z": (planes, Motion(rotate=(0.0, 0.0, TURN))),
+            "about Z": (planes, Motion(rotate=(0.0, 0.0, ROTATION))),
             "piston": (planes, Motion(shift=(0.0, 0.0, PISTON))),
             "scale": (cameras, Motion(scale=SCALE)),
             "face across": (faces, Motion(rotate=(FACE, 0.0, 0.0))),
@@ -272,8 +272,8 @@ class SingleMotions(MonitorImages):
                 local, field = self.local(camera), geometry.field_beta_rad
             value, sigma = self.reading(camera, motion, parameter)
             bare = math.tan(value) / math.cos(field) ** 2 / local
-            found = self.true(camera, motion, parameter) / bare
-            return found, abs(found * sigma / value)
+            shift = self.true(camera, motion, parameter) / bare
+            return shift, abs(shift * sigma / value)
 
         return self.ratio(factor)
 
@@ -284,14 +284,14 @@ class SingleMotions(MonitorImages):
         focal length in that direction.
         """
 
-        def turn(camera: str) -> Measured:
+        def rotation(camera: str) -> Measured:
             f, f_x = focal_lengths(self.geometry(camera))
             left, right, sigma = self.spots(camera, f"face {direction}", "Y" if direction == "along" else "X")
             moved = 0.5 * (abs(left) + abs(right))
             made = float(autocollimator.mirror_rotation(moved, f if direction == "along" else f_x)) / FACE
             return made, made * sigma / math.sqrt(2.0) / moved
 
-        return self.ratio(turn)
+        return self.ratio(rotation)
 
     def roll(self) -> Ratio:
         """Return the spots' displacement across the line divided by that of the line CCD's ends, eq. (4).
@@ -301,12 +301,12 @@ class SingleMotions(MonitorImages):
 
         def moved(camera: str) -> Measured:
             left, right, sigma = self.spots(camera, "about Z", "X")
-            end = 0.5 * self.geometry(camera).separation_m * math.tan(TURN)
+            end = 0.5 * self.geometry(camera).separation_m * math.tan(ROTATION)
             return quotient((roll_displacement(left, right), sigma / math.sqrt(2.0)), (end, 0.0))
 
         return self.ratio(moved)
 
-    def growth(self) -> Ratio:
+    def scale_of_spots(self) -> Ratio:
         """Return the mean spot displacement by eq. (6) divided by L Δf / f of eq. (7).
 
         Δf is the traced change of the focal length f, L the position of the spot along the line.
@@ -320,7 +320,7 @@ class SingleMotions(MonitorImages):
 
         return self.ratio(moved)
 
-    def growth_by_side(self) -> float:
+    def scale_by_side(self) -> float:
         """Return the largest relative difference of one side's spot displacement from the mean of eq. (6)."""
         worst = 0.0
         for camera in self.cameras:
@@ -355,31 +355,31 @@ def _show_ratios(context: Context, name: str, ratios: Mapping[str, float]) -> No
         context.figure(name, _ratios_svg(exact))
 
 
-def mirror_turns(backend: Backend, turns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def mirror_rotations(backend: Backend, rotations: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return rotation and displacement of a reflected ray for small rotations of a mirror, in radians.
 
-    The displacement is on a screen at unit distance. ``turns`` holds the rotations.
+    The displacement is on a screen at unit distance. ``rotations`` holds the rotations.
     """
     mirror = Element("mirror", "mirror", plane(), Interaction.REFLECT)
     assembly = Assembly(RigidTree((Body("mirror"),)), {"mirror": mirror}, {"path": ("mirror",)})
-    states = [{"mirror": Motion(rotate=(float(turn), 0.0, 0.0))} for turn in (0.0, *turns)]
+    states = [{"mirror": Motion(rotate=(float(rotation), 0.0, 0.0))} for rotation in (0.0, *rotations)]
     rays = make_rays(backend, np.array([0.0, 0.0, 1.0]), np.array([0.0, 0.0, -1.0]))
     traced = trace(backend, assemble(assembly, ["path"], states), rays, world=True)
     _, direction, _, _ = traced.numpy(traced.world)
     start, after = direction[0, 0], direction[1:, 0]
-    turned = np.arctan2(np.linalg.norm(np.cross(start, after), axis=-1), after @ start)
-    return turned, np.linalg.norm(after / (after @ start)[:, None] - start, axis=-1)
+    reflected = np.arctan2(np.linalg.norm(np.cross(start, after), axis=-1), after @ start)
+    return reflected, np.linalg.norm(after / (after @ start)[:, None] - start, axis=-1)
 
 
 def run(context: Context) -> Iterator[CheckResult]:
     """Yield the results of all checks of single changes; the images of all motions are rendered in one batch."""
     if "001.eq1.turn" in context.selected:
         context.progress(0.0, "trace a plane mirror")
-        turns = np.array(MIRROR_TURNS)
-        turned, moved = mirror_turns(context.backend, turns)
-        ratio, screen = turned / turns, np.abs(moved / np.tan(2 * turns) - 1.0)
+        rotations = np.array(MIRROR_ROTATIONS)
+        reflected, moved = mirror_rotations(context.backend, rotations)
+        ratio, screen = reflected / rotations, np.abs(moved / np.tan(2 * rotations) - 1.0)
         worst = ratio[np.argmax(np.abs(ratio - 2.0))]
-        yield context.row("001.eq1.turn", worst, turns=MIRROR_TURNS, screen=screen)
+        yield context.row("001.eq1.turn", worst, rotations=MIRROR_ROTATIONS, screen=screen)
         if len(context.selected) == 1:
             return
     context.progress(0.1, f"build {INSTRUMENT}")
@@ -436,11 +436,11 @@ def _singles(context: Context, images: SingleMotions, shown: dict[str, Ratio]) -
     # how far off the axis of the mirrors the line stands
     bias = float(images.experiment.instrument.cameras[images.cameras[0]].spec.field_bias)
     yield row("001.eq3.cos2", images.needed_factor("d_alpha"), f / f_x, bias=bias, cos2_bias=math.cos(bias) ** 2)
-    read, rolled = images.over("about Z", "d_gamma", TURN), images.roll()
+    read, rolled = images.over("about Z", "d_gamma", ROTATION), images.roll()
     rows = row("001.eq5", read, 2.0, rolled=rolled), row("001.eq5", rolled, None, 2.0, rolled=rolled)
     yield context.check("001.eq5").worse(*rows)
-    read, grown, sides = images.over("scale", "d_f"), images.growth(), images.growth_by_side()
-    yield context.check("001.eq7").worse(*(row("001.eq7", one, grown=grown, sides=sides) for one in (read, grown)))
+    read, grown, sides = images.over("scale", "d_f"), images.scale_of_spots(), images.scale_by_side()
+    yield context.check("001.eq7").worse(*(row("001.eq7", ratio, grown=grown, sides=sides) for ratio in (read, grown)))
     true = fmean(images.true(camera, "piston", "d_f") for camera in images.cameras) / PISTON
     yield row("001.eq7.piston", images.over("piston", "d_f", PISTON), true, true=true)
 
@@ -449,11 +449,11 @@ def state_of(cameras: tuple[str, ...], shares: Mapping[str, np.ndarray]) -> Stat
     """Return the state in which each camera makes given fractions of the four AMOUNTS, in the order of PARAMETERS."""
     state: dict[str, Motion] = {}
     for camera in cameras:
-        along_x, along_y, turn, growth = (
+        along_x, along_y, rotation, scale = (
             float(s) * AMOUNTS[p] for s, p in zip(shares[camera], PARAMETERS, strict=True)
         )
-        state[f"{BASE}/{camera}/focal_plane"] = Motion(shift=(along_x, along_y, 0.0), rotate=(0.0, 0.0, turn))
-        state[f"{BASE}/{camera}"] = Motion(scale=growth)
+        state[f"{BASE}/{camera}/focal_plane"] = Motion(shift=(along_x, along_y, 0.0), rotate=(0.0, 0.0, rotation))
+        state[f"{BASE}/{camera}"] = Motion(scale=scale)
     return state
 
 
@@ -486,7 +486,7 @@ class JointMotions(MonitorImages):
         super().__init__(context, experiment, states_of(tuple(experiment.instrument.cameras), rounds, context.seed))
         self.mixtures = [k for k, name in enumerate(self.motions) if name.startswith("mixture")]
 
-    def superposition(self, one: str, other: str, axis: str) -> Ratio:
+    def superposition(self, first: str, second: str, axis: str) -> Ratio:
         """Return a spot's displacement due to two changes divided by the prediction of eq. (8).
 
         The prediction is from the displacements due to each change. Of a camera's two spots, the one farther from a
@@ -494,10 +494,10 @@ class JointMotions(MonitorImages):
         """
 
         def worse(camera: str) -> Measured:
-            both = self.spots(camera, f"{one}+{other}", axis)
-            first, second = self.spots(camera, one, axis), self.spots(camera, other, axis)
-            noise = float(np.hypot(first[2], second[2]))
-            sides = [quotient((both[k], both[2]), (superposed(first[k], second[k]), noise)) for k in (0, 1)]
+            both = self.spots(camera, f"{first}+{second}", axis)
+            single = [self.spots(camera, motion, axis) for motion in (first, second)]
+            noise = float(np.hypot(single[0][2], single[1][2]))
+            sides = [quotient((both[k], both[2]), (superposed(single[0][k], single[1][k]), noise)) for k in (0, 1)]
             return max(sides, key=lambda side: abs(side[0] - 1.0))
 
         return self.ratio(worse)

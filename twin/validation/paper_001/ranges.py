@@ -110,8 +110,8 @@ class Bench:
             mean = self.experiment.expected_frames(photons).reshape(-1, rows, columns)
             windows, corner = _windows(mean, self._measure.path.shape)
             spots = measure_spots(windows, self.frames, calibration, "ml", cores())
-            place = np.stack([spots.row, spots.column], axis=-1) + corner
-            out[piece] = place.reshape(-1, len(path.channels), 2)
+            position = np.stack([spots.row, spots.column], axis=-1) + corner
+            out[piece] = position.reshape(-1, len(path.channels), 2)
         return out
 
     def traced(self, states: Sequence[State]) -> np.ndarray:
@@ -135,7 +135,7 @@ class Bench:
         return np.moveaxis(known.centre, 0, 1)
 
     def readings(self, start: np.ndarray, end: np.ndarray) -> dict[str, dict[str, np.ndarray]]:
-        """Return camera -> set of formulas -> estimated changes in S states, (S, 4), in arcsec and um.
+        """Return the estimated changes in S states, (S, 4), in arcsec and um, by camera and set of formulas.
 
         The estimates of the four parameters are computed from spot positions before and after the change, (S, C, 2) for
         C channels.
@@ -158,7 +158,7 @@ class Bench:
         return out
 
     def truth(self, states: Sequence[State]) -> dict[str, np.ndarray]:
-        """Return camera -> traced changes of its four parameters in S states, (S, 4), in arcsec and um."""
+        """Return the traced changes of each camera's four parameters in S states, (S, 4), in arcsec and um."""
         changes = self.experiment.sight.truth(states)
         return {
             name: np.stack([c.d_alpha, c.d_beta, c.d_gamma, c.d_f], axis=-1) * PER_SI
@@ -296,7 +296,7 @@ CLAIMED = {
 FINE = {"d_alpha": 0.1, "d_beta": 0.1, "d_gamma": 0.1, "d_f": 40.0}
 """Parameter -> tighter tolerance: 0.1 arcsec for all angles, and Table 5's 0.04 mm for d_f."""
 RELATIVE = 0.01
-WINDOW, CUT = "leaves the area CCD", "an aperture cuts the beam"
+WINDOW, VIGNETTED = "leaves the area CCD", "an aperture cuts the beam"
 EDGE_PX = 11.0
 """Smallest allowed distance of a spot from the outermost pixel centres, pixels.
 
@@ -418,10 +418,10 @@ def single_range(bench: Bench, wide: Bench, parameter: str, sign: int, count: in
 
     def rendered(size: np.ndarray) -> Mapping[str, np.ndarray]:
         all_states = states(size)
-        place = wide.positions(all_states)
+        position = wide.positions(all_states)
         moved = bench.traced(all_states) - traced_origin
-        gap[0] = max(gap[0], float(np.max(np.abs(place - origin - moved))))
-        return shares(size, origin, place, raw)
+        gap[0] = max(gap[0], float(np.max(np.abs(position - origin - moved))))
+        return shares(size, origin, position, raw)
 
     begin = _START[parameter]
     end, why = beam_end(bench, states, begin, _FAR[parameter])
@@ -445,7 +445,7 @@ def single_range(bench: Bench, wide: Bench, parameter: str, sign: int, count: in
 
 
 def _joined(parts: Mapping[str, list[np.ndarray]]) -> dict[str, np.ndarray]:
-    """Return set of formulas -> N pairs of true change and error, (N, 2), in ascending order of the change."""
+    """Return N pairs of true change and error, (N, 2), of each set of formulas, in ascending order of the change."""
     out = {}
     for form, pieces in parts.items():
         joined = np.concatenate(pieces)
@@ -464,7 +464,7 @@ def beam_end(bench: Bench, states: Callable[[np.ndarray], list[State]], start: f
             trial_states = states(np.array([size]))
             bench.traced(trial_states)
         except BeamMissedError:
-            return CUT
+            return VIGNETTED
         except (AimError, np.linalg.LinAlgError):
             return "no ray is found"
         return ""
@@ -484,8 +484,8 @@ def joint_states(bench: Bench, changes: Mapping[str, np.ndarray]) -> list[State]
     states: list[dict[str, Motion]] = [{} for _ in next(iter(changes.values()))]
     for camera, wanted in changes.items():
         units = [motion_of(camera, name, bench.geometry(camera))[1] for name in NAMES]
-        for state, (x, y, turn, scale) in zip(states, wanted * np.array(units), strict=True):
-            state[f"{BASE}/{camera}/focal_plane"] = Motion(rotate=(0.0, 0.0, turn), shift=(x, y, 0.0))
+        for state, (x, y, rotation, scale) in zip(states, wanted * np.array(units), strict=True):
+            state[f"{BASE}/{camera}/focal_plane"] = Motion(rotate=(0.0, 0.0, rotation), shift=(x, y, 0.0))
             state[f"{BASE}/{camera}"] = Motion(scale=scale)
     return list(states)
 
@@ -609,7 +609,7 @@ def separation(experiment: MonitorExperiment, bench: Bench, trials: int, seed: i
 RETURNS: Mapping[str, tuple[tuple[float, float] | None, str]] = {
     "plane": (None, "as built"),
     "roof": (None, "as built; the ridge lies across the line"),
-    "roof along": ((0.0, 3e-3), "the ridge lies along the line; the area CCD stands beside its pinhole along the line"),
+    "roof along": ((0.0, 3e-3), "the ridge lies along the line; the area CCD is beside its pinhole along the line"),
     "corner": ((0.0, 0.0), "the spot falls on its own pinhole: the area CCD must see it through a beam splitter"),
 }
 """Kind of return reflector -> position of the area CCD for it, and a remark.
@@ -718,9 +718,9 @@ def _returning(instrument: Instrument, kind: str) -> Assembly:
             bodies.append(body)
             elements[mirror] = Element(mirror, body.path, plane(), Interaction.REFLECT)
             added.append(mirror)
-        way = old.sequences[f"{channel.key}/monitor"]
-        at = way.index(name)
-        sequences[f"{channel.key}/monitor"] = (*way[: at + 1], *added, *way[at + 1 :])
+        path = old.sequences[f"{channel.key}/monitor"]
+        at = path.index(name)
+        sequences[f"{channel.key}/monitor"] = (*path[: at + 1], *added, *path[at + 1 :])
     return Assembly(RigidTree(tuple(bodies)), elements, sequences, old.media)
 
 
@@ -761,8 +761,8 @@ def responses(resolved: ResolvedJob, backend: Backend, like: Bench) -> list[Resp
         built = with_return(variant(resolved, backend, camera, ccd_offset=offset), kind)
         bench = Bench(built, like)
         states = [{}, piston(camera, 0.0, along=(SHIFT, 0.0)), piston(camera, 0.0, along=(0.0, SHIFT))]
-        place = bench.positions(states)
-        moved = (place[1:] - place[0]) * pitch / SHIFT
+        position = bench.positions(states)
+        moved = (position[1:] - position[0]) * pitch / SHIFT
         # columns run along -X, rows along +Y
         out.append(Response(kind, -moved[0, :, 1], moved[1, :, 0], gains(bench)[CORRECTED]))
     return out
@@ -777,9 +777,9 @@ def depth_of_focus(resolved: ResolvedJob, camera: str) -> float:
     return 2.0 * resolved.instrument.autocollimator.wavelength * (spec.focal_length / spec.entrance_pupil) ** 2
 
 
-def piston(camera: str, amount: float, *, along: tuple[float, float] = (0.0, 0.0), turn: float = 0.0) -> State:
+def piston(camera: str, amount: float, *, along: tuple[float, float] = (0.0, 0.0), rotation: float = 0.0) -> State:
     """Return the state with the line CCD moved along Z (and along X and Y, and rotated about Z), metres and radians."""
-    return {f"{BASE}/{camera}/focal_plane": Motion(rotate=(0.0, 0.0, turn), shift=(*along, amount))}
+    return {f"{BASE}/{camera}/focal_plane": Motion(rotate=(0.0, 0.0, rotation), shift=(*along, amount))}
 
 
 def false_slopes(bench: Bench, form: str, pistons: Sequence[float]) -> np.ndarray:
@@ -832,11 +832,11 @@ def pupil_study(
     for offset in offsets:
         bench = Bench(variant(resolved, backend, like.cameras[0], pupil_offset=offset), like)
         slopes.append(false_slopes(bench, CORRECTED, (-depth, depth)))
-    place, slope = np.array(offsets), np.array(slopes)
-    design = np.column_stack([np.ones(len(place)), place])
+    position, slope = np.array(offsets), np.array(slopes)
+    design = np.column_stack([np.ones(len(position)), position])
     solved, *_ = np.linalg.lstsq(design, slope, rcond=None)
     rest = np.sqrt(np.mean((slope - design @ solved) ** 2, axis=0))
-    return PupilStudy(place, slope, solved[1:].T, rest)
+    return PupilStudy(position, slope, solved[1:].T, rest)
 
 
 def piston_curves(bench: Bench, count: int) -> Curves:
@@ -860,7 +860,7 @@ def piston_curves(bench: Bench, count: int) -> Curves:
 
 
 def gains(bench: Bench, constant: float = 0.0) -> dict[str, np.ndarray]:
-    """Return set of formulas -> estimate divided by true change, (4,), for the four single changes SMALL.
+    """Return the estimate divided by the true change, (4,), of each set of formulas for the four changes SMALL.
 
     The same piston, ``constant`` metres, is present before and after.
     """
@@ -872,13 +872,13 @@ def gains(bench: Bench, constant: float = 0.0) -> dict[str, np.ndarray]:
         if name == "d_f":
             states.append({**piston(camera, constant), motion.body: motion.motion(amount)})
         elif name == "d_gamma":
-            states.append(piston(camera, constant, turn=amount))
+            states.append(piston(camera, constant, rotation=amount))
         else:
             along = (amount, 0.0) if name == "d_alpha" else (0.0, amount)
             states.append(piston(camera, constant, along=along))
-    place, truth = bench.positions(states), bench.truth(states)[camera]
+    position, truth = bench.positions(states), bench.truth(states)[camera]
     change = np.diag(truth[1:] - truth[:1])
-    readings = bench.readings(place[:1], place[1:])[camera]
+    readings = bench.readings(position[:1], position[1:])[camera]
     return {form: np.diag(readings[form]) / change for form in FORMS}
 
 

@@ -74,7 +74,7 @@ def run(context: Context) -> Iterator[CheckResult]:
 def ranges_of(
     context: Context, resolved: ResolvedJob, bench: ranges.Bench, begin: float, share: float
 ) -> dict[str, list[ranges.Range]]:
-    """Return parameter -> its ranges of validity in both directions."""
+    """Return the ranges of validity of each parameter in both directions."""
     wide = ranges.Bench(
         ranges.variant(resolved, context.backend, bench.cameras[0], pixels=ranges.WIDE_PX), bench, shapes=True
     )
@@ -111,7 +111,7 @@ def limit_text(both: Sequence[ranges.Range], form: str, kind: str) -> str:
     size, whence = limit_of(both, form, kind)
     if size == 0.0:
         return "nowhere"
-    ended = "" if whence in ("images", "trace") else f" ({'beam cut' if whence == ranges.CUT else whence})"
+    ended = "" if whence in ("images", "trace") else f" ({'beam cut' if whence == ranges.VIGNETTED else whence})"
     return f"to {_size(size, both[0].parameter)}{ended}"
 
 
@@ -215,11 +215,11 @@ def _box_limits(geometry: MonitorGeometry) -> dict[str, list[float]]:
     anamorphism = f_x / f
     alpha, beta, gamma, d_f = ranges.BOX
     roll = abs(geometry.d_gamma_per_beta) * beta
-    growth = abs(geometry.d_f_per_alpha_m) * ARCSEC * 1e6 * alpha
+    change = abs(geometry.d_f_per_alpha_m) * ARCSEC * 1e6 * alpha
     worst = {
         "d_alpha": (anamorphism - 1.0) * alpha,
         "d_gamma": (2.0 * anamorphism - 1.0) * gamma + roll,
-        "d_f": 0.5 * d_f + growth,
+        "d_f": 0.5 * d_f + change,
     }
     return {name: [float(CLAIMED[name] / value)] for name, value in worst.items()}
 
@@ -234,8 +234,8 @@ def _defocus(context: Context, resolved: ResolvedJob, bench: ranges.Bench, data:
     change = np.max([np.abs(gain / constant[0.0] - 1.0) for gain in constant.values()], axis=0)
     x = OFFSETS_X if not context.fast else (-0.24, 0.0, 0.24)
     y = OFFSETS_Y if not context.fast else (0.24,)
-    places = [(v, 0.0) for v in x] + [(0.0, v) for v in y]
-    pupil = ranges.pupil_study(resolved, context.backend, bench, places, depth)
+    positions = [(v, 0.0) for v in x] + [(0.0, v) for v in y]
+    pupil = ranges.pupil_study(resolved, context.backend, bench, positions, depth)
     f, f_x = focal_lengths(bench.geometry(camera))
     _show_defocus(context, slope, curves, change, pupil, (f_x, f), data)
     offset = next(iter(resolved.instrument.channels_of(camera).values())).pupil_offset[0]
@@ -245,7 +245,7 @@ def _defocus(context: Context, resolved: ResolvedJob, bench: ranges.Bench, data:
         "offset": offset,
         "half": ranges.CONFOCAL,
         "depth": depth,
-        "places": places,
+        "positions": positions,
         "gradient": pupil.gradient[NAMES.index("d_alpha"), 0] * ARCSEC * f_x**2,
         "across": pupil.gradient[NAMES.index("d_beta"), 1] * ARCSEC * f**2,
     }
@@ -392,8 +392,8 @@ def defocus_svg(figure: Figure, pupil: ranges.PupilStudy, curves: ranges.Curves,
     for name in _ORDER:
         value = curves.value[f"{name} claimed"]
         right.plot(1e6 * curves.size, value, "o-", color=_OF_PARAMETER[name], ms=3.5, lw=1.0)
-        place = 1e6 * float(curves.size[-1]), float(value[-1])
-        right.annotate(SYMBOLS[name], place, xytext=(6, 0), textcoords="offset points",
+        position = 1e6 * float(curves.size[-1]), float(value[-1])
+        right.annotate(SYMBOLS[name], position, xytext=(6, 0), textcoords="offset points",
                        color=_OF_PARAMETER[name], va="center")  # fmt: skip
     right.set(xscale="log", yscale="log")
     right.set_xlabel("motion of the line CCD along Z [µm]")
@@ -563,9 +563,9 @@ def _show_field(context: Context, points: Sequence[ranges.FieldPoint], data: Dat
         false = {name: float(1e-6 * p.slope[NAMES.index(name)]) for name in ("d_alpha", "d_f")}
         corrected = (gains[CORRECTED][name] for name in _ORDER)
         rows.append([math.degrees(p.field), p.separation, gains[PRINTED]["d_beta"], *corrected, *false.values()])
-        place: dict[str, Any] = {"field_deg": math.degrees(p.field), "separation_m": p.separation}
+        position: dict[str, Any] = {"field_deg": math.degrees(p.field), "separation_m": p.separation}
         by_defocus = {"false_d_alpha_arcsec_per_um": false["d_alpha"], "false_d_f_um_per_um": false["d_f"]}
-        listed.append({**place, "reading_over_truth": gains, **by_defocus})
+        listed.append({**position, "reading_over_truth": gains, **by_defocus})
     context.table("field", rows)
     context.figure("field-figure", field_svg(points))
     data["field"] = listed

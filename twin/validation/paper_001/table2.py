@@ -89,7 +89,7 @@ def run(context: Context) -> Iterator[CheckResult]:
     worst, spread = max(differences.values())
     text = ", ".join(f"about {axis} {value:.3f}" for axis, (value, _) in differences.items())
     facts: dict[str, Any] = {
-        "found": measurement,
+        "rendered_benches": measurement,
         "text": text,
         "printed": {axis: printed_mean_difference(axis) for axis in differences},
     }
@@ -117,7 +117,7 @@ def _mean_difference(context: Context, measurement: Measured, series: laboratory
     means = np.array([table[axis].mean_difference for table in measurement.real])
     spread = laboratory.declared_spread(spec, series, float(np.max(result.sigma)) / math.sqrt(2.0))
     facts: dict[str, Any] = {
-        "found": measurement,
+        "rendered_benches": measurement,
         "result": result,
         "rows": series.steps + 1,
         "means": means,
@@ -140,13 +140,13 @@ def _z_columns(context: Context, measurement: Measured) -> CheckResult:
     scale = real[0]["Z"].scale
     # each of two instruments has the unrest of a reading and of its reading at zero; equal means within half a digit
     unrest = 2.0 * spec.errors.reading / ARCSEC
-    chance = math.erf(0.005 / (unrest * math.sqrt(2.0))) ** len(mirror_1) if unrest > 0.0 else 0.0
+    probability = math.erf(0.005 / (unrest * math.sqrt(2.0))) ** len(mirror_1) if unrest > 0.0 else 0.0
     apart = np.max(np.abs(scale * first - second), axis=1)
     facts: dict[str, Any] = {
         "scale": scale,
-        "one": mirror_1,
+        "mirror_1": mirror_1,
         "twice": mirror_1[1] * 2.0 / math.sqrt(3.0),
-        "chance": chance,
+        "probability": probability,
         "rate": np.polyfit(ANGLES, mirror_1, 1)[0],
         "sine": math.sqrt(0.75),
         "first": first,
@@ -172,7 +172,7 @@ def _relations(context: Context, measurement: Measured) -> Iterator[CheckResult]
         result, component = measurement.ideal[axis], column_component(axis)
         between = 2.0 * result.series.half_angle
         read = float(result.readings[1, -1, component] / result.series.angles[-1])
-        facts: dict[str, Any] = {"series": result.series, "between": between, "read": read, "own": "XY"[component]}
+        facts: dict[str, Any] = {"series": result.series, "between": between, "read": read, "axis": "XY"[component]}
         row = f"001.table2.relation.{axis.lower()}"
         yield context.row(row, read / autocollimator.relation_factor(axis, 2, between), **facts)
     result = measurement.ideal["Z"]
@@ -252,9 +252,9 @@ def _bench(axes: Axes, path: AutocollimatorPath) -> None:
         axes.plot(*_plan(mirror.apply(edge)), color=INK, lw=3.5)
         # the names stand beside the beams, away from the other autocollimator
         beside = across * (-1.0 if unit == 1 else 1.0)
-        place: dict[str, Any] = {"ha": "center" if unit == 1 else "left", "va": "center"}
-        axes.annotate(f"autocollimator {unit}", _plan(image + 0.05 * beside + 0.14 * view), color=colour, **place)
-        axes.annotate(f"mirror {unit}", _plan(mirror.translation + 0.05 * beside - 0.06 * view), **place)
+        anchor: dict[str, Any] = {"ha": "center" if unit == 1 else "left", "va": "center"}
+        axes.annotate(f"autocollimator {unit}", _plan(image + 0.05 * beside + 0.14 * view), color=colour, **anchor)
+        axes.annotate(f"mirror {unit}", _plan(mirror.translation + 0.05 * beside - 0.06 * view), **anchor)
         for vector, name in ((across, "Y"), (view, "Z")):
             tip = _plan(0.1 * vector)
             axes.annotate("", tip, (0.0, 0.0), arrowprops={"arrowstyle": "-|>", "color": colour, "lw": 1.2})
@@ -274,9 +274,9 @@ def _differences(axes: Axes, tables: Sequence[laboratory.ReadingTable], axis: st
         label = f"rendered, {len(tables)} bench{'es' if len(tables) > 1 else ''}" if k == 0 else None
         axes.plot(result.series.angles / ARCSEC, (start - second) / ARCSEC, color=BLUE, lw=0.9, alpha=0.6, label=label)
     printed = load_printed("001")
-    turns, mirror_1 = (printed.column("table2.turn_arcsec"), printed.columns("table2.mirror_1_arcsec"))
-    difference = np.array(turns if axis == "Z" else mirror_1[axis]) - printed.columns("table2.mirror_2_arcsec")[axis]
-    axes.plot(turns, difference, "o-", color=ORANGE, ms=4, lw=1.2, label="printed Table 2")
+    angles, mirror_1 = (printed.column("table2.turn_arcsec"), printed.columns("table2.mirror_1_arcsec"))
+    difference = np.array(angles if axis == "Z" else mirror_1[axis]) - printed.columns("table2.mirror_2_arcsec")[axis]
+    axes.plot(angles, difference, "o-", color=ORANGE, ms=4, lw=1.2, label="printed Table 2")
     axes.axhline(0.0, color=GREY, lw=0.7)
     axes.set(title=_TITLES[axis], ylabel="arcsec")
     if last:

@@ -175,8 +175,8 @@ def _expected(campaign: Campaign, names: tuple[str, ...], floor: np.ndarray) -> 
     rows = []
     for scheme in (*campaign.spec.schemes, None):
         mean = {n: np.mean([true[k] for k in (scheme or (n,))], axis=0) for n in names}
-        turn = np.array([np.hypot(*(mean[n] - true[n])[:2]) for n in names])
-        rows.append(np.hypot(above * turn, floor))
+        rotation = np.array([np.hypot(*(mean[n] - true[n])[:2]) for n in names])
+        rows.append(np.hypot(above * rotation, floor))
     return np.array(rows)
 
 
@@ -244,12 +244,12 @@ def _pass(setup: CalibrationSetup, field_pass: FieldPass) -> tuple[np.ndarray, .
     fixes, looks = (
         _readings(measured.first, measured.last, v) for v in (errors.gps.interval, errors.star_tracker.interval)
     )
-    place, turn = measured.position(fixes), measured.body_to_itrs(looks)
+    position, rotation = measured.position(fixes), measured.body_to_itrs(looks)
     frame = np.swapaxes(true.orbital_to_itrs(looks), 1, 2)
-    orbit = third_difference(fixes, place)
-    attitude = third_difference(looks, Rotation.from_matrix(frame @ turn).as_rotvec())
-    away = place - true.position(fixes)
-    error = Rotation.from_matrix(np.swapaxes(true.body_to_itrs(looks), 1, 2) @ turn).as_rotvec()
+    orbit = third_difference(fixes, position)
+    attitude = third_difference(looks, Rotation.from_matrix(frame @ rotation).as_rotvec())
+    away = position - true.position(fixes)
+    error = Rotation.from_matrix(np.swapaxes(true.body_to_itrs(looks), 1, 2) @ rotation).as_rotvec()
     error = error - error.mean(axis=0)
     # two readings apart by one step: what is slow cancels, white noise counts twice
     jump = np.sqrt(0.5 * np.mean(np.diff(error, axis=0) ** 2, axis=0))
@@ -265,7 +265,7 @@ def _readings(first: float, last: float, interval: float) -> np.ndarray:
 def _quality(context: Context, campaigns: Sequence[Campaign], setup: CalibrationSetup) -> Iterator[CheckResult]:
     quality = quality_of(setup, campaigns)
     errors, passes = setup.test.errors, quality.orbit.shape[0] * quality.orbit.shape[1]
-    facts: dict[str, Any] = {"found": quality, "passes": passes, "campaigns": campaigns}
+    facts: dict[str, Any] = {"simulated": quality, "passes": passes, "campaigns": campaigns}
     worst, sigma = median_of(
         np.max([v.max(axis=1) / v.min(axis=1) for v in (quality.orbit, quality.attitude)], axis=(0, 2))
     )
@@ -318,14 +318,14 @@ def _slope(context: Context, flights: Flights, number: int, k: int) -> CheckResu
     amplitude = np.array([row[k].amplitude for row in flights.fits]) / ARCSEC
     true = flights.true_amplitude[:, k] / ARCSEC
     sigmas = [row[k].amplitude_sigma for row in flights.fits]
-    facts: dict[str, Any] = {"flights": flights, "own": sigmas, "away": amplitude - true}
+    facts: dict[str, Any] = {"flights": flights, "predicted": sigmas, "away": amplitude - true}
     return context.row(f"003.fig{number}", amplitude.mean(), mean_of(amplitude - true)[1], true.mean(), **facts)
 
 
 def _interior(context: Context, flights: Flights, number: int, parts: tuple[str, ...], what: str) -> CheckResult:
-    places = [i for part in parts for i in lines_of(part) if np.any(flights.interior_sigma[:, :, i])]
-    scatter = flights.interior[:, :, places].std(axis=1, ddof=1) * 1e6
-    claimed = rms(flights.interior_sigma[:, :, places] * 1e6)
+    nodes = [i for part in parts for i in lines_of(part) if np.any(flights.interior_sigma[:, :, i])]
+    scatter = flights.interior[:, :, nodes].std(axis=1, ddof=1) * 1e6
+    claimed = rms(flights.interior_sigma[:, :, nodes] * 1e6)
     each = f"{claimed:.1f} µm"
     if len(parts) > 1:
         by = (rms(flights.interior_sigma[:, :, lines_of(p)[0]]) * 1e6 for p in parts)
@@ -333,7 +333,7 @@ def _interior(context: Context, flights: Flights, number: int, parts: tuple[str,
     value, sigma = median_of(np.sqrt(np.mean(scatter**2, axis=1)))
     facts: dict[str, Any] = {
         "flights": flights,
-        "places": places,
+        "unknowns": nodes,
         "each": each,
         "ratio": rms(scatter) / claimed,
         "what": what,
@@ -354,10 +354,10 @@ def schemes_svg(figure: Figure, flights: Flights, plan: float, height: float) ->
         values = np.concatenate([before[:, None], table], axis=1)
         low, middle, high = np.percentile(values, [5.0, 50.0, 95.0], axis=0)
         for k, name in enumerate(flights.fields):
-            place = np.arange(values.shape[1]) + 0.11 * (k - 3)
+            position = np.arange(values.shape[1]) + 0.11 * (k - 3)
             bars = np.stack([middle[:, k] - low[:, k], high[:, k] - middle[:, k]])
             style: dict[str, Any] = {"color": _COLOURS[k % 7], "fmt": _MARKERS[k % 7], "ms": 4.5, "lw": 1.1}
-            axes.errorbar(place, middle[:, k], bars, label=name, **style)
+            axes.errorbar(position, middle[:, k], bars, label=name, **style)
         axes.axhline(limit, color=GREY, lw=1.0, ls="--")
         axes.text(5.45, limit * 1.04, f"1:50 000, {limit:g} m", color=GREY, ha="right", va="bottom", fontsize=8.5)
         axes.set_yscale("log")
@@ -374,13 +374,13 @@ def schemes_svg(figure: Figure, flights: Flights, plan: float, height: float) ->
 def latitude_svg(figure: Figure, flights: Flights) -> None:
     """Draw roll, pitch and yaw biases over latitude: estimates, truth and fits."""
     degrees = np.degrees(flights.latitude)
-    reach = np.linspace(flights.latitude.min() - 0.03, flights.latitude.max() + 0.03, 61)
+    span = np.linspace(flights.latitude.min() - 0.03, flights.latitude.max() + 0.03, 61)
     for k, (axes, axis) in enumerate(zip(figure.subplots(1, 3), BIAS, strict=True)):
         fit = flights.fits[0][k]
         for fits in flights.fits[1 : 1 + _CURVES]:
-            curve = fits[k].curve(reach) - fits[k].constant + fit.constant
-            axes.plot(np.degrees(reach), curve / ARCSEC, color=GREY, lw=0.5, alpha=0.35)
-        axes.plot(np.degrees(reach), fit.curve(reach) / ARCSEC, color=VERMILION, lw=1.5, label="fit")
+            curve = fits[k].curve(span) - fits[k].constant + fit.constant
+            axes.plot(np.degrees(span), curve / ARCSEC, color=GREY, lw=0.5, alpha=0.35)
+        axes.plot(np.degrees(span), fit.curve(span) / ARCSEC, color=VERMILION, lw=1.5, label="fit")
         axes.plot(degrees, flights.true_bias[0, :, k] / ARCSEC, "x", color=INK, ms=6, label="truth", zorder=4)
         axes.errorbar(
             degrees, flights.bias[0, :, k] / ARCSEC, flights.bias_sigma[0, :, k] / ARCSEC,
@@ -466,8 +466,8 @@ def _per_shift(setup: CalibrationSetup) -> float:
     Points on flat ground are intersected from the forward and the backward line.
     """
     line = setup.camera.lines["forward"]
-    turn = np.cos(line.look) ** 2 / line.principal_distance
-    return float(height_error(turn, setup.test.altitude / np.cos(line.look), 2.0 * line.look, line.look))
+    rotation = np.cos(line.look) ** 2 / line.principal_distance
+    return float(height_error(rotation, setup.test.altitude / np.cos(line.look), 2.0 * line.look, line.look))
 
 
 def _varied(measured: float, flights: Flights, statistic: Callable[[np.ndarray], np.ndarray]) -> Chosen:
@@ -477,10 +477,10 @@ def _varied(measured: float, flights: Flights, statistic: Callable[[np.ndarray],
     fields; the response is the median of a statistic, (N,).
     """
     floor = flights.plan_floor[:, None, :]
-    turned = np.sqrt(np.maximum(flights.expected**2 - floor**2, 0.0))
+    rotation_part = np.sqrt(np.maximum(flights.expected**2 - floor**2, 0.0))
 
     def implied(factor: float) -> float:
-        return float(np.median(statistic(np.hypot(factor * turned, floor))))
+        return float(np.median(statistic(np.hypot(factor * rotation_part, floor))))
 
     name = "variation of the biases between the fields, times"
     return Chosen(name, 1.0, "1", lambda factor: measured * implied(factor) / implied(1.0))
@@ -508,7 +508,7 @@ def _findings(context: Context, flights: Flights) -> Iterator[CheckResult]:
         "spread": np.median(plan.std(axis=2), axis=0),
         "ratio": np.median(plan.max(axis=2) / plan.min(axis=2), axis=0),
         "steps": np.median(plan.mean(axis=2), axis=0),
-        "unseen": np.median(plan[:, :, -1], axis=0),
+        "unobserved": np.median(plan[:, :, -1], axis=0),
     }
     for name, (statistic, implied) in statistics.items():
         values = statistic(plan)

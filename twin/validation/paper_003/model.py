@@ -57,7 +57,7 @@ ROLL_PITCH = BIAS[:2]
 FREE_INTERIOR = tuple(n for n in (f"{line} {k}" for line in LINES for k in INTERIOR) if n not in GAUGE.held)
 TOLERANCE = 1e-3
 """Convergence limit of the stepwise solution: largest last step of a round, in conditional sigmas of the unknowns."""
-PLACES = (700.0, 6000.0, 11300.0)
+COLUMNS = (700.0, 6000.0, 11300.0)
 """Positions, in pixels of the nadir line, of the middles of the rendered windows.
 
 The line has 12 000 pixels over the swath.
@@ -70,7 +70,7 @@ _STEP = {"f": 1e-5, "x": 1e-5, "y": 1e-5}
 
 The error of third order is 1e-9 of the derivative.
 """
-_TURN = 1.5e-5
+_ROTATION = 1.5e-5
 """Half step of numerical derivatives with respect to an attitude angle, radians."""
 _SIDE = 190
 _SIGMA = 2.5
@@ -79,7 +79,7 @@ _SIGMA = 2.5
 The terrain's curvature under it moves its centroid by 0.004 px at most.
 """
 _APART = 300.0
-_REACH = MARGIN + 4
+_HALF = MARGIN + 4
 _TERRAIN: dict[str, Any] = {"kind": "fractal", "relief": "30 m", "exponent": 2.4}
 
 
@@ -132,7 +132,7 @@ def true_sensors(
     trajectory: Platform | None = None,
     interior: Mapping[str, np.ndarray] = FrozenMap(),
 ) -> dict[str, Sensor]:
-    """Return line -> sensor model of the camera as it is after launch, on a trajectory.
+    """Return the sensor model of each camera line as it is after launch, on a trajectory.
 
     Parameters
     ----------
@@ -159,7 +159,7 @@ def true_sensors(
 
 
 @dataclass(frozen=True, eq=False)
-class Turned:
+class Rotated:
     """Platform with its body rotated: its attitude is multiplied by Rx(roll) Ry(pitch) Rz(yaw) from the right.
 
     Attributes
@@ -221,16 +221,16 @@ def derivatives(setup: CalibrationSetup, field_pass: FieldPass, bias: np.ndarray
     ratios = []
     for line in LINES:
         model, pitch = line_model(payload, line), setup.camera.pitch_of(line)
-        base = true_sensors(setup, field_pass, Turned(field_pass.trajectory, bias))[line]
-        seen = places_seen(setup, field_pass, line, np.zeros(3), bias)
+        base = true_sensors(setup, field_pass, Rotated(field_pass.trajectory, bias))[line]
+        seen = image_positions(setup, field_pass, line, np.zeros(3), bias)
         by = partials(model, rays_at(base, field_pass.trajectory, pitch, *seen), ground, bias, still)
         for k, name in enumerate((*INTERIOR, *BIAS)):
-            step = _STEP.get(name, _TURN)
+            step = _STEP.get(name, _ROTATION)
             sides = []
             for sign in (1.0, -1.0):
                 change = np.zeros(6)
                 change[k] = sign * step
-                seen = places_seen(setup, field_pass, line, change[:3], bias + change[3:])
+                seen = image_positions(setup, field_pass, line, change[:3], bias + change[3:])
                 sides.append(misclosure(model, rays_at(base, field_pass.trajectory, pitch, *seen), ground, bias, still))
             coefficient = -(sides[0] - sides[1]) / (2.0 * step)
             expected = by.interior[:, :, k] if k < 3 else by.bias[:, :, k - 3]
@@ -238,7 +238,7 @@ def derivatives(setup: CalibrationSetup, field_pass: FieldPass, bias: np.ndarray
     return max(ratios, key=lambda entry: entry[2])
 
 
-def places_seen(
+def image_positions(
     setup: CalibrationSetup, field_pass: FieldPass, line: str, interior: np.ndarray, bias: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return image lines and pixels of the check points in a camera line with changed orientation.
@@ -247,8 +247,8 @@ def places_seen(
 
     ``interior`` holds the changes of f, x, y, (3,), metres; ``bias`` the attitude bias, (3,), radians.
     """
-    turned = Turned(field_pass.trajectory, bias)
-    return true_sensors(setup, field_pass, turned, {line: interior})[line].image(field_pass.check_ground)
+    rotated = Rotated(field_pass.trajectory, bias)
+    return true_sensors(setup, field_pass, rotated, {line: interior})[line].image(field_pass.check_ground)
 
 
 def exact_campaign(setup: CalibrationSetup, seed: np.random.SeedSequence) -> Campaign:
@@ -272,7 +272,7 @@ def recovered(campaign: Campaign, pitch: float) -> tuple[float, str]:
 
 
 def errors_of(campaign: Campaign, field_pass: FieldPass, adjustment: Adjustment | Stepwise) -> dict[str, float]:
-    """Return unknown (without the field's name) -> estimated minus true value, metres or radians."""
+    """Return the estimated minus the true value of each unknown, by name without the field's, metres or radians."""
     value = dict(zip(adjustment.names, adjustment.values, strict=True))
     out = {
         f"{line} {name}": float(value[f"{line} {name}"] - true)
@@ -290,7 +290,7 @@ class Rank:
     ----------
     unknowns : int
         Number of unknowns.
-    open : tuple of Combination
+    undetermined : tuple of Combination
         Undetermined combinations.
     weak_sigma : float
         Sigma of the nadir line's y, in metres, with its x held fixed.
@@ -302,7 +302,7 @@ class Rank:
     """
 
     unknowns: int
-    open: tuple[Combination, ...]
+    undetermined: tuple[Combination, ...]
     weak_sigma: float
     moved: float
     alone: float
@@ -310,7 +310,7 @@ class Rank:
     @property
     def rank(self) -> int:
         """Rank of the normal equations: the unknowns minus the undetermined combinations."""
-        return self.unknowns - len(self.open)
+        return self.unknowns - len(self.undetermined)
 
 
 def rank_of(setup: CalibrationSetup, campaign: Campaign) -> Rank:
@@ -321,13 +321,13 @@ def rank_of(setup: CalibrationSetup, campaign: Campaign) -> Rank:
     loose = adjust([field_pass.control], independent.laboratory, independent.noise, gauge=Gauge(held=("nadir x",)))
     first = dict(zip(adjustment.open[0].names, adjustment.open[0].change, strict=True)) if adjustment.open else {}
     size = 1e-4 / max(abs(first.get("nadir x", 1.0)), 1e-12)
-    turn = np.array([first.get(f"{field_pass.name} {n}", 0.0) for n in BIAS]) * size
+    rotation = np.array([first.get(f"{field_pass.name} {n}", 0.0) for n in BIAS]) * size
     moved, alone = [], []
     for line in LINES:
         inner = np.array([first.get(f"{line} {n}", 0.0) for n in INTERIOR]) * size
         start, both, inside = (
-            np.stack(places_seen(setup, field_pass, line, a, b))
-            for a, b in ((np.zeros(3), np.zeros(3)), (inner, turn), (inner, np.zeros(3)))
+            np.stack(image_positions(setup, field_pass, line, a, b))
+            for a, b in ((np.zeros(3), np.zeros(3)), (inner, rotation), (inner, np.zeros(3)))
         )
         moved.append(both - start)
         alone.append(inside - start)
@@ -341,7 +341,7 @@ class Walk:
 
     Attributes
     ----------
-    found : Stepwise
+    steps : Stepwise
         Stepwise solution.
     together : Adjustment
         Simultaneous solution.
@@ -351,7 +351,7 @@ class Walk:
         Number of rounds of the stepwise solution -> largest difference after these, sigmas.
     """
 
-    found: Stepwise
+    steps: Stepwise
     together: Adjustment
     distance: float
     after: Mapping[int, float]
@@ -406,7 +406,7 @@ class _Spots:
 
 
 def rendered_marks(setup: CalibrationSetup, campaign: Campaign, seed: np.random.SeedSequence) -> dict[str, FoundMarks]:
-    """Return camera line -> bright ground targets measured in it, four in each window over a campaign's first field.
+    """Return the bright ground targets measured in each camera line, four per window over a campaign's first field.
 
     They are located by their centroids.
     """
@@ -415,9 +415,9 @@ def rendered_marks(setup: CalibrationSetup, campaign: Campaign, seed: np.random.
     sensors = true_sensors(setup, field_pass)
     optics = optics_of(setup.camera, LINES, setup.test.line_time, setup.detectors)
     rows: dict[str, list[FoundMarks]] = {k: [] for k in LINES}
-    for k, place in enumerate(PLACES):
+    for k, column in enumerate(COLUMNS):
         nadir, rng = sensors["nadir"], stream(seed, k)
-        point = nadir.ground(np.array([-nadir.first_line_time / nadir.line_time]), np.array([place]), height)
+        point = nadir.ground(np.array([-nadir.first_line_time / nadir.line_time]), np.array([column]), height)
         lon, lat, _ = (float(np.ravel(v)[0]) for v in nadir.earth.geodetic(point))
         frame = GroundFrame(lon, lat)
         spec = TerrainSpec.model_validate({**_TERRAIN, "height": f"{height} m"})
@@ -441,7 +441,7 @@ def rendered_marks(setup: CalibrationSetup, campaign: Campaign, seed: np.random.
 
 
 def missed(setup: CalibrationSetup, campaign: Campaign, marks: dict[str, FoundMarks]) -> dict[str, np.ndarray]:
-    """Return camera line -> misclosures of the analysis's model at the line's n bright targets, (n, 2), in pixels.
+    """Return the misclosures of the analysis's model at each camera line's n bright targets, (n, 2), in pixels.
 
     The model has the true interior orientation and bias, the measured attitude and the known ground.
     """
@@ -464,17 +464,17 @@ def _brightest(image: np.ndarray, count: int) -> list[tuple[int, int]]:
     for _ in range(count):
         row, column = (int(v) for v in np.unravel_index(int(rest.argmax()), rest.shape))
         out.append((row, column))
-        rest[max(row - _REACH, 0) : row + _REACH + 1, max(column - _REACH, 0) : column + _REACH + 1] = -1.0
+        rest[max(row - _HALF, 0) : row + _HALF + 1, max(column - _HALF, 0) : column + _HALF + 1] = -1.0
     return out
 
 
 def _centroid(image: np.ndarray, row: int, column: int) -> np.ndarray:
     """Return the centroid (line, pixel) of all pixels that the point spread function reaches from a given pixel."""
-    part = image[row - _REACH : row + _REACH + 1, column - _REACH : column + _REACH + 1]
-    if part.shape != (2 * _REACH + 1,) * 2:
+    part = image[row - _HALF : row + _HALF + 1, column - _HALF : column + _HALF + 1]
+    if part.shape != (2 * _HALF + 1,) * 2:
         raise ValueError("a mark lies too near to the window's border")
-    place, total = np.arange(-_REACH, _REACH + 1), part.sum()
-    return np.array([row + part.sum(axis=1) @ place / total, column + part.sum(axis=0) @ place / total])
+    position, total = np.arange(-_HALF, _HALF + 1), part.sum()
+    return np.array([row + part.sum(axis=1) @ position / total, column + part.sum(axis=0) @ position / total])
 
 
 def _matched(predicted: tuple[np.ndarray, np.ndarray], at: np.ndarray, ground: np.ndarray) -> np.ndarray:
@@ -499,7 +499,7 @@ class FromImages:
         Name of the field.
     control, check : int
         Numbers of accepted control points and check points.
-    way : Stepwise
+    steps : Stepwise
         Stepwise solution.
     together : Adjustment
         Simultaneous solution, for sigmas.
@@ -514,7 +514,7 @@ class FromImages:
     name: str
     control: int
     check: int
-    way: Stepwise
+    steps: Stepwise
     together: Adjustment
     error: dict[str, float]
     covariance: np.ndarray
@@ -560,11 +560,11 @@ def matching(campaign: Campaign) -> tuple[float, int, int]:
 
 def _field(campaign: Campaign, field_pass: FieldPass) -> FromImages:
     together = calibrated_alone(campaign, field_pass)
-    way = stepwise([field_pass.control], campaign.laboratory, campaign.noise, held=GAUGE.held, tolerance=TOLERANCE)
+    steps = stepwise([field_pass.control], campaign.laboratory, campaign.noise, held=GAUGE.held, tolerance=TOLERANCE)
     free = [n for n in together.names if n not in GAUGE.held]
-    error = {n: v for n, v in errors_of(campaign, field_pass, way).items() if n not in GAUGE.held}
+    error = {n: v for n, v in errors_of(campaign, field_pass, steps).items() if n not in GAUGE.held}
     where = [together.names.index(n) for n in free]
-    value = dict(zip(way.names, way.values, strict=True))
+    value = dict(zip(steps.names, steps.values, strict=True))
     cameras = {
         line: camera.with_interior([value[f"{line} {k}"] for k in INTERIOR])
         for line, camera in campaign.laboratory.items()
@@ -575,7 +575,7 @@ def _field(campaign: Campaign, field_pass: FieldPass) -> FromImages:
         field_pass.name,
         int(field_pass.control.control.sum()),
         len(field_pass.check_ground),
-        way,
+        steps,
         together,
         error,
         together.covariance[np.ix_(where, where)],
@@ -595,21 +595,21 @@ def summary(from_images: FromImages, names: tuple[str, ...]) -> str:
 
 
 @drawing("paper-003-open", 3.4)
-def open_svg(figure: Figure, rank: Rank, walk: Walk) -> None:
+def undetermined_svg(figure: Figure, rank: Rank, walk: Walk) -> None:
     """Draw the undetermined combination as bars, and how the stepwise solution converges over its rounds, in sigmas."""
     left, right = figure.subplots(1, 2)
-    combination = rank.open[0]
+    combination = rank.undetermined[0]
     names = [n if n.split()[-1] in "fxy" else n.split()[-1] for n in combination.names]
     angle = [n.split()[-1] not in "fxy" for n in combination.names]
     size = [float(c) * (_FOCAL if a else 1.0) * 1e3 for c, a in zip(combination.change, angle, strict=True)]
-    place = np.arange(len(names))
-    left.barh(place, size, color=[VERMILION if a else BLUE for a in angle], height=0.6)
+    position = np.arange(len(names))
+    left.barh(position, size, color=[VERMILION if a else BLUE for a in angle], height=0.6)
     labels = [
         f"{c / ARCSEC:+.0f}″" if a else f"{c * 1e3:+.2f} mm" for c, a in zip(combination.change, angle, strict=True)
     ]
     for k, label in enumerate(labels):
         left.text(0.5 * size[k], k, label, ha="center", va="center", color="white", fontsize=9.0)
-    left.set_yticks(place, names)
+    left.set_yticks(position, names)
     left.set_ylim(len(names) - 0.5, -0.5)
     left.axvline(0.0, color=GREY, lw=0.8)
     left.set_xlabel("image motion of each alone [mm]")
@@ -656,10 +656,10 @@ def _exact(context: Context, seed: np.random.SeedSequence) -> Iterator[CheckResu
         yield context.row("003.model", max(largest.values()), implied=0.0, **facts)
     if "003.equations" in context.selected:
         line, name, worst = derivatives(setup, field_pass, field_pass.bias)
-        yield context.row("003.equations", worst, implied=0.0, one=field_pass, name=name, line=line)
+        yield context.row("003.equations", worst, implied=0.0, field_pass=field_pass, name=name, line=line)
     if "003.equations.exact" in context.selected:
         worst, name = recovered(campaign, setup.camera.pitch)
-        yield context.row("003.equations.exact", worst, implied=0.0, one=field_pass, name=name)
+        yield context.row("003.equations.exact", worst, implied=0.0, field_pass=field_pass, name=name)
 
 
 def _simulated(context: Context, seed: np.random.SeedSequence) -> Iterator[CheckResult]:
@@ -668,12 +668,12 @@ def _simulated(context: Context, seed: np.random.SeedSequence) -> Iterator[Check
     if "003.model.rank" in context.selected:
         rank = rank_of(setup, campaign)
         facts: dict[str, Any] = {
-            "found": rank,
-            "combinations": "; ".join(str(o) for o in rank.open),
+            "simulated": rank,
+            "combinations": "; ".join(str(o) for o in rank.undetermined),
             "pixels": rank.weak_sigma / setup.camera.pitch,
         }
         yield context.row("003.model.rank", rank.rank, None, float(UNKNOWNS), [UNKNOWNS - 1.0], **facts)
-        context.figure("open", open_svg(rank, walked(campaign, campaign.passes[0], ROUNDS)))
+        context.figure("open", undetermined_svg(rank, walked(campaign, campaign.passes[0], ROUNDS)))
     if "003.model.stepwise" in context.selected:
         walk = walked(campaign, campaign.passes[0])
         after = ", ".join(f"{v:.1f} after {n}" for n, v in walk.after.items())
@@ -723,7 +723,7 @@ def _rendered(context: Context, seed: np.random.SeedSequence) -> Iterator[CheckR
         error, matched, wrong = matching(campaign)
         limit = setup_of(FIELDS).test.errors.image
         yield context.row("003.model.points", error, None, limit, matched=matched, wrong=wrong, **facts)
-    facts["rounds"] = ", ".join(str(f.way.rounds) for f in fields)
+    facts["rounds"] = ", ".join(str(f.steps.rounds) for f in fields)
     for row, names, unit in (("bias", ROLL_PITCH, ARCSEC), ("interior", FREE_INTERIOR, 1e-6)):
         worst, sigma = (value / unit for value in max(f.rms(names) for f in fields))
         errors = " ".join(summary(f, names) for f in fields)

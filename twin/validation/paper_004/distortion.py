@@ -86,23 +86,23 @@ class Perspective:
         return self.f + self.p**2 / self.f
 
     @classmethod
-    def nearest(cls, where: Array, turn: Array, tilted: bool = True) -> Perspective:
+    def nearest(cls, where: Array, angle: Array, tilted: bool = True) -> Perspective:
         """Fit the distortion-free camera to chief rays by nonlinear least squares, without series expansion.
 
         Parameters
         ----------
         where : (N,) ndarray
             Positions of N chief rays along the line, metres.
-        turn : (N,) ndarray
+        angle : (N,) ndarray
             Angles W of their directions, radians.
         tilted : bool
             True to estimate the principal point p; False for p = 0.
         """
-        start = (where[-1] - where[0]) / (np.tan(turn[-1]) - np.tan(turn[0]))
+        start = (where[-1] - where[0]) / (np.tan(angle[-1]) - np.tan(angle[0]))
 
         def rest(guess: Array) -> Array:
             f, w = start * (1.0 + guess[0]), guess[1] if tilted else 0.0
-            return np.asarray(where - f * (np.tan(turn - w) + np.tan(w)))
+            return np.asarray(where - f * (np.tan(angle - w) + np.tan(w)))
 
         fit = least_squares(rest, np.zeros(1 + tilted), x_scale=1e-3, xtol=1e-15, ftol=1e-15, gtol=1e-15)
         f = start * (1.0 + float(fit.x[0]))
@@ -119,44 +119,44 @@ class SpotTest:
     run: SimulatedDistortion
 
     @cached_property
-    def place(self) -> Array:
+    def position(self) -> Array:
         """Positions L of the N points along the line, measured in the images, (N,), metres."""
         return self.run.compensated.fit.position
 
     @cached_property
-    def turn(self) -> Array:
+    def angle(self) -> Array:
         """Angles W of the N points by compensated readings, from the zero that the operator set, (N,), radians."""
         return self.run.compensated.fit.angle
 
     @cached_property
     def zeroed(self) -> Array:
         """Angles W of the N points, from the zero that a fit with a constant term estimates, (N,), radians."""
-        return np.asarray(self.turn - self.run.compensated.zero)
+        return np.asarray(self.angle - self.run.compensated.zero)
 
     @cached_property
-    def true_place(self) -> Array:
+    def true_position(self) -> Array:
         """True positions L of the N chief rays along the line, (N,), metres."""
         return self.run.means.mean(self.run.truth.position[..., 0])
 
     @cached_property
-    def true_turn(self) -> Array:
+    def true_angle(self) -> Array:
         """True angles W of the N points, (N,), radians."""
         return self.run.means.mean(self.run.truth.field_angle)
 
     @cached_property
     def camera(self) -> Perspective:
         """Principal distance, principal point and distortion of the traced camera."""
-        return Perspective.nearest(self.true_place, self.true_turn)
+        return Perspective.nearest(self.true_position, self.true_angle)
 
     @cached_property
     def part(self) -> Perspective:
         """Principal distance, principal point and distortion of the traced camera from unevenly spaced points."""
-        return Perspective.nearest(self.true_place[UNEVEN], self.true_turn[UNEVEN])
+        return Perspective.nearest(self.true_position[UNEVEN], self.true_angle[UNEVEN])
 
     @property
     def zero(self) -> float:
         """Error of the zero of the angles W, mean over the points, in radians."""
-        return float(np.mean(self.turn - self.true_turn))
+        return float(np.mean(self.angle - self.true_angle))
 
     def shifted(self, *powers: int) -> tuple[Array, Array]:
         """Return the effect of the wrong angle zero alone on a least-squares fit of powers of tan W to the chief rays.
@@ -164,24 +164,24 @@ class SpotTest:
         The effect consists of the coefficients of the P powers, (P,), and of the residuals at the N points, (N,), in
         metres.
         """
-        columns = np.tan(self.true_turn)[:, None] ** np.array(powers)
+        columns = np.tan(self.true_angle)[:, None] ** np.array(powers)
         # what the camera images to W stands beside W + zero
-        moved = -self.camera.f * self.zero * (1.0 + np.tan(self.true_turn) ** 2)
+        moved = -self.camera.f * self.zero * (1.0 + np.tan(self.true_angle) ** 2)
         coefficients = np.linalg.lstsq(columns, moved)[0]
         return coefficients, np.asarray(moved - columns @ coefficients)
 
-    def errors(self, turn: Array, points: slice | NDArray[np.intp]) -> tuple[float, float]:
+    def errors(self, angle: Array, points: slice | NDArray[np.intp]) -> tuple[float, float]:
         """Return the error of f and the RMS error of the distortion, metres, for selected points with given angles.
 
         A constant, f and p are fitted to these points.
         """
-        fits = [_fitted(self.place[points], turn[points]), _fitted(self.true_place[points], self.true_turn[points])]
-        (f, rest), (f_true, rest_true) = fits
+        f, rest = _fitted(self.position[points], angle[points])
+        f_true, rest_true = _fitted(self.true_position[points], self.true_angle[points])
         return f - f_true, rms(rest - rest_true)
 
 
-def _fitted(where: Array, turn: Array) -> tuple[float, Array]:
-    columns = np.tan(turn)[:, None] ** np.arange(3)
+def _fitted(where: Array, angle: Array) -> tuple[float, Array]:
+    columns = np.tan(angle)[:, None] ** np.arange(3)
     coefficients = np.linalg.lstsq(columns, where)[0]
     return float(coefficients[1]), np.asarray(where - columns @ coefficients)
 
@@ -192,11 +192,11 @@ def run(context: Context) -> Iterator[CheckResult]:
     if not context.selected - _PRINTED_ONLY:
         return
     tests = [SpotTest(run) for run in measured_tests(context)]
-    places, sets = tests[0].run.record.reading.shape
-    count = len(tests) * places * sets
+    points, sets = tests[0].run.record.reading.shape
+    spots = len(tests) * points * sets
     facts: dict[str, Any] = {
         "tests": tests,
-        "rendered": f"{len(tests)} tests of {places} points and {sets} sets, {count} spots rendered",
+        "rendered": f"{len(tests)} tests of {points} points and {sets} sets, {spots} spots rendered",
         "points": POINTS,
         "sets": SETS,
         "accuracy": ACCURACY_UM,
@@ -255,9 +255,9 @@ Facts = Mapping[str, Any]
 
 
 def _eq1(context: Context, tests: Sequence[SpotTest], facts: Facts) -> Iterator[CheckResult]:
-    printed, freed = (np.array([_by_eq1(t, turn(t)) for t in tests]) for turn in (lambda t: t.turn, lambda t: t.zeroed))
+    printed, freed = (np.array([_by_eq1(t, w(t)) for t in tests]) for w in (lambda t: t.angle, lambda t: t.zeroed))
     left = rms([t.shifted(1, 2)[1] for t in tests])
-    alone = rms([t.place - principal_distance(t.place, t.turn) * np.tan(t.turn) - t.camera.rest for t in tests])
+    alone = rms([t.position - principal_distance(t.position, t.angle) * np.tan(t.angle) - t.camera.rest for t in tests])
     zero = rms([t.zero for t in tests])
     need = ACCURACY_UM / (UM * left) * zero
     noise = UM * rms(freed) / np.sqrt(len(tests))
@@ -267,16 +267,16 @@ def _eq1(context: Context, tests: Sequence[SpotTest], facts: Facts) -> Iterator[
     yield context.row("004.eq1.zero", value, inputs=[dividing(value)], **facts, **more)
 
 
-def _by_eq1(test: SpotTest, turn: Array) -> float:
+def _by_eq1(test: SpotTest, angle: Array) -> float:
     """Return the RMS error of the distortion by eq. (1) with f and p of eq. (2), in metres."""
-    f, p = principal_distance_and_point(test.place, turn)
-    return rms(distortion(test.place, turn, f, p) - test.camera.rest)
+    f, p = principal_distance_and_point(test.position, angle)
+    return rms(distortion(test.position, angle, f, p) - test.camera.rest)
 
 
 def _eq2(context: Context, tests: Sequence[SpotTest], facts: Facts) -> Iterator[CheckResult]:
     f_true, p_true = (np.array([getattr(t.camera, name) for t in tests]) for name in ("f", "p"))
-    both = np.array([principal_distance_and_point(t.place, t.turn) for t in tests])
-    alone = np.array([principal_distance(t.place, t.turn) for t in tests])
+    both = np.array([principal_distance_and_point(t.position, t.angle) for t in tests])
+    alone = np.array([principal_distance(t.position, t.angle) for t in tests])
     fits = [t.run.compensated.fit for t in tests]
     f, f_sigma, p, p_sigma = (
         np.array([getattr(fit, part)(name) for fit in fits])
@@ -284,23 +284,23 @@ def _eq2(context: Context, tests: Sequence[SpotTest], facts: Facts) -> Iterator[
         for part in ("value", "sigma")
     )
 
-    def distance(found: Array, equation: str) -> CheckResult:
-        scatter = MM * float(np.std(found - f_true, ddof=1))
+    def distance(fitted: Array, equation: str) -> CheckResult:
+        scatter = MM * float(np.std(fitted - f_true, ddof=1))
         # truth differs by a micrometre between tests
-        value, truth = MM * (np.mean(f_true) + np.mean(found - f_true)), MM * float(np.mean(f_true))
+        value, truth = MM * (np.mean(f_true) + np.mean(fitted - f_true)), MM * float(np.mean(f_true))
         sigma = scatter / np.sqrt(len(tests))
         return context.row("004.eq2.f", value, sigma, truth, equation=equation, scatter=scatter, **facts)
 
-    def zero(found: Array, predicted: Array, equation: str) -> CheckResult:
+    def zero(fitted: Array, predicted: Array, equation: str) -> CheckResult:
         """Check the principal point by one of the paper's equations, which depends on the error of the angles' zero."""
-        error, turn = found - p_true, rms([t.zero for t in tests])
+        error, offset = fitted - p_true, rms([t.zero for t in tests])
         more: dict[str, Any] = {
             "equation": equation,
             "true": np.mean(p_true),
-            "zero": turn,
+            "zero": offset,
             "rest": rms(error - predicted),
         }
-        more["per_arcsec"] = MM * rms(predicted) / (turn / ARCSEC)
+        more["per_arcsec"] = MM * rms(predicted) / (offset / ARCSEC)
         sigma = MM * rms(p_sigma) / np.sqrt(len(tests))
         return context.row("004.eq2.p", MM * rms(error), sigma, None, [MM * rms(predicted)], **facts, **more)
 
@@ -308,20 +308,20 @@ def _eq2(context: Context, tests: Sequence[SpotTest], facts: Facts) -> Iterator[
     score = (f - f_true) / f_sigma
     more = {"within": np.sum(np.abs(score) < 2.0), "f_sigma": f_sigma}
     yield context.row("004.eq2.distance", rms(score), 1.0 / np.sqrt(2 * len(tests)), 1.0, **facts, **more)
-    known = np.array([principal_point(t.place, t.turn, t.camera.f) for t in tests])
+    known = np.array([principal_point(t.position, t.angle, t.camera.f) for t in tests])
     predicted = [np.array([-t.shifted(*powers)[0][-1] for t in tests]) for powers in ((1, 2), (2,))]
     check = context.check("004.eq2.p")
     yield check.worse(zero(both[:, 1], predicted[0], "(2)"), zero(known, predicted[1], "(4)"))
     yield _uneven(context, tests, facts, "004.eq2.uneven", lambda t, at: principal_distance_and_point(*at)[1])
     pitch = tests[0].run.bench.ccd.band.pitch
-    error, stated = rms(p - p_true) / pitch, rms(p_sigma) / pitch
+    error, sigma = rms(p - p_true) / pitch, rms(p_sigma) / pitch
     more = {
-        "edge": float(np.tan(tests[0].true_turn[-1]) ** 2),
+        "edge": float(np.tan(tests[0].true_angle[-1]) ** 2),
         "error": pitch * error,
-        "stated": pitch * stated,
+        "predicted": pitch * sigma,
         "correlation": np.median([[abs(fit.correlation[2, k]) for k in (0, 1)] for fit in fits], axis=0),
     }
-    yield context.row("004.eq2.point", error, error / np.sqrt(2 * len(tests)), None, [stated], **facts, **more)
+    yield context.row("004.eq2.point", error, error / np.sqrt(2 * len(tests)), None, [sigma], **facts, **more)
 
 
 def _uneven(
@@ -332,11 +332,11 @@ def _uneven(
     solve: Callable[[SpotTest, tuple[Array, Array]], Any],
 ) -> CheckResult:
     """Check the principal point by one of the paper's equations for unevenly spaced points."""
-    points = np.array([solve(t, (t.place[UNEVEN], t.zeroed[UNEVEN])) for t in tests])
-    true, turn = np.array([t.part.p for t in tests]), tests[0].true_turn[UNEVEN]
+    points = np.array([solve(t, (t.position[UNEVEN], t.zeroed[UNEVEN])) for t in tests])
+    true, angle = np.array([t.part.p for t in tests]), tests[0].true_angle[UNEVEN]
     scatter = MM * float(np.std(points - true, ddof=1))
     value, truth = MM * float(np.mean(true) + np.mean(points - true)), MM * float(np.mean(true))
-    more: dict[str, Any] = {"uneven": turn, "scatter": scatter}
+    more: dict[str, Any] = {"uneven": angle, "scatter": scatter}
     return context.row(identifier, value, scatter / np.sqrt(len(tests)), truth, **facts, **more)
 
 
@@ -348,14 +348,14 @@ def _sensitivity(context: Context, tests: Sequence[SpotTest], facts: Facts) -> I
     whole = slice(None)
     raw = [np.asarray(t.run.raw.fit.angle) for t in tests]
     all_raw, inner = (np.array([t.errors(w, k) for t, w in zip(tests, raw, strict=True)]) for k in (whole, half))
-    with_compensation = rms([t.errors(t.turn, whole)[1] for t in tests])
-    spots = rms([t.errors(t.true_turn, whole)[1] for t in tests])
+    with_compensation = rms([t.errors(t.angle, whole)[1] for t in tests])
+    spots = rms([t.errors(t.true_angle, whole)[1] for t in tests])
     by_spots, by_angles = spots**2, with_compensation**2 - spots**2
     chosen = Chosen(
         "dividing error of scenes/lab/turntable.yaml, times", 1.0, "1",
         lambda factor: 100.0 * (1.0 - by_spots / (by_spots + factor**2 * by_angles)),
     )  # fmt: skip
-    more: dict[str, Any] = {"own": with_compensation, "spots": spots, "as_read": rms(all_raw[:, 1])}
+    more: dict[str, Any] = {"compensated": with_compensation, "spots": spots, "as_read": rms(all_raw[:, 1])}
     share = 100.0 * (1.0 - by_spots / with_compensation**2)
     yield context.row("004.sensitivity.angle", share, None, 50.0, inputs=[chosen], **facts, **more)
     for name, column, over, under in (("field", 1, all_raw, inner), ("distance", 0, inner, all_raw)):
@@ -363,14 +363,14 @@ def _sensitivity(context: Context, tests: Sequence[SpotTest], facts: Facts) -> I
         more = {"half": half, "top": top, "bottom": bottom}
         sigma = _ratio(over, under, column)
         yield context.row(f"004.sensitivity.{name}", top / bottom, sigma, 1.0, **facts, **more)
-    few = rms([t.errors(t.turn, slice(k, None, FEW))[0] for t in tests for k in range(FEW)])
-    total = rms([t.errors(t.turn, whole)[0] for t in tests])
-    more = {"few": few, "every": total, "fewer": POINTS // FEW, "gain": FEW**0.5}
+    few = rms([t.errors(t.angle, slice(k, None, FEW))[0] for t in tests for k in range(FEW)])
+    total = rms([t.errors(t.angle, whole)[0] for t in tests])
+    more = {"few": few, "total": total, "fewer": POINTS // FEW, "gain": FEW**0.5}
     yield context.row("004.sensitivity.points", few / total, None, 1.0, **facts, **more)
     rng = np.random.default_rng(np.random.SeedSequence(context.seed, spawn_key=(1,)))
     wrong = FIT_RMS_ARCSEC * ARCSEC
-    error = UM * rms([t.errors(t.true_turn + rng.normal(0.0, wrong, len(t.turn)), whole)[1] for t in tests])
-    points = len(tests[0].turn)
+    error = UM * rms([t.errors(t.true_angle + rng.normal(0.0, wrong, len(t.angle)), whole)[1] for t in tests])
+    points = len(tests[0].angle)
     expected = UM * float(np.mean([t.camera.f for t in tests])) * wrong * np.sqrt(1.0 - 3.0 / points)
     more = {"asked": FIT_RMS_ARCSEC, "needed": FIT_RMS_ARCSEC * ACCURACY_UM / expected}
     sigma = expected / np.sqrt(2.0 * points * len(tests))
@@ -388,15 +388,15 @@ def _ratio(over: Array, under: Array, column: int) -> float:
 def _errors_of_tests(context: Context, tests: Sequence[SpotTest], facts: Facts) -> Iterator[CheckResult]:
     """Check the remaining dividing error of the angles and the remaining error of the distortion."""
     compensated, raw = (
-        np.array([np.std(angle(t) - t.true_turn) for t in tests]) / ARCSEC
-        for angle in (lambda t: t.turn, lambda t: t.run.raw.fit.angle)
+        np.array([np.std(angle(t) - t.true_angle) for t in tests]) / ARCSEC
+        for angle in (lambda t: t.angle, lambda t: t.run.raw.fit.angle)
     )
     value = float(np.max(compensated))
     row = "004.turntable.compensated"
-    yield context.row(row, value, inputs=[dividing(value)], own=compensated, raw=raw, **facts)
+    yield context.row(row, value, inputs=[dividing(value)], compensated=compensated, raw=raw, **facts)
     raw, compensated = _errors(tests).T
     value = float(np.max(compensated))
-    yield context.row("004.table2.accuracy", value, inputs=[dividing(value)], own=compensated, raw=raw, **facts)
+    yield context.row("004.table2.accuracy", value, inputs=[dividing(value)], compensated=compensated, raw=raw, **facts)
     runs = [t.run for t in tests]
     less = 100.0 * (1.0 - compensated / raw)
     # known better than sigma, but the printed figure is of one table
@@ -423,8 +423,8 @@ def _moved(test: SpotTest) -> Array:
 
     It is the principal distance f times the correction, without the part that the fit of zero, f and p absorbs.
     """
-    correction = test.camera.f * (test.turn - test.run.raw.fit.angle)
-    columns = np.tan(test.turn)[:, None] ** np.arange(3)
+    correction = test.camera.f * (test.angle - test.run.raw.fit.angle)
+    columns = np.tan(test.angle)[:, None] ** np.arange(3)
     return np.asarray(correction - columns @ np.linalg.lstsq(columns, correction)[0])
 
 
@@ -451,7 +451,7 @@ def _show(context: Context, tests: Sequence[SpotTest]) -> None:
     context.figure("reduction", reduction_svg(_errors(tests), (rms(raw), rms(compensated)), reduction))
     # error of the zero, p of (2), and p that the zero explains
     by_eq2 = [
-        (t.zero / ARCSEC, MM * principal_distance_and_point(t.place, t.turn)[1], -MM * t.shifted(1, 2)[0][1])
+        (t.zero / ARCSEC, MM * principal_distance_and_point(t.position, t.angle)[1], -MM * t.shifted(1, 2)[0][1])
         for t in tests
     ]
     fits = [t.run.compensated.fit for t in tests]
@@ -530,62 +530,62 @@ def chief_rays(setup: DistortionSetup, backend: Backend) -> Callable[[Array], Ar
     middle = path.directions(np.array([[0.0, setup.camera.bands[test.band].offset]]))[0]
     axis = np.array([1.0, 0.0, 0.0])
 
-    def places(turn: Array) -> Array:
-        light = rotation_matrix(np.append(turn, 0.0)[:, None] * axis) @ middle
+    def positions(angle: Array) -> Array:
+        light = rotation_matrix(np.append(angle, 0.0)[:, None] * axis) @ middle
         along = path.places({}, light)[:, 0]
         return np.asarray(along[:-1] - along[-1])
 
-    return places
+    return positions
 
 
 def run_equations(context: Context) -> Iterator[CheckResult]:
     """Check the printed equations on traced chief rays, without noise."""
     context.progress(0.0, "trace chief rays")
     setup = DistortionSetup.read(TEST)
-    places = chief_rays(setup, context.backend)
+    positions = chief_rays(setup, context.backend)
     band, test = setup.camera.bands[setup.test.band], setup.test
     half = 0.5 * test.reach * band.pixels * band.pitch
-    rough = float(places(np.array([1e-3]))[0]) / 1e-3
+    rough = float(positions(np.array([1e-3]))[0]) / 1e-3
     edge = float(np.arctan(half / rough))
-    yield from _solutions(context, places, edge)
-    yield _ignored(context, places, edge * np.linspace(-1.0, 1.0, test.points), band.pitch)
+    yield from _solutions(context, positions, edge)
+    yield _ignored(context, positions, edge * np.linspace(-1.0, 1.0, test.points), band.pitch)
     end, most = 0.5 * band.pixels * band.pitch, 1.02 * edge / test.reach
-    whole = _turn_to(places, end, most) - _turn_to(places, -end, most)
+    whole = _angle_to(positions, end, most) - _angle_to(positions, -end, most)
     yield context.row("004.turntable.range", np.degrees(whole), band=band)
 
 
-def _turn_to(places: Callable[[Array], Array], wanted: float, most: float) -> float:
+def _angle_to(positions: Callable[[Array], Array], wanted: float, most: float) -> float:
     """Return the rotation of the table, within ±``most``, that is imaged to a given position on the line, radians."""
-    return float(brentq(lambda w: float(places(np.array([w]))[0]) - wanted, -most, most, xtol=1e-14))
+    return float(brentq(lambda w: float(positions(np.array([w]))[0]) - wanted, -most, most, xtol=1e-14))
 
 
-def _ignored(context: Context, places: Callable[[Array], Array], turn: Array, pitch: float) -> CheckResult:
+def _ignored(context: Context, positions: Callable[[Array], Array], angle: Array, pitch: float) -> CheckResult:
     """Check eq. (3) with positions and angles counted from a point one pixel off the middle of the line."""
-    where, beside = places(turn), _turn_to(places, pitch, float(turn[-1]))
-    shift = float(places(np.array([beside]))[0])
-    first = distortion(where, turn, principal_distance(where, turn))
-    moved = where - shift, turn - beside
+    where, beside = positions(angle), _angle_to(positions, pitch, float(angle[-1]))
+    shift = float(positions(np.array([beside]))[0])
+    first = distortion(where, angle, principal_distance(where, angle))
+    moved = where - shift, angle - beside
     second = distortion(*moved, principal_distance(*moved))
     change = float(np.max(np.abs(second - first)))
     facts: dict[str, Any] = {
-        "turn": turn,
+        "angle": angle,
         "shift": shift,
         "change": change,
-        "undistorted": pitch * np.tan(turn[-1]) ** 2,
+        "undistorted": pitch * np.tan(angle[-1]) ** 2,
         "accuracy": ACCURACY_UM,
         "most": MM * pitch * 1e-6 * ACCURACY_UM / change,
     }
     return context.row("004.eq3.ignored", UM * change, **facts)
 
 
-def _solutions(context: Context, places: Callable[[Array], Array], edge: float) -> Iterator[CheckResult]:
+def _solutions(context: Context, positions: Callable[[Array], Array], edge: float) -> Iterator[CheckResult]:
     """Check eqs. (2), (3) and (4) against a singular value decomposition of eq. (1)."""
     # not even about the middle, so that no sum vanishes and an error in any of them shows
-    turn = edge * np.linspace(-1.0, 0.6, POINTS)
-    where, t = places(turn), np.tan(turn)
-    f, p = (float(v) for v in principal_distance_and_point(where, turn))
-    alone = float(principal_distance(where, turn))
-    known = float(principal_point(where, turn, alone))
+    angle = edge * np.linspace(-1.0, 0.6, POINTS)
+    where, t = positions(angle), np.tan(angle)
+    f, p = (float(v) for v in principal_distance_and_point(where, angle))
+    alone = float(principal_distance(where, angle))
+    known = float(principal_point(where, angle, alone))
     columns = np.column_stack([t, -(t**2)])
     both = np.linalg.lstsq(columns, where)[0]
     first = np.linalg.lstsq(columns[:, :1], where)[0]
@@ -597,7 +597,7 @@ def _solutions(context: Context, places: Callable[[Array], Array], edge: float) 
     }
     for name, (difference, values) in solutions.items():
         worst = UM * float(np.max(np.abs(difference)))
-        yield context.row(f"004.{name}.solution", worst, implied=0.0, turn=turn, values=values)
+        yield context.row(f"004.{name}.solution", worst, implied=0.0, angle=angle, values=values)
 
 
 GROUP = group_of("004.distortion", run)

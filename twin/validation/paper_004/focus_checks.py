@@ -67,14 +67,14 @@ def effects(bench: FocusBench, inclined: float = 1.0) -> Array:
     x = np.array([1.0, 0.0, 0.0]) - up[0] * up
     x /= np.linalg.norm(x)
     y = np.cross(up, x)
-    size_turn, size_shift = np.array(test.misset.rotate), np.array(test.misset.shift)
+    size_rotation, size_shift = np.array(test.misset.rotate), np.array(test.misset.shift)
     none = np.zeros(3)
-    steps = [(size * axis, none) for size, axis in zip(size_turn, (x, y, up), strict=True)]
+    steps = [(size * axis, none) for size, axis in zip(size_rotation, (x, y, up), strict=True)]
     steps += [(none, size * axis) for size, axis in zip(size_shift, (x, y, up), strict=True)]
     start = _parameters(bench, Pose(np.eye(3), none))
     out = []
-    for turn, shift in steps:
-        rotation = rotation_matrix(turn)
+    for vector, shift in steps:
+        rotation = rotation_matrix(vector)
         pose = Pose(rotation, centre - rotation @ centre + shift)
         out.append(_parameters(bench, pose) - start)
     return np.array(out)
@@ -82,8 +82,8 @@ def effects(bench: FocusBench, inclined: float = 1.0) -> Array:
 
 def _parameters(bench: FocusBench, pose: Pose) -> Array:
     defocus = np.array([site.defocus(pose, 0.0) for site in bench.sites])
-    places = np.array([site.place for site in bench.sites])
-    piston, slope_x, slope_y = np.linalg.lstsq(np.column_stack([np.ones(len(places)), places]), defocus)[0]
+    positions = np.array([site.place for site in bench.sites])
+    piston, slope_x, slope_y = np.linalg.lstsq(np.column_stack([np.ones(len(positions)), positions]), defocus)[0]
     # a rotation (a, b, c) lifts a point by a Y' - b X'
     return np.array([slope_y, -slope_x, line_rotation(pose), *pose.translation[:2], piston])
 
@@ -143,7 +143,7 @@ class Plan:
         return self.alignment.states[0].placement.pose @ Pose(self.motion.matrix, self.motion.shift)
 
     @property
-    def left(self) -> Array:
+    def residual(self) -> Array:
         """True defocus of the N sites after the planned motion, (N,), metres."""
         heights = self.alignment.states[0].placement.heights
         return np.array([site.defocus(self.moved, heights[site.band]) for site in self.alignment.bench.sites])
@@ -159,8 +159,8 @@ class Plan:
         axis = np.cross([0.0, 0.0, 1.0], normal)
         angle = np.arcsin(np.linalg.norm(axis))
         tilt = rotation_matrix(axis / np.linalg.norm(axis) * angle)
-        turn = rotation_matrix(np.array([0.0, 0.0, -alignment.states[0].true_level]))
-        moved = mount.holes @ (tilt @ turn).T + np.array([0.0, 0.0, piston])
+        rotation = rotation_matrix(np.array([0.0, 0.0, -alignment.states[0].true_level]))
+        moved = mount.holes @ (tilt @ rotation).T + np.array([0.0, 0.0, piston])
         return np.asarray((moved - mount.holes) @ mount.normal)
 
 
@@ -285,14 +285,14 @@ def _measured(
     more: dict[str, Any] = {"before": error[:, 0], "after": error[:, 1], "error": error, "span": span}
     yield context.row("004.alignment.defocus", UM_PER_M * rms(error), None, 0.0, **facts, **more)
     plans = [Plan(a) for a in alignments]
-    left = np.array([MM_PER_M * np.max(np.abs(p.left)) for p in plans])
+    residual = np.array([MM_PER_M * np.max(np.abs(p.residual)) for p in plans])
     moved = [(a, p.moved, a.states[0].placement.heights) for a, p in zip(alignments, plans, strict=True)]
-    more = {"left": _list(left, 4)}
-    yield context.row("004.alignment.plane", float(np.max(left)), inputs=[_chips(moved)], **facts, **more)
-    turns = np.array([abs(line_rotation(p.moved)) / ARCMIN for p in plans])
+    more = {"left": _list(residual, 4)}
+    yield context.row("004.alignment.plane", float(np.max(residual)), inputs=[_chips(moved)], **facts, **more)
+    rotations = np.array([abs(line_rotation(p.moved)) / ARCMIN for p in plans])
     begin = np.array([abs(a.states[0].true_level) / ARCMIN for a in alignments])
-    value = float(np.max(turns))
-    more = {"begin": _list(begin, 2), "turns": _list(turns, 2)}
+    value = float(np.max(rotations))
+    more = {"begin": _list(begin, 2), "rotations": _list(rotations, 2)}
     yield context.row("004.alignment.constraint", value, inputs=[_theodolite(alignments, value)], **facts, **more)
     asked, changes = (np.array(values) for values in ([p.asked for p in plans], [p.shims.change for p in plans]))
     alone = np.array([abs(p.shims.level_coupling) / ARCMIN for p in plans])
@@ -300,16 +300,16 @@ def _measured(
     yield context.row("004.alignment.shims", UM_PER_M * rms(changes - asked), None, 0.0, **facts, **more)
 
 
-def _chips(placed: Sequence[tuple[SimulatedFocus, Pose, Mapping[str, float]]]) -> Chosen:
+def _chips(poses: Sequence[tuple[SimulatedFocus, Pose, Mapping[str, float]]]) -> Chosen:
     """Return the glueing errors of the line CCDs, in millimetres, as an input that the paper does not print.
 
     The largest distance from best focus depends on them.
     """
     flat, as_glued = (
-        np.array([[s.defocus(pose, share * heights[s.band]) for s in a.bench.sites] for a, pose, heights in placed])
+        np.array([[s.defocus(pose, share * heights[s.band]) for s in a.bench.sites] for a, pose, heights in poses])
         for share in (0.0, 1.0)
     )
-    spread = placed[0][0].bench.setup.test.misset.chips
+    spread = poses[0][0].bench.setup.test.misset.chips
     return Chosen(
         "scatter of the glued chips", UM_PER_M * spread, "µm",
         lambda factor: float(MM_PER_M * np.max(np.abs(flat + factor * (as_glued - flat)))),
@@ -330,28 +330,28 @@ def _reached(context: Context, alignments: Sequence[SimulatedFocus], facts: Mapp
     """Check the final result of repeated measuring and shimming."""
     plan = alignments[0].bench.setup.test
     far = np.array([[MM_PER_M * np.max(np.abs(s.true_defocus)) for s in a.states] for a in alignments])
-    turns = np.array([[abs(s.true_level) / ARCMIN for s in a.states] for a in alignments])
+    rotations = np.array([[abs(s.true_level) / ARCMIN for s in a.states] for a in alignments])
     ends = [(a, a.states[-1].placement.pose, a.states[-1].placement.heights) for a in alignments]
     more: dict[str, Any] = {"before": _list(far[:, 0], 2), "after": _list(far[:, -1], 4)}
     value = float(np.max(far[:, -1]))
     yield context.row("004.alignment.confocal", value, inputs=[_chips(ends)], **facts, **more)
-    more = {"before": _list(turns[:, 0], 2), "after": _list(turns[:, -1], 2), "level": plan.level}
-    value = float(np.max(turns[:, -1]))
+    more = {"before": _list(rotations[:, 0], 2), "after": _list(rotations[:, -1], 2), "level": plan.level}
+    value = float(np.max(rotations[:, -1]))
     yield context.row("004.alignment.level", value, inputs=[_theodolite(alignments, value)], **facts, **more)
-    within_limits = (far <= CONFOCAL_MM) & (turns <= LINE_LEVEL_ARCMIN)
+    within_limits = (far <= CONFOCAL_MM) & (rotations <= LINE_LEVEL_ARCMIN)
     rounds = np.where(within_limits.any(axis=1), np.argmax(within_limits, axis=1), far.shape[1])
     more = {"none": np.sum(rounds == 0), "once": np.sum(rounds == 1), "step": plan.mount.step}
     more["again"] = [_second_round(a) for a in alignments]
     needed = float(np.max(rounds))
-    share = max(float(np.max(far[:, -1])) / CONFOCAL_MM, float(np.max(turns[:, -1])) / LINE_LEVEL_ARCMIN)
+    share = max(float(np.max(far[:, -1])) / CONFOCAL_MM, float(np.max(rotations[:, -1])) / LINE_LEVEL_ARCMIN)
     chosen = Chosen("what one round leaves, times", 1.0, "1", lambda k: needed if k * share <= 1.0 else needed + 1.0)
     yield context.row("004.alignment.rounds", needed, inputs=[chosen], **facts, **more)
-    context.figure("alignments", alignment_svg(far, turns, CONFOCAL_MM, LINE_LEVEL_ARCMIN))
+    context.figure("alignments", alignment_svg(far, rotations, CONFOCAL_MM, LINE_LEVEL_ARCMIN))
 
 
 @drawing("alignments-004", 3.6)
 def alignment_svg(
-    figure: Figure, far: NDArray[np.float64], turns: NDArray[np.float64], far_bound: float, turn_bound: float
+    figure: Figure, far: NDArray[np.float64], rotations: NDArray[np.float64], far_bound: float, rotation_bound: float
 ) -> None:
     """Draw the results of A alignments before and after, and those of the paper.
 
@@ -359,7 +359,7 @@ def alignment_svg(
     both (A, S).
     """
     labels = ("farthest CCD from best focus [mm]", "turn of the line [arcmin]")
-    panels = zip(figure.subplots(1, 2), (far, turns), (far_bound, turn_bound), labels, strict=True)
+    panels = zip(figure.subplots(1, 2), (far, rotations), (far_bound, rotation_bound), labels, strict=True)
     for axes, values, bound, label in panels:
         number = np.arange(1, len(values) + 1)
         axes.axhspan(1e-4, bound, color=LIGHT, alpha=0.6, lw=0)

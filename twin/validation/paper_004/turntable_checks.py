@@ -113,13 +113,13 @@ def _criterion(context: Context, series: Sequence[CalibrationSeries]) -> CheckRe
 def fit_table(spec: TurntableTestSpec, seed: int) -> FittedTable:
     """Calibrate a table, fit its dividing error with all five models, and test them at readings in between."""
     done = run_turntable(spec, seed, names=CLOSED_FORMS)
-    series, held = done.series, done.held_out
-    assert held is not None
+    series, excluded = done.series, done.held_out
+    assert excluded is not None
     residual_rms = {name: rms(done.held_out_residual(name)) for name in done.fits}
     try:
         # without its cross-validation, which takes ten times as long and chooses nothing here
         network = fit_dividing_error(series.angle, series.mean, series.sigma, NETWORK, seed)
-        residual_rms[NETWORK] = rms(held.mean - network(held.angle))
+        residual_rms[NETWORK] = rms(excluded.mean - network(excluded.angle))
     except NotConvergedError:
         pass
     return FittedTable(done.choice.chosen, {name: residual_rms.get(name, float("inf")) for name in FITS})
@@ -146,7 +146,7 @@ def _repeats(
             chosen = context.check(identifier).basis == "chosen"
             inputs = _readings(spec, seeds[:FAST_TABLES], identifier, value) if chosen else []
             explained = [REPEAT_RMS_ARCSEC / REPEATS**0.5] if name.endswith("mean") else []
-            more: dict[str, Any] = {"found": repeats, "quartiles": np.percentile(repeats, [25.0, 75.0])}
+            more: dict[str, Any] = {"simulated": repeats, "quartiles": np.percentile(repeats, [25.0, 75.0])}
             yield context.row(identifier, value, sigma, None, explained, inputs, **facts, **more)
 
 
@@ -165,10 +165,10 @@ def _readings(spec: TurntableTestSpec, seeds: NDArray[np.integer], identifier: s
     ):
         largest = [np.max(TurntableModel(changed, int(seed)).calibrate().rms_before) / ARCSEC for seed in seeds]
         # both errors go into the RMS in square
-        growth = (float(np.median(largest)) ** 2 - value**2) / (FURTHER**2 - 1.0)
+        increase = (float(np.median(largest)) ** 2 - value**2) / (FURTHER**2 - 1.0)
 
-        def response(factor: float, growth: float = growth) -> float:
-            return float(np.sqrt(max(value**2 + (factor**2 - 1.0) * growth, 0.0)))
+        def response(factor: float, increase: float = increase) -> float:
+            return float(np.sqrt(max(value**2 + (factor**2 - 1.0) * increase, 0.0)))
 
         out.append(Chosen(name, size, "arcsec", response))
     return out
@@ -194,7 +194,7 @@ def dividing(value: float, power: float = 1.0) -> Chosen:
 
 
 def _ranks(tables: Sequence[FittedTable]) -> dict[str, Array]:
-    """Return fit -> its rank on each turntable, 1 for the smallest error."""
+    """Return the rank of each fit on each turntable, 1 for the smallest error."""
     return {
         name: np.array([1.0 + sum(v < t.held_out[name] for v in t.held_out.values()) for t in tables]) for name in FITS
     }

@@ -35,7 +35,7 @@ The second gives the exponent with which the result depends on this error.
 """
 ERRORS = (0.35, 0.7, 1.4)
 """Standard deviations of the attitude, arcsec, for which both methods are simulated to find the limit."""
-STATED = 0.5
+PRINTED = 0.5
 STRIPS, FAST_STRIPS = 5, 3
 TIES, CHECKS = 800, 150
 _FIXED = CameraChangeSpec.model_validate({"lasting": {"angles": 3 * ["0.002 arcsec"], "principal_distance": "0.1 um"}})
@@ -106,9 +106,9 @@ def limit(height_ratios: np.ndarray) -> float:
     ``height_ratios`` (3,) are the ratios of bundle to intersection at `ERRORS`; their logarithms are nearly a parabola
     in the logarithm of the error.
     """
-    place, value = np.log(ERRORS), np.log(height_ratios)
+    logarithm, value = np.log(ERRORS), np.log(height_ratios)
     fine = np.linspace(np.log(0.05), np.log(5.0), 2001)
-    curve = np.polyval(np.polyfit(place, value, 2), fine)
+    curve = np.polyval(np.polyfit(logarithm, value, 2), fine)
     return float(np.exp(fine[np.argmin(np.abs(curve))]))
 
 
@@ -124,7 +124,7 @@ def run(context: Context) -> Iterator[CheckResult]:
     fine = limit(ratios(FINE, stream(root, 0)))
     limits = np.array([limit(ratio_row) for ratio_row in ratio_list])
     measured, sigma = mean_of(limits)
-    at = np.log(STATED)
+    at = np.log(PRINTED)
     factor = float(np.exp(np.mean([np.interp(at, np.log(ERRORS), np.log(ratio_row)) for ratio_row in ratio_list])))
     drawn = draw_block(strip(IMAGE, 0.01), stream(root, count))
     # between the two the limit goes with a power of the image points' error
@@ -133,7 +133,7 @@ def run(context: Context) -> Iterator[CheckResult]:
         "floor": height_error(drawn, True),
         "factor": factor,
         "finer": fine,
-        "needed": IMAGE * (STATED / measured) ** (1.0 / power),
+        "needed": IMAGE * (PRINTED / measured) ** (1.0 / power),
         "strips": count,
         "ties": TIES,
         "errors": [f"{error:g}″" for error in ERRORS],

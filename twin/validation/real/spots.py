@@ -157,7 +157,7 @@ def _gaussian(lights: Sequence[Light], noise: NoiseModel) -> tuple[float, int]:
 
 
 def _groups(lights: Sequence[Light]) -> dict[str, list[Light]]:
-    """Return kind -> lights that were taken at the same times."""
+    """Return the lights of each kind that were recorded at the same times."""
     out: dict[str, list[Light]] = {}
     for light in lights:
         same = out.setdefault(light.windows.kind, [])
