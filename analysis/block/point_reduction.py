@@ -662,7 +662,8 @@ class Reduction:
             True to multiply the equations by the square roots of their weights.
         """
         for piece in self.pieces:
-            parts, used = self._linearised(piece, state), {}
+            parts = self._linearised(piece, state)
+            used: dict[int, int] = {}
             if weighted:
                 for k, (which, *equations) in parts.items():
                     root = np.sqrt(state.weight[k][which] / state.factor.get(self.sets[k].group, 1.0))
@@ -683,18 +684,18 @@ class Reduction:
                 yield rows
 
     @cached_property
-    def _last(self) -> list[tuple[Array, Array, dict[int, tuple[Array, ...]]]]:
+    def _last(self) -> list[tuple[Array, Array, dict[int, tuple[Any, ...]]]]:
         """Unknowns and points of the last linearisation, and its equations, of measurements that make one piece."""
         return []
 
-    def _linearised(self, piece: Sequence[Bundle], state: State) -> dict[int, tuple[Array, ...]]:
+    def _linearised(self, piece: Sequence[Bundle], state: State) -> dict[int, tuple[Any, ...]]:
         """Return indices of measurements, misclosures and derivatives by unknowns and points, of each set of a piece.
 
         Normal equations, steps of the points and residuals need the same ones, which are kept where they are few.
         """
-        for x, ground, parts in self._last:
+        for x, ground, kept in self._last:
             if x is state.x and ground is state.ground:
-                return dict(parts)
+                return dict(kept)
         selected: dict[int, list[Indices]] = {}
         for bundle in piece:
             for k, which in bundle.members:
