@@ -162,7 +162,7 @@ def test_what_is_wrong_with_a_course_is_told_at_its_first_time(prepared) -> None
     full, dim = _warnings(prepared, course, saturated, share)
     assert "saturated pixels in the spot forward/left at 2 times, first at 1 min" in full
     assert "backward/right at 2 min: only 49% of the nominal light" in dim
-    bent = SimpleNamespace(holds=np.array([True, True, False]), beyond=np.array([False, True, True]))
+    bent = SimpleNamespace(valid=np.array([True, True, False]), beyond=np.array([False, True, True]))
     evidence = SimpleNamespace(course_doubt=lambda times, spots: f"{spots[0]} at {times[1]}")
     parts = {"smoothed": None, "times": np.array(course.times), "curvature": {"model": bent}, "evidence": evidence}
     first, lost, again = TimeSeries.doubts(SimpleNamespace(**parts), ["a"])

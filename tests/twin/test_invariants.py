@@ -98,7 +98,7 @@ def test_image_quality_that_cannot_be_is_none(backend, gf7_pair, monkeypatch) ->
     monkeypatch.undo()
     bench = quality._CameraBench(gf7_pair, "forward", backend, (0.0,), None)
     good = np.array([[0.1], [0.05], [0.04], [1e-6], [0.3], [0.3]])
-    bench._hold(good, np.zeros(1), None)
+    bench._require_possible(good, np.zeros(1), None)
     for row, value, said in (
         (1, 7.9e11, "a wavefront error of camera forward in waves: 7.9e"),
         (2, 0.06, "at best focus: 0.06"),
@@ -108,8 +108,8 @@ def test_image_quality_that_cannot_be_is_none(backend, gf7_pair, monkeypatch) ->
         wrong = good.copy()
         wrong[row] = value
         with pytest.raises(UnphysicalError, match=said):
-            bench._hold(wrong, np.zeros(1), None)
+            bench._require_possible(wrong, np.zeros(1), None)
     # of a beam that is all but dark nothing is told, and nothing held
     dark = good.copy()
     dark[[1, 0]] = [[7.9e11], [0.999]]
-    bench._hold(dark, np.zeros(1), None)
+    bench._require_possible(dark, np.zeros(1), None)
