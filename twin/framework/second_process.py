@@ -12,11 +12,13 @@ import gc
 import os
 import pickle
 import signal
+import tempfile
 import threading
 from collections.abc import Callable, Collection, Mapping
 from concurrent.futures import Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from multiprocessing import active_children, connection, get_context, parent_process
+from pathlib import Path
 from typing import Any
 
 from optics.numerics.backend import cores
@@ -44,6 +46,7 @@ class SecondProcess:
         self._tasks: dict[str, Callable[[], Any]] = {}
         self._sent: dict[str, Future[Any]] = {}
         self._apart: set[str] = set()
+        self._files: list[Path] = []
 
     def __enter__(self) -> SecondProcess:
         alone = threading.current_thread() is threading.main_thread()
@@ -59,6 +62,8 @@ class SecondProcess:
             self._child.kill()
             self._pool.shutdown(cancel_futures=True)
             self._child.close()
+        for file in self._files:
+            file.unlink(missing_ok=True)
 
     def __contains__(self, name: str) -> bool:
         """Return True if a task of that name has been started."""
@@ -82,8 +87,11 @@ class SecondProcess:
         if self._pool is None:
             return
         try:
-            # all in one piece, since they have large values in common
-            self._pool.submit(_keep, pickle.dumps(dict(tasks), pickle.HIGHEST_PROTOCOL))
+            # all in one piece, since they have large values in common; a file, since the pool would copy them twice
+            with tempfile.NamedTemporaryFile(prefix="camtwin-tasks-", delete=False) as file:
+                self._files.append(Path(file.name))
+                pickle.dump(dict(tasks), file, pickle.HIGHEST_PROTOCOL)
+            self._pool.submit(_keep, file.name)
             for name in sorted(tasks, key=lambda name: name not in apart):
                 self._sent[name] = self._pool.submit(_do, name)
         except (pickle.PicklingError, TypeError, AttributeError, BrokenProcessPool):
@@ -127,9 +135,11 @@ def _end_with_the_first() -> None:
     os._exit(0)
 
 
-def _keep(tasks: bytes) -> None:
-    """Store pickled tasks in the second process."""
-    _TASKS.update(pickle.loads(tasks))
+def _keep(path: str) -> None:
+    """Store tasks that were pickled to a file in the second process, and delete the file."""
+    with open(path, "rb") as file:
+        os.unlink(path)
+        _TASKS.update(pickle.load(file))
 
 
 def _do(name: str) -> Any:

@@ -38,7 +38,7 @@ from scenes.yaml.errors import Problem, unknown
 from scenes.yaml.spec import Spec
 from twin.framework.frame_store import allocate_frames, largest_of, release_memory
 from twin.framework.random_streams import stream
-from twin.sensors.poisson_numbers import poisson_pieces
+from twin.sensors.poisson_numbers import DRAWING_BYTES, poisson_pieces
 
 
 class NoiseTerm(FurtherNoise, Protocol):
@@ -449,7 +449,7 @@ class EmvaDetector:
             Number of threads that expose.
         """
         # electrons, read noise, and electrons as they were collected for noise that depends on them
-        return threads * pixels * self.frames_at_once(frames, pixels) * 24
+        return threads * (pixels * self.frames_at_once(frames, pixels) * 24 + DRAWING_BYTES)
 
     def _read_out(self, level: np.ndarray, shift: np.ndarray, each: Sequence[np.random.Generator]) -> np.ndarray:
         """Return grey values of frames (N, H, W) from their electrons ``level``; the array is overwritten.

@@ -61,6 +61,8 @@ _ROOM = 1 << 17
 
 With fewer, the function calls take as long as the work.
 """
+DRAWING_BYTES = 128 * _ROOM
+"""Temporary memory of a thread that draws numbers, in bytes, in addition to the piece that it returns (measured)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,12 +130,14 @@ def poisson_pieces(mean: np.ndarray, count: int, rng: np.random.Generator, toget
         Whole numbers as float64.
     """
     flat = np.ascontiguousarray(mean, dtype=np.float64).reshape(-1)
-    plan, huge = _Plan.of(flat), np.flatnonzero(flat >= SERIES_END)
+    parts = [slice(start, start + _ROOM) for start in range(0, flat.size, _ROOM)]
+    plans, huge = [_Plan.of(flat[part]) for part in parts], np.flatnonzero(flat >= SERIES_END)
     words, second = _split_stream(rng, flat[huge], count, flat.size, together)
     for first in range(0, count, together):
         out = np.empty((min(together, count - first), flat.size))
         for start, end in _steps(0, len(out), flat.size):
-            plan.fill(out[start:end], _words_of(words, end - start, flat.size))
+            for part, plan in zip(parts, plans, strict=True):  # more than one only if each step is a single draw
+                plan.fill(out[start:end, part], _words_of(words, end - start, plan.mean.size))
         if huge.size:
             out[:, huge] = second.poisson(flat[huge], (len(out), huge.size))
         yield out.reshape(len(out), *np.shape(mean))
