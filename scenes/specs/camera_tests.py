@@ -486,8 +486,8 @@ class FocusTestSpec(CameraUnderTestSpec):
     @model_validator(mode="after")
     def _scan_has_steps(self) -> FocusTestSpec:
         if 2.0 * self.scan.reach < 5.0 * self.scan.step:
-            found = f"{format_quantity(self.scan.step, LENGTH)} over +-{format_quantity(self.scan.reach, LENGTH)}"
-            raise Problem("fewer than six positions through focus", found, "a smaller step", within=("scan", "step"))
+            value = f"{format_quantity(self.scan.step, LENGTH)} over +-{format_quantity(self.scan.reach, LENGTH)}"
+            raise Problem("fewer than six positions through focus", value, "a smaller step", within=("scan", "step"))
         if len(set(self.fields)) < len(self.fields):
             raise Problem("a field is given twice", str(list(self.fields)), "different fields", within=("fields",))
         return self
@@ -739,8 +739,8 @@ class MeasuredFocusSpec(TitledSpec):
     @model_validator(mode="after")
     def _shim_for_each_hole(self) -> MeasuredFocusSpec:
         if self.shims is not None and len(self.shims) != len(self.mount.holes):
-            found, allowed = f"{len(self.shims)} of them", f"{len(self.mount.holes)}, one for each hole"
-            raise Problem("the number of shims differs from the number of holes", found, allowed, within=("shims",))
+            value, allowed = f"{len(self.shims)} of them", f"{len(self.mount.holes)}, one for each hole"
+            raise Problem("the number of shims differs from the number of holes", value, allowed, within=("shims",))
         return self
 
 
@@ -786,8 +786,8 @@ class LensSpec(Spec):
         for name in ("front_radius", "back_radius"):
             radius = getattr(self, name)
             if 2.0 * abs(radius) <= self.diameter:
-                found, allowed = format_quantity(radius, LENGTH), "a length above half the diameter in size"
-                raise Problem("the surface is too strongly curved for its diameter", found, allowed, within=(name,))
+                value, allowed = format_quantity(radius, LENGTH), "a length above half the diameter in size"
+                raise Problem("the surface is too strongly curved for its diameter", value, allowed, within=(name,))
         return self
 
 

@@ -367,7 +367,7 @@ def resolve_operation(spec: OperationSpec) -> OperationSetup:
         reference = getattr(spec, key)
         if reference == NONE:
             problem, allowed = "a plan of operation needs disturbances", "the name of a file of disturbances"
-            raise spec.error(problem, (key,), found=reference, allowed=allowed)
+            raise spec.error(problem, (key,), value=reference, allowed=allowed)
         update[key] = portable_reference(folder, reference, spec, (key,), others)
     spec = spec.model_copy(update=update)
     setup = OperationSetup.model_construct(operation=spec, model=resolve_on(spec, spec.instrument, spec.disturbances))
@@ -505,7 +505,7 @@ def _is_measured(kind: str, columns: ReadingColumnSpec, where: tuple[str, ...]) 
     try:
         value, sigma = value_kinds(kind, where[-1])
     except Problem as problem:
-        raise Problem(problem.problem, problem.found, problem.allowed, within=where) from None
+        raise Problem(problem.problem, problem.value, problem.allowed, within=where) from None
     count = {QUATERNION: 4}.get(columns.unit, 3) if kind == "attitude" else 1
     if len(columns.column) != count:
         text = f"{len(columns.column)} columns for one {kind}"

@@ -297,9 +297,9 @@ def light_mtf_figure(run: CameraRun) -> Figure:
             um, um, np.sqrt(np.maximum(psf.values, 0.0)), cmap="YlGnBu", shading="nearest", rasterized=True
         )
         # up to a thousandth of the peak
-        lit = np.abs(um)[np.max(psf.values, axis=0) + np.max(psf.values, axis=1) > 1e-3 * np.max(psf.values)]
-        lower.set_xlim(-np.max(lit), np.max(lit))
-        lower.set_ylim(-np.max(lit), np.max(lit))
+        illuminated = np.abs(um)[np.max(psf.values, axis=0) + np.max(psf.values, axis=1) > 1e-3 * np.max(psf.values)]
+        lower.set_xlim(-np.max(illuminated), np.max(illuminated))
+        lower.set_ylim(-np.max(illuminated), np.max(illuminated))
         lower.set_aspect("equal")
         lower.set_title(f"Strehl {psf.strehl:.2f}", fontsize=8.0)
         lower.set_xlabel(MICRO)

@@ -563,8 +563,8 @@ def _on_new_shims(pose: Pose, plan: plane_fit.ShimPlan, mount: plane_fit.Mount, 
     Its rotation in the mounting surface is set with an error of ``setting`` radians.
     """
     achieved = plan.achieved
-    turned = rotation_matrix(setting * mount.normal) @ achieved.matrix
-    return pose @ Pose(turned, achieved.shift)
+    rotated = rotation_matrix(setting * mount.normal) @ achieved.matrix
+    return pose @ Pose(rotated, achieved.shift)
 
 
 def _holes(values: Iterable[Any]) -> dict[str, Any]:

@@ -212,7 +212,7 @@ def checked_knob(name: str, value: float, knobs: Mapping[str, Knob]) -> Knob:
         raise InputError(unknown("no such knob", name, knobs).at())
     if not abs(value) <= knob.limit:
         found, allowed = f"{value:g} {knob.unit}".strip(), f"up to {knob.limit:g} {knob.unit}".strip()
-        raise InputError(Issue(f"{name} is too large", found=found, allowed=allowed))
+        raise InputError(Issue(f"{name} is too large", value=found, allowed=allowed))
     return knob
 
 

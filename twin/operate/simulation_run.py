@@ -125,8 +125,8 @@ def _require_name(option: str, name: str, names: Collection[str]) -> None:
 class _Options:
     """Source of error messages about too little memory, which refer to the command-line options."""
 
-    def error(self, problem: str, key: KeyPath, *, found: object, allowed: str) -> InputErrorText:
-        return InputErrorText(f"{key[0]}: {problem}; {found} readings, allowed: {allowed}")
+    def error(self, problem: str, key: KeyPath, *, value: object, allowed: str) -> InputErrorText:
+        return InputErrorText(f"{key[0]}: {problem}; {value} readings, allowed: {allowed}")
 
 
 def simulate_into(

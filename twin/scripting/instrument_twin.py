@@ -732,4 +732,4 @@ def _motion_named(text: str, nodes: Mapping[str, NodeInfo]) -> ElementaryMotion:
 
 def _wrong(problem: str, value: str, allowed: str, suggestion: str | None = None) -> InputError:
     """Return an error about a motion's text, with what is allowed and the nearest valid name as suggestion."""
-    return InputError(Issue(problem, found=repr(value), allowed=allowed, suggestion=suggestion))
+    return InputError(Issue(problem, value=repr(value), allowed=allowed, suggestion=suggestion))

@@ -345,7 +345,7 @@ def check_targets(resolved: ResolvedJob) -> None:
         raise job.error(
             "the frames of the test targets do not fit into memory",
             ("render", "targets", "frames"),
-            found=str(settings.frames),
+            value=str(settings.frames),
             allowed=f"at most {LARGEST_FRAMES // each} with regions of {settings.region} pixels",
         )
     for key, mounted in resolved.instrument.cameras.items():
@@ -356,7 +356,7 @@ def check_targets(resolved: ResolvedJob) -> None:
             raise job.error(
                 f"the images of targets do not fit the line CCD {name} of camera {mounted.camera!r}",
                 ("render", "targets", "region"),
-                found=f"{settings.region} pixels on a line of {pixels}",
+                value=f"{settings.region} pixels on a line of {pixels}",
                 allowed="a smaller region or a longer line",
             )
 

@@ -380,7 +380,7 @@ def run_uncertainty(
         raise InputError(
             Issue(
                 "no disturbance of the prior changes a camera, so that there is nothing to measure",
-                found=str(resolved.disturbances.name),
+                value=str(resolved.disturbances.name),
                 allowed="disturbances of cameras, their mirrors or focal planes",
             )
         )

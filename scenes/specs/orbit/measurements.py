@@ -505,9 +505,9 @@ class MeasuredTestSpec(FixedTestSpec):
         if isinstance(value, Mapping):
             here = [key for key in ("conventions", "passes") if value.get(key) is not None]
             if ("data" in value) == bool(here) or len(here) == 1:
-                found = names_text([*(["data"] if "data" in value else []), *here]) or "none of them"
+                actual = names_text([*(["data"] if "data" in value else []), *here]) or "none of them"
                 allowed = "`data: DIR`, or `conventions:` and `passes:`"
-                raise Problem("the measurements must be given in exactly one way", found, allowed, within=("data",))
+                raise Problem("the measurements must be given in exactly one way", actual, allowed, within=("data",))
         return value
 
 

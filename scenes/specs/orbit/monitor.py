@@ -410,8 +410,8 @@ class OrbitMonitorSpec(TitledSpec):
     @model_validator(mode="after")
     def _times_fit(self) -> "OrbitMonitorSpec":
         if self.cameras is not None and (len(self.cameras) != 2 or len(set(self.cameras)) != 2):
-            found = ", ".join(self.cameras) or "none"
-            raise Problem("not a pair of cameras", found, "two different cameras", within=("cameras",))
+            value = ", ".join(self.cameras) or "none"
+            raise Problem("not a pair of cameras", value, "two different cameras", within=("cameras",))
         self._require_keys()
         if self.course is not None:
             self._check_course(self.course)
@@ -447,9 +447,9 @@ class OrbitMonitorSpec(TitledSpec):
             problem = "a perturbation needs a course: random motions start from the nominal instrument"
             raise Problem(problem, None, "perturb with a course", within=("perturb",))
         if (self.course is None) is (loop.readings is None):
-            found = "neither" if loop.readings is None else "both"
+            value = "neither" if loop.readings is None else "both"
             allowed = "readings: {every: 4 min, count: 25}, or the file's course"
-            raise Problem("the readings' times must be given once", found, allowed, within=("mechanisms",))
+            raise Problem("the readings' times must be given once", value, allowed, within=("mechanisms",))
 
     def _check_course(self, course: CourseSpec) -> None:
         """Raise `Problem` unless the times are evenly spaced and all motions are in the test's `motion`."""
@@ -460,8 +460,8 @@ class OrbitMonitorSpec(TitledSpec):
         steps = [b - a for a, b in pairwise(course.times)]
         for k, step in enumerate(steps):
             if abs(step - steps[0]) > _EVEN:
-                found = f"{moment(course.times[k])} to {moment(course.times[k + 1])} after steps of {moment(steps[0])}"
-                raise Problem("the times are not evenly spaced", found, "equal steps", None, ("course", "times", k + 1))
+                value = f"{moment(course.times[k])} to {moment(course.times[k + 1])} after steps of {moment(steps[0])}"
+                raise Problem("the times are not evenly spaced", value, "equal steps", None, ("course", "times", k + 1))
 
     def _check_interval(self, interval: float, key: KeyPath) -> None:
         """Raise `Problem` unless the interval is a multiple of the step and not longer than the course."""

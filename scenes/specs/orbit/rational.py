@@ -149,14 +149,14 @@ class RationalAdjustSpec(RationalTestSpec):
     def _passes_fit(self) -> None:
         """Raise Problem for images of a pass that are not there, that another pass has, or that lack a shared term."""
         taken: set[str] = set()
-        for name, one in self.passes.items():
-            for k, image in enumerate(one.images):
+        for name, group in self.passes.items():
+            for k, image in enumerate(group.images):
                 where = ("passes", name, "images", k)
                 if image not in self.images:
                     raise unknown("no such image in the block", image, tuple(self.images), where)
                 if image in taken:
                     raise Problem("an image of two passes", image, "each image in one pass, once", within=where)
-                lacking = one.errors.sigma.keys() - (self.images[image].errors or self.errors).sigma.keys()
+                lacking = group.errors.sigma.keys() - (self.images[image].errors or self.errors).sigma.keys()
                 if lacking:
                     term = sorted(lacking)[0]
                     raise Problem(f"{image} has no {term} of its own", None, f"`{term}` in its errors", within=where)

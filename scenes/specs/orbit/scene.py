@@ -103,8 +103,8 @@ class LineImageSpec(Spec):
     def _spectrum_rises(self) -> "LineImageSpec":
         first, last = self.spectrum
         if not first < last:
-            found = f"[{format_quantity(first, LENGTH)}, {format_quantity(last, LENGTH)}]"
-            raise Problem("the spectrum is empty", found, "[shortest, longest]", within=("spectrum",))
+            value = f"[{format_quantity(first, LENGTH)}, {format_quantity(last, LENGTH)}]"
+            raise Problem("the spectrum is empty", value, "[shortest, longest]", within=("spectrum",))
         return self
 
 

@@ -197,11 +197,11 @@ def _image(spec: LineImageFileSpec, name: str, sensor: Sensor, folder: Path, cou
         allowed = (
             f"{sensor.camera.pixels} pixels of {name}; `first_pixel` of the image's first column, and its `window`"
         )
-        raise spec.error("an image wider than its line", ("first_pixel",), found=found, allowed=allowed)
+        raise spec.error("an image wider than its line", ("first_pixel",), value=found, allowed=allowed)
     if first_line + rows > sensor.lines + 1:
         found = f"lines to {first_line + rows - 1}"
         allowed = f"lines to {sensor.lines - 1}, of which the table has times; or a `window`"
-        raise spec.error("an image longer than its line times", ("first_line",), found=found, allowed=allowed)
+        raise spec.error("an image longer than its line times", ("first_line",), value=found, allowed=allowed)
     return LineFrame(frame, Window(first_line, first_pixel, rows, columns), sensor, (1.0, 1.0))
 
 

@@ -133,7 +133,7 @@ def run_rational_match(setup: RationalMatchSetup, advance: Advance = silent) -> 
         try:
             grid = surface(images, spec.heights, spec.surface, advance)
         except CRSError as error:
-            raise spec.surface.error("not a coordinate reference system", ("crs",), found=spec.surface.crs) from error
+            raise spec.surface.error("not a coordinate reference system", ("crs",), value=spec.surface.crs) from error
     return RationalMatch(setup, FrozenMap(points), grid)
 
 

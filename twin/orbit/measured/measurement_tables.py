@@ -138,7 +138,7 @@ def read_pass(
     if len(images) < 2:
         found = f"of {names_text(tuple(images)) or 'none'}"
         allowed = "image points of two line cameras or more"
-        raise InputError(Issue("too few line cameras", pixels.file, found=found, allowed=allowed))
+        raise InputError(Issue("too few line cameras", pixels.file, value=found, allowed=allowed))
     return PassMeasurements(name, platform, {line: times[line] for line in images}, ground, images)
 
 
@@ -571,7 +571,7 @@ def platform_of(epoch: str, orbit: Table, attitude: Table, conventions: measurem
         missing = [name for name in ("vx", "vy", "vz") if name not in orbit]
         if missing:
             raise InputError(
-                Issue(f"no column {missing[0]!r}", orbit.file, found=names_text(columns), allowed="all three or none")
+                Issue(f"no column {missing[0]!r}", orbit.file, value=names_text(columns), allowed="all three or none")
             )
         speed = orbit.stacked("vx", "vy", "vz")[order]
         _check_velocity(orbit, order, time, position, speed)

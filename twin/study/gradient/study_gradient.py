@@ -805,5 +805,5 @@ def _refused(setup: StudySetup, factor: GradientFactor, step: float, error: Inpu
     issue = error.issues[0]
     at = f"{factor.value:g} ± {abs(step):g} {factor.unit}".strip()
     text = f"the base does not allow values beside its own, {at}, which finite differences need: {issue.problem}"
-    problem = Problem(text, issue.found, issue.allowed, issue.suggestion)
+    problem = Problem(text, issue.value, issue.allowed, issue.suggestion)
     return setup.error(problem, ("factors", factor.name, factor.spec.kind))

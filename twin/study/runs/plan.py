@@ -433,7 +433,7 @@ class Plan:
             validate(self.setup.job.model, YamlFile("", tree, {}))
         except InputError as error:
             factor, issue = self.setup.study.factors[name], error.issues[0]
-            problem = Problem(issue.problem, issue.found, issue.allowed, issue.suggestion)
+            problem = Problem(issue.problem, issue.value, issue.allowed, issue.suggestion)
             raise self.setup.error(problem, ("factors", name, factor.kind)) from None
 
 

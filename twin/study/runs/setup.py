@@ -92,7 +92,7 @@ class StudySetup:
         """Return an InputError whose position is ``key`` in the study's file."""
         if isinstance(problem, str):
             return self.study.error(problem, key, allowed=allowed)
-        issue = Issue(problem.problem, "", None, (), problem.found, problem.allowed, problem.suggestion)
+        issue = Issue(problem.problem, "", None, (), problem.value, problem.allowed, problem.suggestion)
         return InputError(self._placed(issue, (*key, *problem.within)))
 
     def _placed(self, issue: Issue, key: KeyPath) -> Issue:
@@ -321,7 +321,7 @@ def _read_table(study: StudySpec, path: Path, key: KeyPath, named: Mapping[str, 
         if heads and (missing := [column for column in named if column not in heads]):
             text, allowed, meant = "no such column", names_text(heads), nearest(missing[0], heads)
             key_path = (*named[missing[0]], "column")
-            raise study.error(text, key_path, found=missing[0], allowed=allowed, suggestion=meant)
+            raise study.error(text, key_path, value=missing[0], allowed=allowed, suggestion=meant)
         checked(1, heads)
         # of columns of one name the last
         column_of = {head: k for k, head in enumerate(heads) if head in named}
