@@ -310,7 +310,7 @@ def _entry(edge: Edge) -> dict[str, Any]:
         case _:
             out["half"] = metres(shape.half_x, shape.half_y)
     if edge.rotation and not isinstance(shape, Circle | Polygon):
-        out["turn"] = written(remainder(edge.rotation, 2.0 * pi), ANGLE)
+        out["rotation"] = written(remainder(edge.rotation, 2.0 * pi), ANGLE)
     return out
 
 

@@ -264,7 +264,7 @@ def test_edges_take_the_share_of_their_area(backend, cut, bare) -> None:
         ("{clear: circle, radius: 1 m, inner: 75 mm}", 0.25),
         ("{clear: rectangle, half: [1 m, 1 m], centre: [1 m, 0 m]}", 0.5),
         ("{blocks: polygon, corners: [[0 m, 0 m], [1 m, 0 m], [0 m, 1 m]]}", 0.25),
-        ("{clear: ellipse, half: [150 mm, 75 mm], turn: 30 deg}", 0.5),
+        ("{clear: ellipse, half: [150 mm, 75 mm], rotation: 30 deg}", 0.5),
         ("{blocks: circle, radius: 75 mm}, {clear: rectangle, half: [1 m, 1 m], centre: [1 m, 0 m]}", 0.625),
     ):
         optics = CameraOptics.alone(with_edges(text), backend)

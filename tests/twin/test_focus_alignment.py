@@ -49,7 +49,7 @@ def reduced() -> FocusSetup:
     camera = setup.camera.model_copy(
         update={"bands": FrozenMap({name: setup.camera.bands[name] for name in ("P", "B4")})}
     )
-    scan = setup.test.scan.model_copy(update={"reach": 0.5e-3, "step": 0.12e-3, "points": 7})
+    scan = setup.test.scan.model_copy(update={"half_range": 0.5e-3, "step": 0.12e-3, "points": 7})
     test = setup.test.model_copy(update={"fields": (-0.9, 0.0, 0.9), "scan": scan})
     return setup.model_copy(update={"camera": camera, "test": test})
 
@@ -240,7 +240,7 @@ def scanned(best, search, misled=0.0, seen=lambda mtf: (mtf, SIGMA)):
         mtf = abs(through_focus(shift + misled * (take < 1000), best))
         return *seen(mtf), np.zeros((1, 1, 1), np.uint16), "too dark"
 
-    plan = SimpleNamespace(depth=0.6, points=9, step=20.0, reach=400.0)
+    plan = SimpleNamespace(depth=0.6, points=9, step=20.0, half_range=400.0)
     site = SimpleNamespace(band="P", field=0.5, nominal_per_shift=dict.fromkeys(DIRECTIONS, 1.0))
     bench = SimpleNamespace(setup=SimpleNamespace(test=SimpleNamespace(scan=plan)), sites=[site])
     bench.geometric_zero = lambda band: 145.0

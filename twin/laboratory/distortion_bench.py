@@ -335,7 +335,7 @@ class DistortionBench:
         ccd = LineCcd.from_specs(band, setup.detectors[band.detector])
         _check_pinhole(setup, camera.model.line_principal_distance)
         half_length = 0.5 * band.pixels * band.pitch
-        edge = np.arctan(test.reach * half_length / camera.model.line_principal_distance)
+        edge = np.arctan(test.extent * half_length / camera.model.line_principal_distance)
         field_angle = edge * np.linspace(-1.0, 1.0, test.points)
         _check_table(setup, field_angle)
         try:
@@ -422,9 +422,9 @@ class DistortionBench:
         column = first[..., 0]
         if np.min(column) < 0 or np.max(column) + test.window > self.ccd.band.pixels:
             overshoot = 0.5 * test.window + np.max(np.abs(position[..., 0])) / pitch - 0.5 * self.ccd.band.pixels
-            most = test.reach - 2.0 * max(overshoot, 0.0) / self.ccd.band.pixels
+            most = test.extent - 2.0 * max(overshoot, 0.0) / self.ccd.band.pixels
             allowed = f"at most about {most:.4f} for this zero of the table"
-            raise BenchError("the first or last spot falls beside the line", ("reach",), allowed)
+            raise BenchError("the first or last spot falls beside the line", ("extent",), allowed)
         inside = (spot - first) * pitch
         light = np.stack([self.images(w, at) for w, at in zip(self.field_angle, inside, strict=True)])
         # far tails of the Fourier sum may ring below zero by rounding
@@ -486,6 +486,6 @@ def _check_table(setup: DistortionSetup, field_angle: np.ndarray) -> None:
         raise BenchError(
             f"the camera's field requires +-{np.rad2deg(field_angle[-1]):.3f} deg of the turntable, but about its "
             f"camera_angle only +-{np.rad2deg(max(margin, 0.0)):.3f} deg are calibrated",
-            ("reach",),
-            "a smaller reach, or a turntable file that is calibrated over the field",
+            ("extent",),
+            "a smaller extent, or a turntable file that is calibrated over the field",
         )

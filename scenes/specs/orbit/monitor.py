@@ -263,20 +263,20 @@ class ReadingsSpec(Spec):
     ----------
     begin : float
         Time of the first reading from the orbit's epoch, in seconds.
-    every : float
+    interval : float
         Interval between readings, in seconds.
     count : int
         Number of readings.
     """
 
     begin: Moment = 0.0
-    every: Interval
+    interval: Interval
     count: Annotated[Whole, Field(ge=2, le=1000)]
 
     @property
     def times(self) -> tuple[float, ...]:
         """Times of the readings from the orbit's epoch, in seconds."""
-        return tuple(self.begin + self.every * k for k in range(self.count))
+        return tuple(self.begin + self.interval * k for k in range(self.count))
 
 
 class LoopImagesSpec(Spec):
@@ -297,7 +297,7 @@ class LoopImagesSpec(Spec):
     times: Annotated[tuple[Moment, ...], Field(min_length=1, max_length=20)]
     side: Annotated[Side, Field(le=2000)] = 400
     ground: SceneGroundSpec = SceneGroundSpec()
-    points: ImagePointsSpec = ImagePointsSpec.model_validate({"control": 0, "tie": 60, "reach": 16})
+    points: ImagePointsSpec = ImagePointsSpec.model_validate({"control": 0, "tie": 60, "search_radius": 16})
 
     @model_validator(mode="after")
     def _has_ties(self) -> "LoopImagesSpec":
@@ -421,7 +421,7 @@ class OrbitMonitorSpec(TitledSpec):
         if self.mechanisms is None:
             if index_of_value(self.reference_time, self.times) is None:
                 raise no_such_time(self.reference_time, self.times, "one of course.times").below("reference")
-            self._check_interval(self.every, ("interval",))
+            self._check_interval(self.cadence, ("interval",))
             for k, interval in enumerate(self.intervals or ()):
                 self._check_interval(interval, ("intervals", k))
         elif self.mechanisms.images is not None:
@@ -448,7 +448,7 @@ class OrbitMonitorSpec(TitledSpec):
             raise Problem(problem, None, "perturb with a course", within=("perturb",))
         if (self.course is None) is (loop.readings is None):
             value = "neither" if loop.readings is None else "both"
-            allowed = "readings: {every: 4 min, count: 25}, or the file's course"
+            allowed = "readings: {interval: 4 min, count: 25}, or the file's course"
             raise Problem("the readings' times must be given once", value, allowed, within=("mechanisms",))
 
     def _check_course(self, course: CourseSpec) -> None:
@@ -497,7 +497,7 @@ class OrbitMonitorSpec(TitledSpec):
         return self.times[1] - self.times[0]
 
     @property
-    def every(self) -> float:
+    def cadence(self) -> float:
         """Interval between measurements of the monitor, in seconds."""
         assert self.interval is not None
         return self.interval

@@ -175,7 +175,7 @@ class RationalPointsSpec(Spec):
     ----------
     tie : int
         Number of points that are chosen in each image and matched in the others.
-    reach : int
+    search_radius : int
         Search radius about a predicted position, in pixels: the largest error of the polynomials of two images.
     template : int
         Side of a template, in pixels.
@@ -191,7 +191,7 @@ class RationalPointsSpec(Spec):
     """
 
     tie: Annotated[Whole, Field(ge=1, le=20_000)] = 200
-    reach: Annotated[Whole, Field(ge=2, le=100)] = 10
+    search_radius: Annotated[Whole, Field(ge=2, le=100)] = 10
     template: Annotated[Whole, Field(ge=LEAST_TEMPLATE, le=101), AfterValidator(_is_odd)] = 25
     least_correlation: Annotated[Number, Field(gt=0.0, lt=1.0)] = 0.6
     largest_sigma: Annotated[Number, Field(gt=0.0, le=2.0)] = 0.2

@@ -209,7 +209,7 @@ def _extent(
     spec: OrbitMatchSpec, images: Mapping[str, LineFrame], heights: tuple[float, float]
 ) -> tuple[GroundFrame, tuple[float, float, float, float]]:
     """Return plane coordinates of the ground, and the images' bounds west, east, south and north, in metres."""
-    seen, reach = [], spec.points.reach + spec.points.template
+    seen, reach = [], spec.points.search_radius + spec.points.template
     for name, image in images.items():
         window = image.window
         side = [np.linspace(-reach, n - 1.0 + reach, _BORDER) for n in (window.lines, window.pixels)]

@@ -388,7 +388,7 @@ def _once(table: Table, column: str) -> None:
 
 CONVENTIONS: Mapping[str, Any] = {
     "frame": "itrs",
-    "quaternion": {"scalar": "last", "turns": "body_to_frame"},
+    "quaternion": {"scalar": "last", "direction": "body_to_frame"},
     "body_axes": ["forward", "right", "down"],
     "time_scale": "utc",
     "line_moment": "middle",
@@ -400,7 +400,7 @@ CONVENTIONS: Mapping[str, Any] = {
 CAMERA_FILE = "camera.yaml"
 TEST_FILE = "calibrate.yaml"
 LINES_SEE_POINTS = (
-    "an attitude whose lines see the points: `scalar` first or last, `turns`, `body_axes`, frame and times of the"
+    "an attitude whose lines see the points: `scalar` first or last, `direction`, `body_axes`, frame and times of the"
     " attitude file (`twin.orbit check` finds which agree with the ground points); names, images and coordinates that"
     " belong together"
 )
@@ -600,7 +600,7 @@ def _quaternions_of(numbers: Array, conventions: measurements.ConventionsSpec) -
     assert convention is not None
     assert conventions.body_axes is not None
     xyzw = numbers if convention.scalar == "last" else np.roll(numbers, -1, axis=1)
-    if convention.turns == "frame_to_body":
+    if convention.direction == "frame_to_body":
         xyzw = xyzw * np.array([-1.0, -1.0, -1.0, 1.0])
     axes = np.array(measurements.body_axes_matrix(conventions.body_axes), np.float64)
     if np.array_equal(axes, np.eye(3)):

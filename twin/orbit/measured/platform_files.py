@@ -135,7 +135,7 @@ def read_platform(spec: PlatformFilesSpec, folder: Path) -> tuple[PlatformReadin
         _of_file_or_test(spec_of, "scalar", spec_of.scalar, attitude.scalar, "the position of the scalar")
         if quaternions
         else "last",
-        _of_file_or_test(spec_of, "turns", spec_of.turns, attitude.turns, "the direction of the rotation")
+        _of_file_or_test(spec_of, "direction", spec_of.direction, attitude.turns, "the direction of the rotation")
         if quaternions
         else "body_to_frame",
         spec_of.body_axes,
