@@ -195,10 +195,10 @@ def turned_over(surface: LensSurface) -> LensSurface:
         terms.append(XYPolynomial(**{n: -getattr(term, n) * (-1) ** b for (_, b), n in _POLYNOMIAL.items()}))
     figure = shape.figure
     if isinstance(figure, ZernikeFigure):
-        (cx, cy), terms = figure.centre, figure.terms
+        (cx, cy), zernikes = figure.centre, figure.terms
         # sag(x, y) -> -sag(x, -y): terms that are odd in y keep their sign.
-        signs = {j: 1.0 if noll_to_nm(j)[1] < 0 else -1.0 for j in terms}
-        figure = ZernikeFigure(figure.radius, (cx, -cy), {j: signs[j] * a for j, a in terms.items()})
+        signs = {j: 1.0 if noll_to_nm(j)[1] < 0 else -1.0 for j in zernikes}
+        figure = ZernikeFigure(figure.radius, (cx, -cy), {j: signs[j] * a for j, a in zernikes.items()})
     elif figure is not None:
         raise TypeError("a figure on a grid")
     even = tuple(-a for a in shape.even)

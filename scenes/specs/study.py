@@ -274,12 +274,12 @@ class FactorSpec(spec.Spec):
         return next(kind for kind in KINDS if getattr(self, kind) is not None)
 
     @property
-    def places(self) -> tuple[KeyPath, ...]:
+    def key_paths(self) -> tuple[KeyPath, ...]:
         """All key paths in the base that get the value of the factor."""
         return self.keys if self.keys is not None else (self.key,) if self.key is not None else ()
 
     def key_of(self, k: int) -> KeyPath:
-        """Return the key path, within this factor, of entry number ``k`` of ``places``."""
+        """Return the key path, within this factor, of entry number ``k`` of ``key_paths``."""
         return ("key",) if self.key is not None else ("keys", k)
 
     @property
@@ -303,7 +303,7 @@ class FactorSpec(spec.Spec):
 
     def _check_scales(self) -> None:
         """Raise `Problem` unless a factor that scales is a positive number, and a pure number if it has no key."""
-        same = next((k for k, scale in enumerate(self.scales) if scale.key in self.places), None)
+        same = next((k for k, scale in enumerate(self.scales) if scale.key in self.key_paths), None)
         if same is not None:
             raise Problem("the factor sets this value itself", None, "another key", within=("scales", same, "key"))
         if not self.scales or self.table is not None:
@@ -311,7 +311,7 @@ class FactorSpec(spec.Spec):
         numbers = self.numbers()
         if not numbers.numeric:
             raise Problem("not numbers", shown(list(self.scalars())), "numbers, for scales", within=(self.kind,))
-        if not self.places and numbers.unit is not None:
+        if not self.key_paths and numbers.unit is not None:
             value, allowed = f"a number with {numbers.unit}", "pure numbers: values: [0.5, 1, 2]"
             raise Problem("a factor without a key is a ratio", value, allowed, within=(self.kind,))
 
@@ -634,7 +634,7 @@ class StudySpec(spec.TitledSpec):
     def _fits_together(self) -> StudySpec:
         factors: dict[Any, str] = {}
         for name, factor in self.factors.items():
-            for k, key_path in enumerate(factor.places):
+            for k, key_path in enumerate(factor.key_paths):
                 if key_path in factors:
                     text = f"the factor {factors[key_path]} already changes this value"
                     within = ("factors", name, *factor.key_of(k))

@@ -92,7 +92,7 @@ def test_distortion_is_that_of_the_papers_formula(gf7_alone) -> None:
     assert found.point[0] == pytest.approx(0.0, abs=1e-9)
     assert found.point[1] == pytest.approx(-found.distance * np.tan(np.deg2rad(6.0)), rel=2e-3)
     assert found.rms < found.largest < 1e-3
-    away = (found.places - found.ideal).reshape(-1, 2)
+    away = (found.positions - found.ideal).reshape(-1, 2)
     np.testing.assert_allclose(away.mean(axis=0), 0.0, atol=1e-12)
     # as drawn: a grid whose departures stay within half of its spacing, and the line's in millimetres and micrometres
     left, right, *_ = camera_plots.distortion_figure(SimpleNamespace(distortion=found)).axes

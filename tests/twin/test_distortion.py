@@ -71,7 +71,7 @@ def test_images_are_those_of_the_general_renderer():
     images = b.images(turn, place)[0]
     about_x = np.array([[1, 0, 0], [0, np.cos(turn), -np.sin(turn)], [0, np.sin(turn), np.cos(turn)]])
     light = (about_x @ b.centre_direction)[None]
-    (pupil,) = b.path.pupils(b.as_built, light, b.path.places(b.as_built, light))
+    (pupil,) = b.path.pupils(b.as_built, light, b.path.positions(b.as_built, light))
     node, weight = np.polynomial.legendre.leggauss(9)
     first, last = b.ccd.band.spectrum.ends
     wavelengths = first + 0.5 * (last - first) * (node + 1.0)

@@ -384,7 +384,7 @@ def test_geometry_of_a_misset_focal_plane(tabled_bench) -> None:
     pose = Pose(rotation_matrix(np.array(MISSET.rotate)), np.array(MISSET.shift))
     state = {**tabled_bench.camera.as_built, f"{ROOT}/focal_plane": MISSET}
     directions = tabled_bench.path.directions(places(tabled_bench))
-    hits = tabled_bench.path.places(state, directions)
+    hits = tabled_bench.path.positions(state, directions)
     pupils = tabled_bench.path.pupils(state, directions, hits)
     defocused = 0
     for site, pupil, hit in zip(tabled_bench.sites, pupils, hits, strict=True):
@@ -423,7 +423,7 @@ def test_a_chips_height_counts_downstream(middle) -> None:
 def test_a_moved_target_is_a_moved_detector(tabled_bench, shift: float) -> None:
     """Pupils traced with the target 1 mm out of the collimator's focus, 80 um at the image."""
     directions = tabled_bench.path.directions(places(tabled_bench))
-    hits = tabled_bench.path.places(tabled_bench.camera.as_built, directions)
+    hits = tabled_bench.path.positions(tabled_bench.camera.as_built, directions)
     pupils = tabled_bench.path.pupils(tabled_bench.camera.as_built, directions, hits, shift)
     for site, pupil in zip(tabled_bench.sites, pupils, strict=True):
         for edge, imager in site.imagers.items():

@@ -453,9 +453,9 @@ def test_a_mode_that_no_spot_shows_moves_heights_by_the_exact_trace(loop_setup, 
     first[model.row("forward", "defocus")] = second[model.row("backward", "defocus")] = 1.0
     modes = unobservable_modes(model.prior, np.stack([angle, first, second]), np.array([ARCSEC, 1e-5, 1e-5]))
     assert len(modes) == 3
-    components = experiment.stated.components
+    components = experiment.prior.components
     for mode in modes:
-        amounts = mode.motions * experiment.stated.sigma
+        amounts = mode.motions * experiment.prior.sigma
         state = state_of(amounts, components, experiment.thermal)
         spots = experiment.path.mean_spots([{}, state])
         moved = np.abs(spots[1] - spots[0]).max()

@@ -119,8 +119,8 @@ class AsBuiltBench(Site):
         self.experiment = MonitorExperiment(setup.base, backend)
         self.camera = judged_camera(self.test, self.experiment.instrument)
         self.line = line_points(self.experiment.instrument, self.camera)
-        assert self.experiment.stated is not None
-        prior = with_wavefront(self.experiment.stated, self.test.wavefront)
+        assert self.experiment.prior is not None
+        prior = with_wavefront(self.experiment.prior, self.test.wavefront)
         if not prior.components:
             allowed = "a disturbances file with standard deviations greater than zero, such as `assembled`"
             raise self.test.error("the prior has no motions", ("prior",), value=self.test.prior, allowed=allowed)

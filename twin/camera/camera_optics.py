@@ -384,10 +384,10 @@ class CameraOptics:
         InputError
             Edges block all of a field's light.
         """
-        places = tuple((float(x), float(y)) for x, y in self.fractions(fields))
+        positions = tuple((float(x), float(y)) for x, y in self.fractions(fields))
         if not self.state and not self.built:
             model, blocked = self.model, self.vignetting
-            return FieldBeams.trace(model, self.path.backend, places, rings, blocked, wavelength=self.wavelength)
+            return FieldBeams.trace(model, self.path.backend, positions, rings, blocked, wavelength=self.wavelength)
         nodes = stop_nodes(self.model, rings, self.vignetting is not None)
         rays = self.rays(fields, np.concatenate([np.zeros((1, 2)), np.stack([nodes.x, nodes.y], axis=-1)]))
         plane = self.model.focal_plane
@@ -396,7 +396,7 @@ class CameraOptics:
         room = np.sum((position[:, 0] - last) * direction[:, 0], -1)
         passed = rays.valid[:, 1:] if self.model.edges or self.vignetting is not None else None
         distance = float(self.model.first_order.exit_pupil_distance[0])
-        spec, fields = self.model.spec, np.array(places)
+        spec, fields = self.model.spec, np.array(positions)
         return FieldBeams(spec, fields, nodes, position, direction, rays.path, distance, room, passed)
 
     @one_blas_thread()
@@ -429,8 +429,8 @@ class CameraOptics:
             Edges cut a pupil into too many pieces, or a wavefront is too irregular for its polynomials.
         """
         light = self.directions(fields)
-        places = self.path.places(self.state, light)
-        pupils = self.path.pupils(self.state, light, places, wavelength=self.wavelength)
+        positions = self.path.positions(self.state, light)
+        pupils = self.path.pupils(self.state, light, positions, wavelength=self.wavelength)
         check_range("the light that a pupil's shadow leaves", np.array([p.light for p in pupils]), 0.0, 1.0, ROUNDING)
         if self.model.edges:
             nodes = stop_nodes(self.model, RINGS, True)
@@ -506,9 +506,9 @@ class CameraOptics:
     ) -> tuple[Mtf, ...]:
         """Compute the MTF of vignetted pupils at evenly spaced frequencies, line by line over the pupil."""
         light = self.directions(fields)
-        places = self.path.places(self.state, light)
+        positions = self.path.positions(self.state, light)
         used = colours if lenses(self.model.spec) else [np.min(colours)]
-        vignetted = [self.path.vignetted_pupils(self.state, light, places, float(colour)) for colour in used]
+        vignetted = [self.path.vignetted_pupils(self.state, light, positions, float(colour)) for colour in used]
         if frequency is None:
             shortest = float(np.min(colours))
             cutoff = max(float(np.max(v.pupil.cutoff(np.eye(2), shortest))) for pupils in vignetted for v in pupils)

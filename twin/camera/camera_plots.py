@@ -368,7 +368,7 @@ def distortion_figure(run: CameraRun) -> Figure:
     d = run.distortion
     figure = svg.new_figure(3.6)
     left, right = figure.subplots(1, 2, gridspec_kw={"width_ratios": [1.35, 1.0]})
-    away = d.places - d.ideal
+    away = d.positions - d.ideal
     spacing = 0.5 * float(np.min(np.ptp(d.ideal, axis=(0, 1)) / (np.array(d.fields.shape[:2]) - 1)))
     factor = rounded_down(spacing / max(d.largest, 1e-12))
     for places, colour, width in ((d.ideal, svg.GREY, 0.6), (d.ideal + factor * away, svg.BLUE, 1.0)):

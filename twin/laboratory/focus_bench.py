@@ -195,7 +195,7 @@ class FocusBench:
         half = {n: 0.5 * (b.pixels - 2.0 * test.edge.region) * b.pitch for n, b in bands.items()}
         positions = np.array([[field * half[name], bands[name].offset] for name, field in keys])
         directions = self.path.directions(positions)
-        hits = self.path.places(self.camera.as_built, directions)
+        hits = self.path.positions(self.camera.as_built, directions)
         pupils = self.path.pupils(self.camera.as_built, directions, hits)
         sites = []
         for i, (name, field) in enumerate(keys):

@@ -333,12 +333,12 @@ def _factor(name: str, factor: FactorSpec, setup: StudySetup) -> FactorKnob | No
         mean, sigma = values[:2]
         values = [mean - 4.0 * sigma, mean + 4.0 * sigma] if factor.kind == "normal" else values[2:]
     base = 1.0
-    if factor.places:
+    if factor.key_paths:
         try:
-            base = number_at(setup.base, factor.places[0], unit)
+            base = number_at(setup.base, factor.key_paths[0], unit)
         except Problem as problem:
             raise setup.error(problem, ("factors", name, *factor.key_of(0))) from None
-    knobs = {} if factor.scales else _knobs(factor.places, unit)
+    knobs = {} if factor.scales else _knobs(factor.key_paths, unit)
     return FactorKnob(name, unit, min(*values, base), max(*values, base), base, numbers.whole, knobs)
 
 

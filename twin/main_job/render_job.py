@@ -129,7 +129,7 @@ def render_job(
     times = 0 if resolved.job.course is None else len(resolved.job.course.times)
     require_memory(resolved, experiment.size(frame_count, times, target_pixels(resolved)), experiment.detector)
     resolved = resolved.with_job(checked_nodes(resolved.job, experiment.instrument.nodes))
-    experiment.stated  # noqa: B018 - what is wrong with it is said before the long parts
+    experiment.prior  # noqa: B018 - what is wrong with it is said before the long parts
     stage.begin(1)
     course = resolved.job.course
     states = (

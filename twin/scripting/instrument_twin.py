@@ -398,7 +398,7 @@ class InstrumentTwin:
         prior = find_disturbances(job, self.resolved.instrument)
         resolved = self.resolved.model_copy(update={"job": job, "disturbances": prior})
         twin = InstrumentTwin(resolved, self._bench.stating(resolved))
-        twin.experiment.stated  # noqa: B018 - raises now if the instrument lacks a body
+        twin.experiment.prior  # noqa: B018 - raises now if the instrument lacks a body
         return twin
 
     def render(self, frames: int | None = None, seed: int | None = None, **render: Any) -> Shot:

@@ -110,7 +110,7 @@ class Shot:
         rows = {
             (camera, name, direction): _edge_row(targets_at, direction)
             for camera, targets in cameras.items()
-            for name, targets_at in targets.places.items()
+            for name, targets_at in targets.positions.items()
             for direction in targets_at.before.edges
         }
         return _indexed(rows, ["camera", "place", "direction"])

@@ -188,7 +188,7 @@ def run_states(
     advance : Advance
         Called with the number of states done.
     """
-    prior, disturbances = experiment.stated, experiment.disturbances
+    prior, disturbances = experiment.prior, experiment.disturbances
     assert prior is not None
     assert disturbances is not None
     amounts = prior.draw(np.random.default_rng(stream(seed, _DRAWN)), count)

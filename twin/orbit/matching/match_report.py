@@ -94,7 +94,7 @@ def _warnings(run: Match) -> tuple[str, ...]:
     for group in run.points.sorts.values():
         for name, line in group.lines.items():
             if group.kind == "map" and line.accepted.any() and np.max(np.abs(line.median_shift)) > _FAR * reach:
-                texts.append(f"points of {name} lie near the limit; a larger `points.search_radius` may find more")
+                texts.append(f"points of {name} lie at the search limit; a larger `points.search_radius` may find more")
     if run.accuracy is None or run.accuracy < 0.0:
         texts.append("the accuracy of the datum transformation of the maps to WGS 84 is not stated by its authority")
     elif run.accuracy > 0.1:

@@ -532,7 +532,7 @@ def chief_rays(setup: DistortionSetup, backend: Backend) -> Callable[[Array], Ar
 
     def positions(angle: Array) -> Array:
         light = rotation_matrix(np.append(angle, 0.0)[:, None] * axis) @ middle
-        along = path.places({}, light)[:, 0]
+        along = path.positions({}, light)[:, 0]
         return np.asarray(along[:-1] - along[-1])
 
     return positions
