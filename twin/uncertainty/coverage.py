@@ -144,7 +144,7 @@ class Coverage:
         return int(binom.ppf(1.0 - FALSE, self.measured, FALSE_ALARM))
 
     @property
-    def sigma_holds(self) -> bool:
+    def sigma_agrees(self) -> bool:
         """True if no count of covered intervals is outside its limits and sigma is doubted in no state."""
         return not self.outliers and self.alarms <= self.alarm_limit and not self.doubted
 

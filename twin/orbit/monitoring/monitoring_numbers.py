@@ -335,7 +335,7 @@ CORRECTION: Record[tuple[loop_run.LoopRun, str, loop_run.LoopAnalysis]] = Record
     Quantity("cycle_steps", lambda of: of[2].cycle and of[2].cycle.steps, "of the limit cycle, peak to peak", "cycle"),
     Quantity("unit", lambda of: of[2].corrector.unit[0], "unit of positions"),
     Quantity("positions", lambda of: positions(of[0], of[1]), "when images are taken", converted=False),
-    Quantity("held_s", lambda o: [float(o[0].closed.course.times[k]) for k in o[2].ends], "times at its range's end"),
+    Quantity("saturated_s", lambda o: [float(o[0].closed.course.times[k]) for k in o[2].ends], "at its range's end"),
 )
 
 
