@@ -537,7 +537,7 @@ class MirrorSpec(Spec):
     radius : float
         Vertex radius of curvature, in metres, positive if the centre of curvature lies toward +z; ``flat`` for a plane.
     conic : float
-        Conic constant k.
+        Conic constant k: 0 for a sphere, the default, -1 for a paraboloid, less for a hyperboloid.
     aspheric : Mapping[str, float]
         Coefficients A4, A6, ... of the sag beyond the conic's, in 1/m^3, 1/m^5, ...; by default a pure conic.
     sag : Mapping[str, SagTerm] | None

@@ -935,7 +935,7 @@ class BenchErrorsSpec(Spec):
 
 
 class AutocollimatorTestSpec(TitledSpec):
-    """Test with two autocollimators.
+    """Principle experiment: two autocollimators read two mirrors on a turntable that rotates in known steps.
 
     Attributes
     ----------

@@ -191,7 +191,7 @@ class TermSpec(Spec):
     window : float | None
         Length of the window, ending at the reading, over which the input is averaged, in seconds.
     relative : bool
-        True if the newest sample minus its mean over `window` acts.
+        True if the effect follows the input's newest sample minus its mean over `window`.
     lag : TimeConstantSpec | None
         Time constant of a first-order lag with which the input acts.
     gap : float
@@ -264,8 +264,8 @@ class FocusSpec(Spec):
     camera : str
         Camera whose readings of kind `focus` are used.
     motion : str
-        Shift in whose amount the readings are, such as `base/telescope/M2 shift z`. The disturbances may only have this
-        motion, since no other is distinguishable.
+        Shift whose amount the readings give, such as `base/telescope/M2 shift z`. The disturbances may only have this
+        motion, since readings of focus cannot separate others from it.
     """
 
     camera: Name

@@ -491,7 +491,7 @@ class CameraSetup(Spec):
     perturb : Mapping[str, PerturbationSpec]
         Perturbations of bodies of the instrument, as in a job; for a camera alone of its parts.
     refocus : bool
-        Whether the camera is refocused in that state, as in a job.
+        True if the camera is refocused in that state, as in a job.
     """
 
     camera: CameraSpec
