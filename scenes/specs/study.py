@@ -405,8 +405,7 @@ class DesignSpec(spec.Spec):
     @model_validator(mode="after")
     def _has_runs(self) -> DesignSpec:
         if self.kind == GRID and self.runs is not None:
-            value = f"runs: {self.runs}"
-            raise Problem("a grid has as many runs as combinations", value, "no runs", within=("runs",))
+            raise Problem("a grid has as many runs as combinations", f"runs: {self.runs}", "no runs", within=("runs",))
         if self.kind != GRID and self.runs is None:
             raise Problem(f"a design of kind {self.kind} needs its number of runs", None, "runs: 1000")
         return self

@@ -198,9 +198,8 @@ class CalibrationImagesSpec(Spec):
     @model_validator(mode="after")
     def _are_enough(self) -> "CalibrationImagesSpec":
         if len(self.patches) < LEAST_PATCHES:
-            value = f"{len(self.patches)}"
             problem = "too few patches to separate principal distance from attitude"
-            raise Problem(problem, value, f"{LEAST_PATCHES} or more", within=("patches",))
+            raise Problem(problem, str(len(self.patches)), f"{LEAST_PATCHES} or more", within=("patches",))
         if self.points.control < 1 or self.points.check < 1:
             value = f"control {self.points.control}, check {self.points.check}"
             problem = "a calibration needs control and check points"
