@@ -195,7 +195,7 @@ def _passes(edge: object, x: np.ndarray, y: np.ndarray) -> np.ndarray:
     """Which rays at places (x, y) an edge of a file lets through."""
     e = edge
     middle = getattr(e, "centre", None) or (0.0, 0.0)
-    turn = getattr(e, "turn", None) or 0.0
+    turn = getattr(e, "rotation", None) or 0.0
     c, s = np.cos(turn), np.sin(turn)
     dx, dy = x - middle[0], y - middle[1]
     a, b = c * dx + s * dy, -s * dx + c * dy

@@ -160,7 +160,7 @@ def front_edges(rng: np.random.Generator, radius: float) -> list[str]:
     first, count = rng.uniform(0.0, 360.0), rng.integers(0, 5)
     for k in range(count):
         turn = (first + k * 360.0 / count) % 360.0
-        out.append(f"{{blocks: ray, width: {rng.uniform(0.01, 0.04) * radius:.6f} m, turn: {turn:.4f} deg}}")
+        out.append(f"{{blocks: ray, width: {rng.uniform(0.01, 0.04) * radius:.6f} m, rotation: {turn:.4f} deg}}")
     if rng.uniform() < 0.3:
         out.append(f"{{clear: circle, radius: {rng.uniform(0.9, 1.0) * radius:.6f} m, "
                    f"centre: [{rng.normal(0.0, 0.05) * radius:.6f} m, 0 m]}}")  # fmt: skip
@@ -169,7 +169,7 @@ def front_edges(rng: np.random.Generator, radius: float) -> list[str]:
     if rng.uniform() < 0.3:
         out.append(f"{{blocks: rectangle, half: [{rng.uniform(0.05, 0.2) * radius:.6f} m, "
                    f"{rng.uniform(0.05, 0.2) * radius:.6f} m], centre: [{rng.uniform(0.0, 0.8) * radius:.6f} m, 0 m], "
-                   f"turn: {rng.uniform(0.0, 90.0):.4f} deg}}")  # fmt: skip
+                   f"rotation: {rng.uniform(0.0, 90.0):.4f} deg}}")  # fmt: skip
     if rng.uniform() < 0.15:
         out.append(f"{{clear: ellipse, half: [{radius:.6f} m, {rng.uniform(0.6, 0.9) * radius:.6f} m]}}")
     return out

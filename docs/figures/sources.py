@@ -169,7 +169,7 @@ RUNS: Mapping[tuple[str, ...], Mapping[str, tuple[int, str, Read]]] = {
         "orbit.height.share": (0, "%", _share(HEIGHT, "base/forward/M2 figure Z7")),
         "orbit.height.elasticity": (2, "", _doubt("elasticity")),
         "orbit.height.doubled": (2, "m", _doubt("doubled")),
-        "orbit.height.held_997": (1, "m", _at(*_HEIGHT, "student_t", "held_997")),
+        "orbit.height.half_width_997": (1, "m", _at(*_HEIGHT, "student_t", "half_width_997")),
         "orbit.height.beyond": (1, "%", _at(*_HEIGHT, "student_t", "beyond_3_sigma", per=100.0)),
     },
     ("twin.uncertainty", "gf7_pair", "--disturbances", "launch"): {

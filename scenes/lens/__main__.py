@@ -60,7 +60,7 @@ def _quantity(option: str, text: str | None, kind: Kind) -> float | None:
     try:
         value = parse_quantity(text, kind)
     except Problem as problem:
-        raise InputError(Issue(f"{option}: {problem.problem}", found=problem.found, allowed=problem.allowed)) from None
+        raise InputError(Issue(f"{option}: {problem.problem}", value=problem.value, allowed=problem.allowed)) from None
     if not value > 0.0:
         raise InputError(Issue(f"{option} is not greater than zero", "", None, (), text))
     return value

@@ -24,7 +24,7 @@ from scenes.lens.prescription import OVER, LensSurface, Note, Prescription, even
 from scenes.lens.statements import Source, read_lines
 from scenes.yaml.errors import InputError, Issue, KeyPath, shown
 
-_TURNS = {"rotX": 0, "rotY": 1, "rotZ": 2}
+_ROTATIONS = {"rotX": 0, "rotY": 1, "rotZ": 2}
 _SHIFTS = {"x": 0, "y": 1, "z": 2}
 DEEPEST = 20
 LARGEST_FILE = 100_000
@@ -57,9 +57,9 @@ class _Reader:
         self.ambient = 1.0
         self.named: dict[float, CatalogueGlass] = {}
 
-    def error(self, key: KeyPath, problem: str, found: object = None, allowed: str | None = None) -> InputError:
+    def error(self, key: KeyPath, problem: str, value: object = None, allowed: str | None = None) -> InputError:
         """Return an input error that names the file and the line of a key, for the caller to raise."""
-        text = None if found is None else shown(found)
+        text = None if value is None else shown(value)
         return InputError(Issue(problem, self.file, self.line(key), key, text, allowed))
 
     def line(self, key: KeyPath) -> int:
@@ -74,11 +74,11 @@ class _Reader:
                 break
         return line
 
-    def number(self, given: Mapping[str, Any], name: str, key: KeyPath, default: float | None = None) -> float:
+    def number(self, entry: Mapping[str, Any], name: str, key: KeyPath, default: float | None = None) -> float:
         """Return the finite number at a key of a mapping; raise InputError if it is none."""
-        if name not in given and default is not None:
+        if name not in entry and default is not None:
             return default
-        value = given.get(name)
+        value = entry.get(name)
         if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < 1e20:
             raise self.error((*key, name), f"{name} is not a number", value, "a number")
         return float(value)
@@ -95,72 +95,72 @@ class _Reader:
             raise self.error(key, "not a list", value, "a list")
         return value
 
-    def _only(self, given: Mapping[str, Any], key: KeyPath, known: Mapping[str, tuple[str, ...]]) -> None:
+    def _only(self, entry: Mapping[str, Any], key: KeyPath, known: Mapping[str, tuple[str, ...]]) -> None:
         """Raise InputError for keys that this type of item does not have, since their numbers would be ignored."""
-        for name in given:
-            names = known.get(str(given.get("type")), ("R", "items"))
+        for name in entry:
+            names = known.get(str(entry.get("type")), ("R", "items"))
             if name != "type" and name not in names:
-                raise self.error((*key, name), "this key is not supported", given[name], ", ".join(names))
+                raise self.error((*key, name), "this key is not supported", entry[name], ", ".join(names))
 
     # ----------------------------------------------------------------------------------------------------- parts
 
-    def optic(self, given: Mapping[str, Any], key: KeyPath, pose: Pose, before: float, after: float) -> None:
+    def optic(self, entry: Mapping[str, Any], key: KeyPath, pose: Pose, before: float, after: float) -> None:
         """Read an optic and all optics inside it, in its parent's frame and media."""
         if len(key) > 2 * DEEPEST:
             raise self.error(key, "optics are nested too deeply", allowed=f"at most {DEEPEST} levels")
-        kind = given.get("type")
-        for name in given:
+        kind = entry.get("type")
+        for name in entry:
             if name not in _OF_OPTICS:
                 self.notes.append(Note(self.line((*key, name)), str(name), "not understood"))
-        pose = self._placed(given, key, pose)
-        before = self.medium(given["inMedium"], (*key, "inMedium")) if "inMedium" in given else before
-        after = self.medium(given["outMedium"], (*key, "outMedium")) if "outMedium" in given else after
+        pose = self._placed(entry, key, pose)
+        before = self.medium(entry["inMedium"], (*key, "inMedium")) if "inMedium" in entry else before
+        after = self.medium(entry["outMedium"], (*key, "outMedium")) if "outMedium" in entry else after
         match kind:
             case "CompoundOptic":
-                for k, item in enumerate(self.listed(given.get("items"), (*key, "items"))):
+                for k, item in enumerate(self.listed(entry.get("items"), (*key, "items"))):
                     below = (*key, "items", k)
                     self.optic(self.mapping(item, below), below, pose, before, after)
             case "Lens":
-                glass = self.medium(given.get("medium"), (*key, "medium"))
-                items = self.listed(given.get("items"), (*key, "items"))
+                glass = self.medium(entry.get("medium"), (*key, "medium"))
+                items = self.listed(entry.get("items"), (*key, "items"))
                 if len(items) != 2:
                     raise self.error((*key, "items"), "a lens has two faces", f"{len(items)}")
                 for k, (inside, outside) in enumerate(((before, glass), (glass, after))):
                     below = (*key, "items", k)
                     self.optic(self.mapping(items[k], below), below, pose, inside, outside)
             case "Mirror":
-                self._add(given, key, pose, Interaction.REFLECT, before)
+                self._add(entry, key, pose, Interaction.REFLECT, before)
             case "RefractiveInterface":
                 how = Interaction.PASS if before == after else Interaction.REFRACT
-                self._add(given, key, pose, how, after)
+                self._add(entry, key, pose, how, after)
             case "Detector":
-                self._add(given, key, pose, Interaction.PASS, before)
-            case "Baffle" if "obscuration" in given:
-                self._add(given, key, pose, Interaction.PASS, before)
+                self._add(entry, key, pose, Interaction.PASS, before)
+            case "Baffle" if "obscuration" in entry:
+                self._add(entry, key, pose, Interaction.PASS, before)
             case "Baffle" | "Interface":
-                text = f"{given.get('name', kind)}: no effect on rays: omitted"
+                text = f"{entry.get('name', kind)}: no effect on rays: omitted"
                 self.notes.append(Note(self.line(key), kind, text))
             case _:
                 known = "CompoundOptic, Lens, Mirror, RefractiveInterface, Detector, Baffle, Interface"
                 raise self.error((*key, "type"), "this type of optic is not supported", kind, known)
 
-    def _add(self, given: Mapping[str, Any], key: KeyPath, pose: Pose, how: Interaction, index: float) -> None:
+    def _add(self, entry: Mapping[str, Any], key: KeyPath, pose: Pose, how: Interaction, index: float) -> None:
         """Append an optic's surface, with its pose, its interaction with light and the index behind it."""
         if len(self.surfaces) >= MOST_SURFACES:
             raise self.error(key, "too many surfaces", allowed=f"at most {MOST_SURFACES}")
-        name = str(given.get("name", "")) or f"S{len(self.surfaces) + 1}"
+        name = str(entry.get("name", "")) or f"S{len(self.surfaces) + 1}"
         taken = {s.name for s in self.surfaces}
         name = next(n for n in (name, *(f"{name}_{k}" for k in range(2, MOST_SURFACES + 2))) if n not in taken)
         below = (*key, "surface")
-        shape = self.shape(self.mapping(given.get("surface"), below), below)
+        shape = self.shape(self.mapping(entry.get("surface"), below), below)
         edges: tuple[Edge, ...] = ()
-        if "obscuration" in given:
+        if "obscuration" in entry:
             below = (*key, "obscuration")
-            edges = self.edges(self.mapping(given["obscuration"], below), below, name)
+            edges = self.edges(self.mapping(entry["obscuration"], below), below, name)
         clear, rest = None, edges
         if edges and not edges[0].blocks and not edges[0].rotation and isinstance(edges[0].shape, Aperture):
             clear, rest = edges[0].shape, edges[1:]
-        if given.get("type") == "Baffle" and not (shape.is_plane and edges):
+        if entry.get("type") == "Baffle" and not (shape.is_plane and edges):
             self.notes.append(Note(self.line(key), name, "a baffle that is not plane, or without an edge: omitted"))
             return
         glass, ratio = self.named[index].name if index in self.named else "", index / self.ambient
@@ -168,16 +168,16 @@ class _Reader:
         surface = LensSurface(name, OVER @ pose, shape, how, ratio, clear, self.line(key), glass, rest)
         self.surfaces.append(turned_over(surface))
 
-    def _placed(self, given: Mapping[str, Any], key: KeyPath, pose: Pose) -> Pose:
+    def _placed(self, entry: Mapping[str, Any], key: KeyPath, pose: Pose) -> Pose:
         """Return a pose after the shifts and rotations of a ``coordSys``, each about the axes reached so far."""
-        if "coordSys" not in given:
+        if "coordSys" not in entry:
             return pose
         key = (*key, "coordSys")
-        for name, value in self.mapping(given["coordSys"], key).items():
+        for name, value in self.mapping(entry["coordSys"], key).items():
             step = np.zeros(3)
-            if name in _TURNS:
-                turn = self.number({name: value}, name, key)
-                pose = pose @ Pose(about_axis(_TURNS[name], turn), step)
+            if name in _ROTATIONS:
+                angle = self.number({name: value}, name, key)
+                pose = pose @ Pose(about_axis(_ROTATIONS[name], angle), step)
                 continue
             if name in _SHIFTS:
                 step[_SHIFTS[name]] = self.number({name: value}, name, key)
@@ -189,24 +189,24 @@ class _Reader:
             pose = pose @ Pose(np.eye(3), step)
         return pose
 
-    def shape(self, given: Mapping[str, Any], key: KeyPath, depth: int = 0) -> Surface:
+    def shape(self, entry: Mapping[str, Any], key: KeyPath, depth: int = 0) -> Surface:
         """Return the shape of an optical surface from its mapping in the file."""
-        kind = given.get("type")
-        self._only(given, key, {"Quadric": ("R", "conic"), "Asphere": ("R", "conic", "coefs", "imin"), "Plane": ()})
+        kind = entry.get("type")
+        self._only(entry, key, {"Quadric": ("R", "conic"), "Asphere": ("R", "conic", "coefs", "imin"), "Plane": ()})
         match kind:
             case "Plane":
                 return Surface()
             case "Sphere" | "Paraboloid" | "Quadric" | "Asphere":
-                radius = self.number(given, "R", key)
+                radius = self.number(entry, "R", key)
                 if radius == 0.0:
                     raise self.error((*key, "R"), "a radius of curvature cannot be zero", 0.0)
                 conic = {"Sphere": 0.0, "Paraboloid": -1.0}.get(str(kind))
-                conic = self.number(given, "conic", key) if conic is None else conic
+                conic = self.number(entry, "conic", key) if conic is None else conic
                 powers = {}
                 if kind == "Asphere":
                     below = (*key, "coefs")
-                    listed = self.listed(given.get("coefs"), below)
-                    first = self.number(given, "imin", key, 2.0)
+                    listed = self.listed(entry.get("coefs"), below)
+                    first = self.number(entry, "imin", key, 2.0)
                     if first != int(first) or not 1 <= first <= 10 or len(listed) > 12:
                         raise self.error(below, "these even powers are not supported", shown(first), "r^2 to r^40")
                     powers = {
@@ -214,14 +214,14 @@ class _Reader:
                     }
                 return even_asphere(1.0 / radius, conic, powers)
             case "Sum" if depth == 0:
-                return self._sum(given, key)
+                return self._sum(entry, key)
             case _:
                 known = "Plane, Sphere, Paraboloid, Quadric, Asphere, Sum of one of them and a Zernike"
                 raise self.error((*key, "type"), "this type of surface is not supported", kind, known)
 
-    def _sum(self, given: Mapping[str, Any], key: KeyPath) -> Surface:
+    def _sum(self, entry: Mapping[str, Any], key: KeyPath) -> Surface:
         """Return the shape of a sum of a conic and a Zernike surface."""
-        items = self.listed(given.get("items"), (*key, "items"))
+        items = self.listed(entry.get("items"), (*key, "items"))
         shape, radius, centre = None, 0.0, (0.0, 0.0)
         terms: dict[int, float] = {}
         for k, item in enumerate(items):
@@ -246,11 +246,11 @@ class _Reader:
             raise self.error(key, "a sum without a conic", allowed="a conic and a Zernike")
         return shape.with_figure(ZernikeFigure(radius, centre, terms)) if terms else shape
 
-    def medium(self, given: object, key: KeyPath) -> float:
+    def medium(self, entry: object, key: KeyPath) -> float:
         """Return the refractive index of a medium at the wavelength."""
-        if isinstance(given, int | float) and not isinstance(given, bool) and 0.1 < given < 10.0:
-            return float(given)
-        medium = self.mapping(given, key)
+        if isinstance(entry, int | float) and not isinstance(entry, bool) and 0.1 < entry < 10.0:
+            return float(entry)
+        medium = self.mapping(entry, key)
         kind, w = medium.get("type"), self.wavelength
         try:
             index = self._index(medium, key, kind, w)
@@ -319,41 +319,41 @@ class _Reader:
         name = f"Sellmeier_{len(self.named) + 1}"
         self.named[index] = CatalogueGlass(name, 2, (*pairs, *[0.0] * 6), first * 1e-6, last * 1e-6)
 
-    def edges(self, given: Mapping[str, Any], key: KeyPath, name: str, depth: int = 0) -> tuple[Edge, ...]:
+    def edges(self, entry: Mapping[str, Any], key: KeyPath, name: str, depth: int = 0) -> tuple[Edge, ...]:
         """Return the edges of an obscuration, clear apertures first; kinds that are not supported are noted."""
-        kind = str(given.get("type"))
+        kind = str(entry.get("type"))
         if kind == "ObscUnion" and depth == 0:
-            found: list[Edge] = []
-            for k, item in enumerate(self.listed(given.get("items"), (*key, "items"))):
+            edges: list[Edge] = []
+            for k, item in enumerate(self.listed(entry.get("items"), (*key, "items"))):
                 below = (*key, "items", k)
-                found += self.edges(self.mapping(item, below), below, name, 1)
-            return tuple(sorted(found, key=lambda edge: edge.blocks))
-        known = {f"{way}{shape}": keys for shape, keys in _OBSCURATIONS.items() for way in ("Clear", "Obsc")}
+                edges += self.edges(self.mapping(item, below), below, name, 1)
+            return tuple(sorted(edges, key=lambda edge: edge.blocks))
+        known = {f"{effect}{shape}": keys for shape, keys in _OBSCURATIONS.items() for effect in ("Clear", "Obsc")}
         if kind not in known:
             self.notes.append(Note(self.line(key), kind, f"the obscuration of {name} is omitted"))
             return ()
-        self._only(given, key, known)
-        x, y = self.number(given, "x", key, 0.0), self.number(given, "y", key, 0.0)
+        self._only(entry, key, known)
+        x, y = self.number(entry, "x", key, 0.0), self.number(entry, "y", key, 0.0)
         shape: EdgeShape
         try:
             match kind[5:] if kind.startswith("Clear") else kind[4:]:
                 case "Circle":
-                    shape = Circle(self.number(given, "radius", key), (x, y))
+                    shape = Circle(self.number(entry, "radius", key), (x, y))
                 case "Annulus":
-                    shape = Circle(self.number(given, "outer", key), (x, y), self.number(given, "inner", key))
+                    shape = Circle(self.number(entry, "outer", key), (x, y), self.number(entry, "inner", key))
                 case "Rectangle":
-                    half = 0.5 * self.number(given, "width", key), 0.5 * self.number(given, "height", key)
+                    half = 0.5 * self.number(entry, "width", key), 0.5 * self.number(entry, "height", key)
                     shape = Rectangle(*half, (x, y))
                 case "Ray":
-                    shape = Ray(self.number(given, "width", key), (x, y))
+                    shape = Ray(self.number(entry, "width", key), (x, y))
                 case _:
-                    xs, ys = ([self.number({n: v}, n, key) for v in self.listed(given.get(n), (*key, n))] for n in _XY)
+                    xs, ys = ([self.number({n: v}, n, key) for v in self.listed(entry.get(n), (*key, n))] for n in _XY)
                     if len(xs) != len(ys):
                         raise self.error(key, "a polygon needs as many xs as ys", f"{len(xs)} and {len(ys)}")
                     shape = Polygon(tuple(zip(xs, ys, strict=True)))
         except ValueError as error:
             raise self.error(key, str(error)) from None
-        return (Edge(shape, kind.startswith("Obsc"), self.number(given, "theta", key, 0.0)),)
+        return (Edge(shape, kind.startswith("Obsc"), self.number(entry, "theta", key, 0.0)),)
 
 
 def _air(um: float, pressure: float, temperature: float, water: float) -> float:

@@ -100,7 +100,7 @@ def with_flat_image(lens: Prescription) -> Prescription:
 
 PITCH = 7e-6
 """Default pixel pitch of the line CCD, in metres."""
-LARGEST_TILT, TURNED = math.radians(45.0), 1e-12
+LARGEST_TILT, OBLIQUE = math.radians(45.0), 1e-12
 """Largest tilt of an image about x, in radians, and largest sine of its tilt about y that counts as rounding error."""
 FAR = 1e6
 """Distance beyond which an object is at infinity, in metres: programs write 1e9 millimetres and more for infinity."""
@@ -192,7 +192,7 @@ def camera_of(lens: Prescription, name: str, backend: Backend, width: Width = AS
     InputError
         The prescription has content that a camera's file cannot represent, or light does not come through.
     """
-    if abs(lens.image.pose.rotation[0, 2]) > TURNED or abs(_image(lens)[1]) > LARGEST_TILT:
+    if abs(lens.image.pose.rotation[0, 2]) > OBLIQUE or abs(_image(lens)[1]) > LARGEST_TILT:
         lens = unfolded(lens)
     if lens.heights:
         lens = _by_angles(lens, name, backend, width)
@@ -286,8 +286,8 @@ def _by_angles(lens: Prescription, name: str, backend: Backend, width: Width) ->
     heights = np.array(lens.heights)
     if lens.field_kind == "object heights":
         if not FAR <= abs(lens.object_distance) < math.inf:
-            found = f"{lens.object_distance:.6g} m"
-            raise lens.error("object heights without a distant object", None, found, "field angles: --field")
+            value = f"{lens.object_distance:.6g} m"
+            raise lens.error("object heights without a distant object", None, value, "field angles: --field")
         tangents = -heights / lens.object_distance
     else:
         middle = replace(lens, fields=((0.0, 0.0),), heights=(), field_kind="angles")
@@ -356,8 +356,8 @@ height; the iteration does not converge for heights that no ray reaches.
 def _check(lens: Prescription) -> None:
     """Raise InputError for content that a camera's file cannot represent."""
     if abs(lens.object_distance) < FAR:
-        found = f"{lens.object_distance:.6g} m"
-        raise lens.error("the object is at a finite distance", lens.surfaces[0].line, found, "a scene at infinity")
+        value = f"{lens.object_distance:.6g} m"
+        raise lens.error("the object is at a finite distance", lens.surfaces[0].line, value, "a scene at infinity")
     if not lens.fields:
         raise lens.error("this kind of field is not supported", None, lens.field_kind, "field angles")
     image = lens.image
@@ -366,12 +366,12 @@ def _check(lens: Prescription) -> None:
     if image.index != 1.0 or image.interaction is not Interaction.PASS:
         raise lens.error("the image is in glass", image.line, allowed="an image in the object's medium")
     normal = image.pose.rotation[:, 2]
-    if abs(normal[0]) > TURNED:
+    if abs(normal[0]) > OBLIQUE:
         raise lens.error("the image is tilted out of the plane of symmetry", image.line, allowed="a tilt about x")
     if abs(_image(lens)[1]) > LARGEST_TILT:
-        found = f"{math.degrees(_image(lens)[1]):.4g} deg"
+        value = f"{math.degrees(_image(lens)[1]):.4g} deg"
         problem = "the image is tilted too far relative to the axis along which light enters"
-        raise lens.error(problem, image.line, found, "45 deg at most")
+        raise lens.error(problem, image.line, value, "45 deg at most")
 
 
 def _image(lens: Prescription) -> tuple[float, float]:
@@ -470,9 +470,9 @@ def _terms(lens: Prescription, surface: LensSurface, shape: Surface) -> dict[str
             problem = "Zernike terms, or a polynomial, of a higher order than a camera's file allows"
             allowed = f"Noll terms Z1 to Z{LAST_NOLL}, and x-y polynomials up to order 7"
             raise lens.error(problem, surface.line, f"Z{last}", allowed)
-        given = {f"Z{j}": a for j, a in shape.figure.terms.items()}
+        coefficients = {f"Z{j}": a for j, a in shape.figure.terms.items()}
         x0, y0 = shape.figure.centre
-        terms.append(ZernikeSag(radius=shape.figure.radius, x0=x0, y0=y0, **given))
+        terms.append(ZernikeSag(radius=shape.figure.radius, x0=x0, y0=y0, **coefficients))
     elif shape.figure is not None:
         raise lens.error("a camera's file cannot represent a figure on a grid", surface.line, surface.name)
     kinds = {kind: name for name, kind in SAG_TERMS.items()}

@@ -38,7 +38,7 @@ def prescription_of(model: CameraModel) -> Prescription:
         index_behind[name] = index
     surfaces = [
         LensSurface(
-            name, model.mirror_pose(name), joined(model.surfaces[name]), how, index_behind[name], *_cut(model, name)
+            name, model.mirror_pose(name), joined(model.surfaces[name]), how, index_behind[name], *_bounds(model, name)
         )
         for name, how in ((name, LIGHT[mirror.light]) for name, mirror in spec.mirrors.items())
     ]
@@ -57,7 +57,7 @@ def prescription_of(model: CameraModel) -> Prescription:
     )
 
 
-def _cut(model: CameraModel, name: str) -> tuple[Any, ...]:
+def _bounds(model: CameraModel, name: str) -> tuple[Any, ...]:
     """Return a surface's clear aperture, line of the file and glass (both empty here), and its further edges."""
     edges = model.edges.get(name, ())
     if name == model.spec.stop or not edges:
@@ -191,19 +191,19 @@ def zemax_text(lens: Prescription) -> str:
     surface("STANDARD", thickness=math.inf)
     poses = [rounded(facing(s).pose) for s in lens.surfaces]
     surface("STANDARD", "COMM frame", thickness=float(poses[0].translation[2]))
-    for k, (pose, given) in enumerate(zip(poses, map(facing, lens.surfaces), strict=True)):
+    for k, (pose, optic) in enumerate(zip(poses, map(facing, lens.surfaces), strict=True)):
         last = k == len(lens.surfaces) - 1
         there = float(poses[k + 1].translation[2] - pose.translation[2]) if not last else 0.0
         out, back = _breaks(pose)
-        kind, rest = _shape(lens, given)
-        rest = [f"COMM {given.name}", *rest, *_edges(lens, given)]
+        kind, rest = _shape(lens, optic)
+        rest = [f"COMM {optic.name}", *rest, *_edges(lens, optic)]
         if k == lens.stop:
             rest.append("STOP")
-        if given.interaction is Interaction.REFLECT:
+        if optic.interaction is Interaction.REFLECT:
             rest.append("GLAS MIRROR 0 0 1.5 40 0 0 0 0 0 0")
         if out:
             surface("COORDBRK", *out)
-        surface(kind, *rest, thickness=0.0 if out and not last else there, curvature=given.surface.curvature)
+        surface(kind, *rest, thickness=0.0 if out and not last else there, curvature=optic.surface.curvature)
         if out and not last:
             surface("COORDBRK", *back, thickness=there)
     return "\n".join(lines) + "\n"
@@ -233,9 +233,9 @@ def _breaks(pose: Pose) -> tuple[list[str], list[str]]:
     return [*out, "PARM 6 0"], [*back, "PARM 6 1"]
 
 
-def _edges(lens: Prescription, given: LensSurface) -> list[str]:
+def _edges(lens: Prescription, optic: LensSurface) -> list[str]:
     """Return the statements of a surface's edge: a clear aperture, an obscuration, or a disk with a hole."""
-    aperture, further = given.aperture, given.edges
+    aperture, further = optic.aperture, optic.edges
     if len(further) == 1 and isinstance(aperture, Circle) and not aperture.inner and further[0].blocks:
         hole = further[0].shape
         if isinstance(hole, Circle) and not hole.inner and hole.centre == aperture.centre:
@@ -243,9 +243,9 @@ def _edges(lens: Prescription, given: LensSurface) -> list[str]:
     blocked = further[0].shape if len(further) == 1 and aperture is None and further[0].blocks else None
     if further and (not isinstance(blocked, Aperture) or further[0].rotation):
         what = "edges other than a clear aperture or an obscuration"
-        raise _cannot(lens, given, what, "one circle, rectangle or ellipse, or a batoid YAML")
+        raise _cannot(lens, optic, what, "one circle, rectangle or ellipse, or a batoid YAML")
     if isinstance(blocked, Circle) and blocked.inner:
-        raise _cannot(lens, given, "an obscuration with a hole", "one circle, rectangle or ellipse, or a batoid YAML")
+        raise _cannot(lens, optic, "an obscuration with a hole", "one circle, rectangle or ellipse, or a batoid YAML")
     match blocked or aperture:
         case None:
             return []
@@ -263,31 +263,31 @@ def _edges(lens: Prescription, given: LensSurface) -> list[str]:
     return lines
 
 
-def _shape(lens: Prescription, given: LensSurface) -> tuple[str, list[str]]:
+def _shape(lens: Prescription, optic: LensSurface) -> tuple[str, list[str]]:
     """Return the Zemax kind of a surface and the statements of its shape."""
-    if given.interaction is Interaction.REFRACT:
+    if optic.interaction is Interaction.REFRACT:
         raise _cannot(
-            lens, given, "a face of a lens: it names a glass where a camera's file has an index", "batoid YAML"
+            lens, optic, "a face of a lens: it names a glass where a camera's file has an index", "batoid YAML"
         )
-    shape = given.surface
+    shape = optic.surface
     conic = [f"CONI {_number(shape.conic)}"] if shape.conic else []
     if isinstance(shape.figure, GridFigure | SummedFigure):
-        raise _cannot(lens, given, "a figure on a grid", "Zernike terms")
+        raise _cannot(lens, optic, "a figure on a grid", "Zernike terms")
     if isinstance(shape.figure, ZernikeFigure) and any(shape.figure.terms.values()):
         if shape.terms:
-            raise _cannot(lens, given, "Zernike terms on a surface with other sag terms", "one kind of terms")
-        return "SZERNSAG", [*conic, *_even(lens, given, shape), *_zernike(shape.figure)]
+            raise _cannot(lens, optic, "Zernike terms on a surface with other sag terms", "one kind of terms")
+        return "SZERNSAG", [*conic, *_even(lens, optic, shape), *_zernike(shape.figure)]
     if shape.terms:
-        return "XPOLYNOM", [*conic, *_polynomial(lens, given, shape)]
+        return "XPOLYNOM", [*conic, *_polynomial(lens, optic, shape)]
     if any(shape.even):
-        return "EVENASPH", [*conic, *_even(lens, given, shape)]
+        return "EVENASPH", [*conic, *_even(lens, optic, shape)]
     return "STANDARD", conic
 
 
-def _even(lens: Prescription, given: LensSurface, shape: Surface) -> list[str]:
+def _even(lens: Prescription, optic: LensSurface, shape: Surface) -> list[str]:
     """Return the Zemax statements of a surface's even powers of the radius."""
     if 2 * len(shape.even) + 2 > LAST_EVEN:
-        raise _cannot(lens, given, f"even powers beyond r^{LAST_EVEN}", f"A4 to A{LAST_EVEN}")
+        raise _cannot(lens, optic, f"even powers beyond r^{LAST_EVEN}", f"A4 to A{LAST_EVEN}")
     terms = [0.0, *(a * MM ** (-2 * n - 3) for n, a in enumerate(shape.even))]
     return [f"PARM {n} {_number(a)}" for n, a in enumerate(terms, start=1)]
 
@@ -300,23 +300,23 @@ def _zernike(figure: ZernikeFigure) -> list[str]:
     return lines + [f"XDAT {n} {_number(v)} 0 0 1" for n, v in enumerate(values, start=1)]
 
 
-def _polynomial(lens: Prescription, given: LensSurface, shape: Surface) -> list[str]:
+def _polynomial(lens: Prescription, optic: LensSurface, shape: Surface) -> list[str]:
     """Return the Zemax statements of a surface's polynomial in x and y."""
     if any(not isinstance(term, XYPolynomial) for term in shape.terms):
-        raise _cannot(lens, given, "sag terms that the format does not have", "polynomial")
+        raise _cannot(lens, optic, "sag terms that the format does not have", "polynomial")
     radius = 0.1
     terms: Mapping[tuple[int, int], float] = polynomial_of(shape)
     order = max(a + b for a, b in terms)
     if order > 20:
-        raise _cannot(lens, given, "a polynomial beyond order 20", "lower orders")
+        raise _cannot(lens, optic, "a polynomial beyond order 20", "lower orders")
     pairs = [(n - b, b) for n in range(1, order + 1) for b in range(n + 1)]
     values = [float(len(pairs)), radius * MM, *(terms.get((a, b), 0.0) * radius ** (a + b) * MM for a, b in pairs)]
     return [f"XDAT {n} {_number(v)} 0 0 1" for n, v in enumerate(values, start=1)]
 
 
-def _cannot(lens: Prescription, given: LensSurface, what: str, allowed: str) -> InputError:
+def _cannot(lens: Prescription, optic: LensSurface, what: str, allowed: str) -> InputError:
     """Return an error about content that a .zmx file cannot represent."""
-    return lens.error(f"a .zmx file cannot represent {what}", given.line, given.name, allowed)
+    return lens.error(f"a .zmx file cannot represent {what}", optic.line, optic.name, allowed)
 
 
 def batoid_text(lens: prescription.Prescription) -> tuple[str, tuple[prescription.Note, ...]]:
@@ -373,18 +373,18 @@ def _place(pose: Pose) -> dict[str, float]:
     out = {name: float(v) for name, v in zip("xyz", pose.translation, strict=True) if v}
     r = pose.rotation
     if not np.array_equal(r, np.eye(3)):
-        turns = {
+        rotations = {
             "rotX": math.atan2(-r[1, 2], r[2, 2]),
             "rotY": math.atan2(r[0, 2], math.hypot(r[0, 0], r[0, 1])),
             "rotZ": math.atan2(-r[0, 1], r[0, 0]),
         }
-        out.update({name: turn for name, turn in turns.items() if turn})
+        out.update({name: angle for name, angle in rotations.items() if angle})
     return out
 
 
-def _surface(lens: prescription.Prescription, given: prescription.LensSurface) -> dict[str, Any]:
+def _surface(lens: prescription.Prescription, optic: prescription.LensSurface) -> dict[str, Any]:
     """Return the keys and values of a surface's shape in a batoid file."""
-    shape = given.surface
+    shape = optic.surface
     freeform = prescription.polynomial_of(Surface(terms=shape.terms)) if shape.terms else {}
     radius = 0.0
     figure = shape.figure
@@ -407,9 +407,9 @@ def _surface(lens: prescription.Prescription, given: prescription.LensSurface) -
             freeform[pair] = freeform.get(pair, 0.0) + value
     terms: dict[int, float] = {}
     if freeform:
-        radius = radius or (0.5 * float(np.ptp(given.aperture.bounds[:2])) if given.aperture else 0.1)
+        radius = radius or (0.5 * float(np.ptp(optic.aperture.bounds[:2])) if optic.aperture else 0.1)
         if max(a + b for a, b in freeform) > prescription.LARGEST_ORDER:
-            raise lens.error("a batoid file cannot represent a polynomial of so high an order", given.line, given.name)
+            raise lens.error("a batoid file cannot represent a polynomial of so high an order", optic.line, optic.name)
         terms = prescription.zernike_of({(a, b): c * radius ** (a + b) for (a, b), c in freeform.items()})
     elif isinstance(figure, ZernikeFigure):
         terms = {j: a for j, a in figure.terms.items() if a}
@@ -421,20 +421,20 @@ def _surface(lens: prescription.Prescription, given: prescription.LensSurface) -
 
 def _obscuration(edge: Edge) -> dict[str, Any] | None:
     """Return the keys and values of an edge in a batoid file; None for a kind that batoid lacks."""
-    way, shape = "Obsc" if edge.blocks else "Clear", edge.shape
+    kind, shape = "Obsc" if edge.blocks else "Clear", edge.shape
     x, y = shape.centre
-    turn = {"theta": edge.rotation} if edge.rotation else {}
+    theta = {"theta": edge.rotation} if edge.rotation else {}
     match shape:
         case Circle(radius, _, inner):
             if inner:
-                return {"type": f"{way}Annulus", "inner": inner, "outer": radius, "x": x, "y": y}
-            return {"type": f"{way}Circle", "radius": radius, "x": x, "y": y}
+                return {"type": f"{kind}Annulus", "inner": inner, "outer": radius, "x": x, "y": y}
+            return {"type": f"{kind}Circle", "radius": radius, "x": x, "y": y}
         case Rectangle(half_x, half_y):
-            return {"type": f"{way}Rectangle", "width": 2.0 * half_x, "height": 2.0 * half_y, "x": x, "y": y, **turn}
+            return {"type": f"{kind}Rectangle", "width": 2.0 * half_x, "height": 2.0 * half_y, "x": x, "y": y, **theta}
         case Ray(width):
-            return {"type": f"{way}Ray", "width": width, "x": x, "y": y, **turn}
+            return {"type": f"{kind}Ray", "width": width, "x": x, "y": y, **theta}
         case Polygon(corners):
             xs, ys = ([float(value) for value in axis] for axis in zip(*corners, strict=True))
-            return {"type": f"{way}Polygon", "xs": xs, "ys": ys}
+            return {"type": f"{kind}Polygon", "xs": xs, "ys": ys}
         case Ellipse():
             return None

@@ -121,17 +121,17 @@ def statements(lines: list[str]) -> list[Statement]:
     out: list[Statement | None] = []
     pending, first_line = "", 0
     for number, text in enumerate(lines, start=1):
-        text, first_line = _cut(text, "!")[0], first_line or number
+        text, first_line = _split(text, "!")[0], first_line or number
         if text.rstrip().endswith("&"):
             pending += text.rstrip()[:-1] + " "
             continue
-        out += [statement_of(first_line, part) for part in _cut(pending + text, ";")]
+        out += [statement_of(first_line, part) for part in _split(pending + text, ";")]
         pending, first_line = "", 0
-    out += [statement_of(first_line, part) for part in _cut(pending, ";")]
+    out += [statement_of(first_line, part) for part in _split(pending, ";")]
     return [statement for statement in out if statement is not None]
 
 
-def _cut(text: str, mark: str) -> list[str]:
+def _split(text: str, mark: str) -> list[str]:
     """Return the parts of a text between separators, ignoring separators inside quotes.
 
     Parameters
@@ -381,14 +381,14 @@ def _prescription(system: CodevSystem, glasses: Glasses) -> Prescription:
         raise source.error("an object in glass", read[0].line, read[0].medium)
     for k, surface in enumerate(read[1:], start=1):
         last = k == len(read) - 1
-        given = surface.decentre
+        decentre = surface.decentre
         if not math.isfinite(surface.thickness):
             raise source.error("an infinite distance behind an optical surface", surface.line)
-        shift = [given.get(name, 0.0) * scale for name in ("XDE", "YDE", "ZDE")]
+        shift = [decentre.get(name, 0.0) * scale for name in ("XDE", "YDE", "ZDE")]
         # Rotations about x and y are left-handed.
-        angles = [math.radians(sign * given.get(name, 0.0)) for name, sign in (("ADE", -1), ("BDE", -1), ("CDE", 1))]
-        turns = [about_axis(axis, angle) for axis, angle in enumerate(angles)]
-        rotation = turns[0] @ turns[1] @ turns[2]
+        angles = [math.radians(sign * decentre.get(name, 0.0)) for name, sign in (("ADE", -1), ("BDE", -1), ("CDE", 1))]
+        rotations = [about_axis(axis, angle) for axis, angle in enumerate(angles)]
+        rotation = rotations[0] @ rotations[1] @ rotations[2]
         before = chain.pose
         if last:
             # The image's "thickness" is a defocus along the axis of the arriving light.
@@ -456,15 +456,15 @@ def _shape(system: CodevSystem, surface: CodevSurface) -> Surface:
     if powers:
         raise system.source.error("even powers on a special surface", surface.line, allowed="SCO coefficients")
     conic = surface.polynomial.get(1, surface.conic)
-    given = {}
+    coefficients = {}
     for m in range(LARGEST_ORDER + 1):
         for n in range(LARGEST_ORDER + 1 - m):
             j = ((m + n) ** 2 + m + 3 * n) // 2 + 1
             if m + n and j in surface.polynomial:
-                given[(m, n)] = surface.polynomial[j] * scale ** (1 - m - n)
+                coefficients[(m, n)] = surface.polynomial[j] * scale ** (1 - m - n)
     sizes = [s for s in surface.sizes.values() if s > 0.0]
     radius = max(sizes, default=1.0)
-    scaled = {(m, n): c * radius ** (m + n) for (m, n), c in given.items()}
+    scaled = {(m, n): c * radius ** (m + n) for (m, n), c in coefficients.items()}
     return polynomial(even_asphere(surface.curvature / scale, conic, {}), scaled, radius)
 
 

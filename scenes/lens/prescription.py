@@ -70,16 +70,16 @@ def polynomial(surface: Surface, coefficients: Mapping[tuple[int, int], float], 
     ValueError
         The order is above LARGEST_ORDER.
     """
-    given = {k: c for k, c in coefficients.items() if c != 0.0}
-    order = max((a + b for a, b in given), default=0)
+    nonzero = {k: c for k, c in coefficients.items() if c != 0.0}
+    order = max((a + b for a, b in nonzero), default=0)
     if order > LARGEST_ORDER:
         raise ValueError(f"a polynomial of order {order}; at most {LARGEST_ORDER} is supported")
-    if not given:
+    if not nonzero:
         return surface
-    if set(given) <= set(_POLYNOMIAL) and not surface.terms:
-        term = XYPolynomial(**{_POLYNOMIAL[k]: c / radius ** sum(k) for k, c in given.items()})
+    if set(nonzero) <= set(_POLYNOMIAL) and not surface.terms:
+        term = XYPolynomial(**{_POLYNOMIAL[k]: c / radius ** sum(k) for k, c in nonzero.items()})
         return replace(surface, terms=(term,))
-    return surface.with_figure(ZernikeFigure(radius, (0.0, 0.0), zernike_of(given)))
+    return surface.with_figure(ZernikeFigure(radius, (0.0, 0.0), zernike_of(nonzero)))
 
 
 def zernike_of(coefficients: Mapping[tuple[int, int], float]) -> dict[int, float]:
@@ -167,8 +167,8 @@ def about_vertex(figure: ZernikeFigure) -> dict[tuple[int, int], float]:
     """
     order = max(figure.order, 0)
     table = monomials(figure.terms, order, figure.radius)
-    own = {(n - b, b): float(table[triangle_index(n - b, b)]) for n in range(order + 1) for b in range(n + 1)}
-    return moved_polynomial(own, figure.centre)
+    polynomial = {(n - b, b): float(table[triangle_index(n - b, b)]) for n in range(order + 1) for b in range(n + 1)}
+    return moved_polynomial(polynomial, figure.centre)
 
 
 def facing(surface: LensSurface) -> LensSurface:
@@ -195,10 +195,10 @@ def turned_over(surface: LensSurface) -> LensSurface:
         terms.append(XYPolynomial(**{n: -getattr(term, n) * (-1) ** b for (_, b), n in _POLYNOMIAL.items()}))
     figure = shape.figure
     if isinstance(figure, ZernikeFigure):
-        (cx, cy), given = figure.centre, figure.terms
+        (cx, cy), zernikes = figure.centre, figure.terms
         # sag(x, y) -> -sag(x, -y): terms that are odd in y keep their sign.
-        signs = {j: 1.0 if noll_to_nm(j)[1] < 0 else -1.0 for j in given}
-        figure = ZernikeFigure(figure.radius, (cx, -cy), {j: signs[j] * a for j, a in given.items()})
+        signs = {j: 1.0 if noll_to_nm(j)[1] < 0 else -1.0 for j in zernikes}
+        figure = ZernikeFigure(figure.radius, (cx, -cy), {j: signs[j] * a for j, a in zernikes.items()})
     elif figure is not None:
         raise TypeError("a figure on a grid")
     even = tuple(-a for a in shape.even)
@@ -310,7 +310,7 @@ def _entry(edge: Edge) -> dict[str, Any]:
         case _:
             out["half"] = metres(shape.half_x, shape.half_y)
     if edge.rotation and not isinstance(shape, Circle | Polygon):
-        out["turn"] = written(remainder(edge.rotation, 2.0 * pi), ANGLE)
+        out["rotation"] = written(remainder(edge.rotation, 2.0 * pi), ANGLE)
     return out
 
 
@@ -465,10 +465,10 @@ class Prescription:
         return self.surfaces[-1]
 
     def error(
-        self, problem: str, line: int | None = None, found: str | None = None, allowed: str | None = None
+        self, problem: str, line: int | None = None, value: str | None = None, allowed: str | None = None
     ) -> InputError:
         """Return an input error that names the prescription's file and a line of it, for the caller to raise."""
-        return InputError(Issue(problem, self.file, line or None, (), found, allowed))
+        return InputError(Issue(problem, self.file, line or None, (), value, allowed))
 
     def with_notes(self, *notes: Note) -> Prescription:
         """Return the prescription with further notes."""

@@ -76,12 +76,12 @@ class Source:
         self,
         problem: str,
         line: int | None = None,
-        found: object = None,
+        value: object = None,
         allowed: str | None = None,
         suggestion: str | None = None,
     ) -> InputError:
         """Return an input error that names the file and a line of it, for the caller to raise."""
-        text = None if found is None else shown(found)
+        text = None if value is None else shown(value)
         return InputError(Issue(problem, self.file, line, (), text, allowed, suggestion))
 
     def note(self, statement: Statement, text: str) -> None:
@@ -276,7 +276,7 @@ def named_glasses(glasses: Glasses, surfaces: Iterable[LensSurface]) -> Glasses:
 def paired(x: Sequence[float], y: Sequence[float], count: int = 0) -> tuple[tuple[float, float], ...]:
     """Return the pairs of x and y fields, as many as counted or as the longer row has; missing ones are zero."""
     count = count or max(len(x), len(y))
-    x, y = ([*given, *[0.0] * count][:count] for given in (x, y))
+    x, y = ([*values, *[0.0] * count][:count] for values in (x, y))
     return tuple(zip(x, y, strict=True))
 
 
@@ -482,8 +482,8 @@ def read_catalogue(path: str | Path) -> tuple[CatalogueGlass, ...]:
                     known = ", ".join(f"{k} {title}" for k, (title, _) in FORMULAS.items())
                     raise source.error("unknown dispersion formula", number, formula, known)
             case "CD" if name:
-                given = source.numbers(s, "a coefficient")
-                coefficients = tuple([*given, *[0.0] * 12][: max(12, len(given))])
+                listed = source.numbers(s, "a coefficient")
+                coefficients = tuple([*listed, *[0.0] * 12][: max(12, len(listed))])
             case "ED" if name and s.words and is_number(s.words[0]):
                 # A zero stands for missing data.
                 expansion = 1e-6 * source.finite(s, 0, "the expansion") or None

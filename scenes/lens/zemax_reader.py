@@ -117,8 +117,8 @@ def read_zemax(path: str | Path, glasses: statements.Glasses = statements.NO_GLA
         raise source.error("no surface in this file", len(lines), allowed="SURF 0, SURF 1, ... of a Zemax file")
     if len(system.surfaces) < 3:
         problem = "too few surfaces: the file is truncated or not an optical system"
-        found = f"{len(system.surfaces)} surfaces"
-        raise source.error(problem, system.surfaces[-1].line, found, "object, optics and image")
+        value = f"{len(system.surfaces)} surfaces"
+        raise source.error(problem, system.surfaces[-1].line, value, "object, optics and image")
     return _prescription(system, glasses)
 
 
@@ -313,11 +313,11 @@ def _break(source: statements.Source, chain: statements.Chain, surface: _Surface
     """Move the frame of the following surfaces by a coordinate break."""
     p = surface.parameters
     shift = (p.get(1, 0.0) * scale, p.get(2, 0.0) * scale, 0.0)
-    turns = [about_axis(axis, math.radians(p.get(3 + axis, 0.0))) for axis in range(3)]
+    rotations = [about_axis(axis, math.radians(p.get(3 + axis, 0.0))) for axis in range(3)]
     if p.get(6, 0.0) == 0.0:
-        chain.move(shift, turns[0] @ turns[1] @ turns[2])
+        chain.move(shift, rotations[0] @ rotations[1] @ rotations[2])
     else:
-        chain.move((0.0, 0.0, 0.0), turns[2] @ turns[1] @ turns[0])
+        chain.move((0.0, 0.0, 0.0), rotations[2] @ rotations[1] @ rotations[0])
         chain.move(shift)
 
 
@@ -357,9 +357,9 @@ def _shape(source: statements.Source, surface: _Surface, scale: float) -> Surfac
         if count and not radius > 0.0:
             raise source.error("a polynomial without a normalisation radius", line)
         pairs = [(order - b, b) for order in range(1, 23) for b in range(order + 1)]
-        given = {pair: x.get(3 + n, 0.0) * scale for n, pair in enumerate(pairs[:count])}
+        coefficients = {pair: x.get(3 + n, 0.0) * scale for n, pair in enumerate(pairs[:count])}
         try:
-            return polynomial(shape, given, radius)
+            return polynomial(shape, coefficients, radius)
         except ValueError as error:
             raise source.error(str(error), line) from None
     if surface.kind == "SZERNSAG":

@@ -82,7 +82,7 @@ MIN_ILLUMINATED = 20
 computed.
 """
 
-Cut = Callable[[np.ndarray, np.ndarray], np.ndarray]
+Vignetting = Callable[[np.ndarray, np.ndarray], np.ndarray]
 """Function that returns which rays are blocked by bodies about a camera.
 
 Its arguments are F fields, (F, 2), as fractions of the half field, and N points of the stop, (N, 2), in units of its
@@ -150,7 +150,7 @@ class FieldBeams:
         backend: Backend,
         fields: tuple[tuple[float, float], ...],
         rings: int,
-        vignetting: Cut | None = None,
+        vignetting: Vignetting | None = None,
         wavelength: float | None = None,
     ) -> FieldBeams:
         """Trace the beams through the camera as designed, limited by the stop, surface edges and ``vignetting``.
@@ -189,10 +189,10 @@ class FieldBeams:
             illuminated = valid.reshape(shape)[:, 1:]
             empty = np.flatnonzero(np.sum(illuminated, axis=-1) < MIN_ILLUMINATED)
             if empty.size:
-                found = f"field {field_text(spec, fields[empty[0]])}, {empty.size} of {len(fields)} fields tested"
+                value = f"field {field_text(spec, fields[empty[0]])}, {empty.size} of {len(fields)} fields tested"
                 key = ("mirrors", next(iter(model.edges)), "edges")
                 raise spec.error(
-                    "edges block practically all light", key, found=found, allowed="a smaller field, or wider edges"
+                    "edges block practically all light", key, value=value, allowed="a smaller field, or wider edges"
                 )
         if vignetting is not None:
             free = ~vignetting(np.array(fields), points[1:] / radius)

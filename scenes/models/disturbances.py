@@ -409,7 +409,7 @@ def _issue_at(resolved: ResolvedJob, cause: str, key: KeyPath, wrong: Problem) -
         return resolved.job.issue(wrong, (*at, *key))
     if changed_cause is not None and "bodies" in changed_cause.set_keys:
         text = f"{key[0]} of {cause}: {wrong.problem}"
-        return resolved.job.issue(Problem(text, wrong.found, wrong.allowed, wrong.suggestion), (*at, "bodies"))
+        return resolved.job.issue(Problem(text, wrong.value, wrong.allowed, wrong.suggestion), (*at, "bodies"))
     assert resolved.disturbances is not None
     return resolved.disturbances.issue(wrong, ("causes", cause, *key))
 
@@ -454,13 +454,13 @@ def _of_cause(
     Components with a standard deviation of zero are included.
     """
     components: list[Component] = []
-    turned: list[str] = []
+    rotated: list[str] = []
     refused: dict[KeyPath, list[str]] = {}
     for path in bodies:
         info = instrument.nodes[path]
         pivot = cause.pivot or default_pivot(info)
         if pivot not in (ORIGIN, *info.pivots):
-            turned.append(path)
+            rotated.append(path)
         can = _possible(info, path in glass)
         for key, kind, axis, sigma in _sigmas(cause):
             if _NEEDS.get(kind, kind) in can:
@@ -468,9 +468,9 @@ def _of_cause(
             elif path not in refused.setdefault(key[:1], []):
                 refused[key[:1]].append(path)
     issues = []
-    if turned:
-        known = tuple(dict.fromkeys((ORIGIN, *instrument.nodes[turned[0]].pivots)))
-        issues.append(where(name, ("pivot",), unknown(f"{_paths_text(turned)} has no such pivot", cause.pivot, known)))
+    if rotated:
+        known = tuple(dict.fromkeys((ORIGIN, *instrument.nodes[rotated[0]].pivots)))
+        issues.append(where(name, ("pivot",), unknown(f"{_paths_text(rotated)} has no such pivot", cause.pivot, known)))
     for key, paths in refused.items():
         allowed = names_text(sorted(_possible(instrument.nodes[paths[0]], paths[0] in glass))) or "nothing"
         issues.append(where(name, key, Problem(f"{_paths_text(paths)} does not allow {key[0]}", allowed=allowed)))

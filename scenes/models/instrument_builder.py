@@ -291,7 +291,7 @@ def _check_temperature(spec: InstrumentSpec, solids: Sequence[Solid]) -> None:
             f"the thermal expansion of {least.name} ({used[least]}) is known only for {least.known.text}"
             f" ({least.known.source})",
             ("temperature",),
-            found=f"{spec.temperature:.6g} K",
+            value=f"{spec.temperature:.6g} K",
             allowed=f"{all_of_them} with these materials, or other materials",
         )
 

@@ -271,9 +271,9 @@ def monitor_chain(
         )
     into_camera = to_base.inverse()
     length = sqrt(transfer**2 - (2.0 * off) ** 2)
-    turned = np.cross(up, toward)
+    across = np.cross(up, toward)
     # Of the two mirror-image prisms, choose the one that lies more nearly across the line.
-    x_axes = {hand: (length * toward + hand * 2.0 * off * turned) / transfer for hand in (1.0, -1.0)}
+    x_axes = {hand: (length * toward + hand * 2.0 * off * across) / transfer for hand in (1.0, -1.0)}
     hand = min(x_axes, key=lambda h: abs(x_axes[h][1]))
     pose = Pose(_columns(x_axes[hand], up), beam.middle + 0.5 * transfer * toward)
     pose = pose @ _tilt_about(large.tilt, large.reflector.null_point(length, large.width))
@@ -337,7 +337,7 @@ def check_prisms(spec: InstrumentSpec) -> None:
                     raise spec.error(
                         f"{camera}/{channel} has a different kind of reflector than the channels before it",
                         spec.key_of(camera, channel, ("monitor", name, "kind")),
-                        found=prism.kind,
+                        value=prism.kind,
                         allowed="the same kind in all channels of an instrument, which are traced together",
                     )
             face = parts.return_face.aperture
@@ -349,7 +349,7 @@ def check_prisms(spec: InstrumentSpec) -> None:
                         f"the index of {prism.material} is not known at the monitor's wavelength of "
                         f"{1e9 * wavelength:.6g} nm",
                         (*key, "material"),
-                        found=prism.material,
+                        value=prism.material,
                         allowed=f"a glass for that wavelength, or a wavelength from {1e9 * medium.shortest:.6g} to "
                         f"{1e9 * medium.longest:.6g} nm",
                     )

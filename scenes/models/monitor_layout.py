@@ -64,7 +64,7 @@ class MonitorDesignSetup(ExperimentSetup[MonitorDesignSpec]):
         if start.as_built:
             problem = f"{start.name} is an instrument as built; a layout starts from a drawing"
             allowed = "the drawing that its file names as its design"
-            raise test.error(problem, ("instrument",), found=test.instrument, allowed=allowed)
+            raise test.error(problem, ("instrument",), value=test.instrument, allowed=allowed)
         owner: Spec = test
         references = test.disturbances
         if references is None:
@@ -92,7 +92,7 @@ class MonitorDesignSetup(ExperimentSetup[MonitorDesignSpec]):
         """Check that the design can start from this instrument; return the set-up."""
         test, start = self.test, self.instrument
         if len(start.cameras) != 2:
-            raise test.error("a layout is designed for a pair", ("instrument",), found=f"{len(start.cameras)} cameras")
+            raise test.error("a layout is designed for a pair", ("instrument",), value=f"{len(start.cameras)} cameras")
         if test.goal.height is not None and start.altitude is None:
             raise test.error(f"{start.name} does not state its altitude", ("goal", "height"), allowed="angle or d_f")
         start_beams(self)
@@ -185,7 +185,7 @@ def start_beams(setup: MonitorDesignSetup) -> Layout:
         ]
         if len(channels) != len(made_again) or not np.allclose(_flat(layouts[0]), _flat(layouts[1]), atol=1e-12):
             problem = f"the channels of {camera} do not mirror those of {first}"
-            raise setup.test.error(problem, ("instrument",), found=start.name, allowed="the same beams, mirrored")
+            raise setup.test.error(problem, ("instrument",), value=start.name, allowed="the same beams, mirrored")
     return tuple(beams)
 
 
@@ -204,7 +204,7 @@ def _prisms_of(setup: MonitorDesignSetup, channel: instruments.ChannelParts) -> 
             return name
     problem = f"the channels of {setup.instrument.name} have prisms that the design does not name"
     allowed = "an entry of prisms with these"
-    raise setup.test.error(problem, ("prisms",), found=f"{has[0]}, {has[1]}", allowed=allowed)
+    raise setup.test.error(problem, ("prisms",), value=f"{has[0]}, {has[1]}", allowed=allowed)
 
 
 def _ccd_of(setup: MonitorDesignSetup) -> str:

@@ -381,7 +381,7 @@ def measured_finishes(resolved: ResolvedJob) -> MeasuredFinishes | None:
                 coatings[kind] = read_coating(spec.coating.table).at(resolved.instrument.autocollimator.wavelength)
             except ValueError as error:
                 text = f"the monitor's wavelength is not in the coating's table: {error}"
-                raise resolved.job.error(text, (*key, "coating"), found=spec.coating.table) from None
+                raise resolved.job.error(text, (*key, "coating"), value=spec.coating.table) from None
         if spec.bsdf is not None:
             scatter[kind] = read_bsdf(spec.bsdf.table)
         try:

@@ -109,13 +109,13 @@ class WavefrontReadingsSpec(ReadingsSpec):
     def _terms_are_a_range(self) -> WavefrontReadingsSpec:
         first, last = (noll(term) for term in self.terms)
         if not 4 <= first <= last <= MAX_NOLL:
-            found = f"{self.terms[0]} to {self.terms[1]}"
-            raise Problem("not a range of terms", found, f"Z4 to Z11, at most Z{MAX_NOLL}", within=("terms",))
+            value = f"{self.terms[0]} to {self.terms[1]}"
+            raise Problem("not a range of terms", value, f"Z4 to Z11, at most Z{MAX_NOLL}", within=("terms",))
         if self.zernikes is not None and self.maps is not None:
             raise Problem("coefficients and maps", "zernikes and maps", "one of them", within=("maps",))
         if self.maps is not None and len(self.maps) != len(self.fields):
-            found, allowed = f"{len(self.maps)} maps", f"{len(self.fields)}, one for each field"
-            raise Problem("the number of maps differs from the number of fields", found, allowed, within=("maps",))
+            value, allowed = f"{len(self.maps)} maps", f"{len(self.fields)}, one for each field"
+            raise Problem("the number of maps differs from the number of fields", value, allowed, within=("maps",))
         return self
 
     @property
@@ -342,8 +342,8 @@ class PositionReadingsSpec(ReadingsSpec):
     @model_validator(mode="after")
     def _as_many(self) -> PositionReadingsSpec:
         if self.frame == FREE and len(self.bodies) < 3:
-            found = f"{len(self.bodies)} bodies"
-            raise Problem("too few bodies for a free frame", found, "three bodies, or frame: base", within=("frame",))
+            value = f"{len(self.bodies)} bodies"
+            raise Problem("too few bodies for a free frame", value, "three bodies, or frame: base", within=("frame",))
         return self
 
 

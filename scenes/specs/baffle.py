@@ -180,9 +180,9 @@ Half = Annotated[tuple[float, float], Vector(Quantity(LENGTH, above_zero=True), 
 SIZES: Mapping[str, tuple[tuple[str, ...], tuple[str, ...]]] = FrozenMap(
     {
         "circle": (("radius",), ("inner",)),
-        "rectangle": (("half",), ("turn",)),
-        "ellipse": (("half",), ("turn",)),
-        "ray": (("width",), ("turn",)),
+        "rectangle": (("half",), ("rotation",)),
+        "ellipse": (("half",), ("rotation",)),
+        "ray": (("width",), ("rotation",)),
         "polygon": (("corners",), ()),
     }
 )
@@ -210,7 +210,7 @@ class SurfaceEdgeSpec(Spec):
         Half widths of a rectangle or an ellipse along x and y, in metres.
     width : float | None
         Width of a ray, a vane that extends without end along x before its rotation, in metres.
-    turn : float | None
+    rotation : float | None
         Rotation of a rectangle, an ellipse or a ray about its centre, right-handed about the surface's z, in radians;
         zero by default.
     corners : tuple[tuple[float, float], ...] | None
@@ -224,7 +224,7 @@ class SurfaceEdgeSpec(Spec):
     inner: PositiveLength | None = None
     half: Half | None = None
     width: PositiveLength | None = None
-    turn: Annotated[float, Quantity(ANGLE, largest="360 deg")] | None = None
+    rotation: Annotated[float, Quantity(ANGLE, largest="360 deg")] | None = None
     corners: Annotated[tuple[Vector2, ...], Field(min_length=3, max_length=1000)] | None = None
 
     @model_validator(mode="after")
@@ -232,7 +232,7 @@ class SurfaceEdgeSpec(Spec):
         require_one(self, ("clear", "blocks"), "an edge is clear or blocks", "clear: SHAPE, or blocks: SHAPE")
         needed, possible = SIZES[self.shape]
         centred = () if self.shape == "polygon" else ("centre",)
-        for name in ("centre", "radius", "inner", "half", "width", "turn", "corners"):
+        for name in ("centre", "radius", "inner", "half", "width", "rotation", "corners"):
             present = getattr(self, name) is not None
             if present and name not in (*needed, *possible, *centred):
                 names = ", ".join((*needed, *possible, *centred))
@@ -260,4 +260,4 @@ class SurfaceEdgeSpec(Spec):
             shape = Ray(self.width, centre)
         else:
             shape = Polygon(self.corners or ())
-        return Edge(shape, self.blocks is not None, self.turn or 0.0)
+        return Edge(shape, self.blocks is not None, self.rotation or 0.0)

@@ -537,7 +537,7 @@ class MirrorSpec(Spec):
     radius : float
         Vertex radius of curvature, in metres, positive if the centre of curvature lies toward +z; ``flat`` for a plane.
     conic : float
-        Conic constant k.
+        Conic constant k: 0 for a sphere, the default, -1 for a paraboloid, less for a hyperboloid.
     aspheric : Mapping[str, float]
         Coefficients A4, A6, ... of the sag beyond the conic's, in 1/m^3, 1/m^5, ...; by default a pure conic.
     sag : Mapping[str, SagTerm] | None
@@ -580,8 +580,8 @@ class MirrorSpec(Spec):
         media = [key for key in ("index", "glass") if getattr(self, key) is not None]
         if (self.light == "refracts") != bool(media):
             problem = "an index or a glass belongs to a face of a lens (light: refracts), and to no other surface"
-            found = f"{' and '.join(media)}, light: {self.light or 'reflected'}" if media else "no index"
-            raise Problem(problem, found, "light: refracts with an index or a glass", within=("light",))
+            value = f"{' and '.join(media)}, light: {self.light or 'reflected'}" if media else "no index"
+            raise Problem(problem, value, "light: refracts with an index or a glass", within=("light",))
         if len(media) > 1:
             problem = "the index of a glass follows from its dispersion"
             raise Problem(problem, "index and glass", "only one of them", within=("index",))
@@ -735,8 +735,8 @@ class CameraSpec(TitledSpec):
                 problem = "lens faces must alternate between into and out of glass; cemented lenses are not supported"
                 allowed = "index: 1 where light leaves glass" if inside else "an index above 1 where light enters glass"
                 key = "index" if mirror.glass is None else "glass"
-                found = f"{mirror.index:g}" if mirror.glass is None else mirror.glass.name
-                raise Problem(problem, found, allowed, within=("mirrors", name, key))
+                value = f"{mirror.index:g}" if mirror.glass is None else mirror.glass.name
+                raise Problem(problem, value, allowed, within=("mirrors", name, key))
             inside = "" if inside else name
         if inside:
             problem = "light enters glass and does not leave it"
@@ -882,7 +882,7 @@ class CameraSpec(TitledSpec):
                 raise self.error(problem, ("mirrors", name, "edges"), allowed="no edges")
             if mirror.light is not None:
                 problem = f"{where} must consist of mirrors only"
-                raise self.error(problem, ("mirrors", name, "light"), found=mirror.light, allowed="mirrors")
+                raise self.error(problem, ("mirrors", name, "light"), value=mirror.light, allowed="mirrors")
             if on_axis and (mirror.decentre or mirror.rotate or isinf(mirror.radius)):
                 key = next(k for k in ("decentre", "rotate", "radius") if k == "radius" or getattr(mirror, k))
                 problem = f"{where} must have curved mirrors about one axis"

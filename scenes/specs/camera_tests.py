@@ -370,8 +370,8 @@ class ScanSpec(Spec):
 
     Attributes
     ----------
-    reach : float
-        Half range of the first scan, which goes from -reach to +reach, in metres.
+    half_range : float
+        Half range of the first scan, which goes from -half_range to +half_range, in metres.
     step : float
         Step of the first scan, in metres.
     points : int
@@ -382,7 +382,7 @@ class ScanSpec(Spec):
         Nyquist frequency.
     """
 
-    reach: unit_fields.PositiveLength
+    half_range: unit_fields.PositiveLength
     step: unit_fields.PositiveLength
     points: Annotated[Whole, Field(ge=7, le=101)] = 9
     depth: Annotated[Number, Field(ge=0.2, le=1.5)] = 0.6
@@ -485,9 +485,9 @@ class FocusTestSpec(CameraUnderTestSpec):
 
     @model_validator(mode="after")
     def _scan_has_steps(self) -> FocusTestSpec:
-        if 2.0 * self.scan.reach < 5.0 * self.scan.step:
-            found = f"{format_quantity(self.scan.step, LENGTH)} over +-{format_quantity(self.scan.reach, LENGTH)}"
-            raise Problem("fewer than six positions through focus", found, "a smaller step", within=("scan", "step"))
+        if 2.0 * self.scan.half_range < 5.0 * self.scan.step:
+            value = f"{format_quantity(self.scan.step, LENGTH)} over +-{format_quantity(self.scan.half_range, LENGTH)}"
+            raise Problem("fewer than six positions through focus", value, "a smaller step", within=("scan", "step"))
         if len(set(self.fields)) < len(self.fields):
             raise Problem("a field is given twice", str(list(self.fields)), "different fields", within=("fields",))
         return self
@@ -512,7 +512,7 @@ class DistortionTestSpec(CameraUnderTestSpec):
         Band whose line CCD is measured.
     points : int
         Number of points over the field.
-    reach : float
+    extent : float
         Distance of the first and last point from the line's centre, as a fraction of half the line's length.
     sets : int
         Number of times that all points are measured.
@@ -540,7 +540,7 @@ class DistortionTestSpec(CameraUnderTestSpec):
     pinhole: unit_fields.PositiveLength
     band: Name
     points: Annotated[Whole, Field(ge=3, le=1001)]
-    reach: Annotated[Number, Field(ge=0.05, lt=1.0)]
+    extent: Annotated[Number, Field(ge=0.05, lt=1.0)]
     sets: Annotated[Whole, Field(ge=1, le=1000)]
     light: Light
     frames: Frames = 4
@@ -739,8 +739,8 @@ class MeasuredFocusSpec(TitledSpec):
     @model_validator(mode="after")
     def _shim_for_each_hole(self) -> MeasuredFocusSpec:
         if self.shims is not None and len(self.shims) != len(self.mount.holes):
-            found, allowed = f"{len(self.shims)} of them", f"{len(self.mount.holes)}, one for each hole"
-            raise Problem("the number of shims differs from the number of holes", found, allowed, within=("shims",))
+            value, allowed = f"{len(self.shims)} of them", f"{len(self.mount.holes)}, one for each hole"
+            raise Problem("the number of shims differs from the number of holes", value, allowed, within=("shims",))
         return self
 
 
@@ -786,8 +786,8 @@ class LensSpec(Spec):
         for name in ("front_radius", "back_radius"):
             radius = getattr(self, name)
             if 2.0 * abs(radius) <= self.diameter:
-                found, allowed = format_quantity(radius, LENGTH), "a length above half the diameter in size"
-                raise Problem("the surface is too strongly curved for its diameter", found, allowed, within=(name,))
+                value, allowed = format_quantity(radius, LENGTH), "a length above half the diameter in size"
+                raise Problem("the surface is too strongly curved for its diameter", value, allowed, within=(name,))
         return self
 
 
@@ -935,7 +935,7 @@ class BenchErrorsSpec(Spec):
 
 
 class AutocollimatorTestSpec(TitledSpec):
-    """Test with two autocollimators.
+    """Principle experiment: two autocollimators read two mirrors on a turntable that rotates in known steps.
 
     Attributes
     ----------

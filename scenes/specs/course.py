@@ -209,8 +209,8 @@ class CourseSpec(Spec):
             raise Problem("nothing changes", None, f"{', '.join(names)} or {last}", None, key)
         for name, values in series.items():
             if values is not None and len(values) != len(self.times):
-                found, allowed = f"{len(values)} entries", f"{len(self.times)}, as many as there are times"
-                raise Problem("not one entry for each time", found, allowed, None, (*key, name))
+                value, allowed = f"{len(values)} entries", f"{len(self.times)}, as many as there are times"
+                raise Problem("not one entry for each time", value, allowed, None, (*key, name))
 
     @property
     def shown(self) -> int:
@@ -306,8 +306,8 @@ def read_course(path: Path, named: CourseSpec) -> CourseSpec:
     if twice is not None:
         raise InputError(Issue("a second column with this head", file, head_line, (twice.strip(),)))
     if TIME not in [column.what for column in columns]:
-        text, found = "there is no column of times", names_text(heads)
-        raise InputError(Issue(text, file, head_line, found=found, allowed="time [min]"))
+        text, actual = "there is no column of times", names_text(heads)
+        raise InputError(Issue(text, file, head_line, value=actual, allowed="time [min]"))
     data: dict[str, Any] = {"times": [None] * len(body), "temperature": {}, "motion": {}}
     lines: dict[KeyPath, int] = {(): head_line, ("temperature",): head_line, ("motion",): head_line}
     for k, (line, cells) in enumerate(body):
@@ -332,7 +332,7 @@ def _column(head: str, file: str, line: int) -> _Column:
     """Return the column of a head; raise `InputError` for an unknown head."""
     match = _HEAD.fullmatch(head.strip())
     if match is None:
-        raise InputError(Issue("not the head of a column", file, line, found=shown(head.strip()), allowed=HEADS))
+        raise InputError(Issue("not the head of a column", file, line, value=shown(head.strip()), allowed=HEADS))
     what, node, axis = match["what"], match["node"] or "", match["axis"]
     known = (*VECTORS, *NUMBERS) if node else (TIME,)
     if what not in known:

@@ -69,8 +69,8 @@ class DetectorSpec(TitledSpec):
     @model_validator(mode="after")
     def _leaves_grey_values(self) -> "DetectorSpec":
         if self.offset_dn >= self.max_dn:
-            found, allowed = f"{self.offset_dn:g} with {self.bit_depth} bits", f"less than {self.max_dn}"
-            raise Problem("no grey values are left above the offset", found, allowed, within=("offset_dn",))
+            value, allowed = f"{self.offset_dn:g} with {self.bit_depth} bits", f"less than {self.max_dn}"
+            raise Problem("no grey values are left above the offset", value, allowed, within=("offset_dn",))
         steps = self.system_gain_dn_per_e * self.full_well_e
         if steps < LEAST_STEPS:
             raise Problem(
@@ -117,7 +117,7 @@ class DetectorSpec(TitledSpec):
             raise self.error(
                 "the dark current alone saturates the pixels",
                 ("dark_current_e_per_s",),
-                found=self.dark_current_e_per_s,
+                value=self.dark_current_e_per_s,
                 allowed=f"less than {limit / exposure:.3g} electrons per second with the exposure of"
                 f" {format_quantity(exposure, TIME)}, or a shorter exposure",
             )
@@ -130,4 +130,4 @@ def require_detector(setup: Spec, key: KeyPath, name: str, detectors: Mapping[st
     """
     if name not in detectors:
         allowed = names_text(detectors) or "a data sheet of that name in `detectors:`"
-        raise setup.error("no such detector in this file", key, found=name, allowed=allowed)
+        raise setup.error("no such detector in this file", key, value=name, allowed=allowed)

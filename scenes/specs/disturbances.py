@@ -167,16 +167,16 @@ MOVES = ("shift", "rotate", "scale", "figure", "radius", "conic", "temperature",
 def _check_matrix(rows: tuple[tuple[float, ...], ...], count: int, within: KeyPath = ()) -> None:
     """Raise `Problem` unless rows form a correlation matrix of ``count`` components; eigenvalues are not checked."""
     if len(rows) != count or any(len(row) != count for row in rows):
-        found = f"{len(rows)} rows of {names_text(dict.fromkeys(len(row) for row in rows)) or 'nothing'}"
-        raise Problem("not a matrix of this size", found, f"{count} rows of {count} numbers", within=within)
+        value = f"{len(rows)} rows of {names_text(dict.fromkeys(len(row) for row in rows)) or 'nothing'}"
+        raise Problem("not a matrix of this size", value, f"{count} rows of {count} numbers", within=within)
     for i, row in enumerate(rows):
         if row[i] != 1.0:
             problem = "a correlation matrix has ones on its diagonal"
             raise Problem(problem, f"{row[i]:g}", "1", within=(*within, i, i))
         for j in range(i):
             if row[j] != rows[j][i]:
-                found = f"{row[j]:g} and {rows[j][i]:g}"
-                raise Problem("a correlation matrix is symmetric", found, "equal", within=(*within, i, j))
+                value = f"{row[j]:g} and {rows[j][i]:g}"
+                raise Problem("a correlation matrix is symmetric", value, "equal", within=(*within, i, j))
 
 
 class CorrelationSpec(spec.Spec):
@@ -374,15 +374,15 @@ class JointSpec(spec.Spec):
         if sorted(heads) != sorted(names):
             extra = [head for head in heads if head not in names]
             missing = [name for name in names if name not in heads]
-            found = f"{names_text(extra[:3])} among the heads" if extra else f"no column {names_text(missing[:3])}"
-            found = found if extra or missing else "a repeated column"
+            value = f"{names_text(extra[:3])} among the heads" if extra else f"no column {names_text(missing[:3])}"
+            value = value if extra or missing else "a repeated column"
             problem = f"not the components of {self.source.file or 'the file of disturbances'}"
-            raise InputError(Issue(problem, str(path), line, (), found, f"their {len(names)} names, each once"))
+            raise InputError(Issue(problem, str(path), line, (), value, f"their {len(names)} names, each once"))
         order = [heads.index(name) for name in names]
         table = [self._row(path, *row, len(names)) for row in rows[1:]]
         if len(table) != len(names):
-            problem, found = "not a matrix of this size", f"{len(table)} rows"
-            raise InputError(Issue(problem, str(path), None, (), found, f"a row for each of the {len(names)} heads"))
+            problem, value = "not a matrix of this size", f"{len(table)} rows"
+            raise InputError(Issue(problem, str(path), None, (), value, f"a row for each of the {len(names)} heads"))
         matrix = tuple(tuple(table[i][j] for j in order) for i in order)
         try:
             _check_matrix(matrix, len(names))
@@ -390,7 +390,7 @@ class JointSpec(spec.Spec):
             row, column = (int(k) for k in wrong.within)
             where = f"{names[row]}, {names[column]}"
             at = rows[1 + order[row]][0]
-            raise InputError(Issue(wrong.problem, str(path), at, (where,), wrong.found, wrong.allowed)) from None
+            raise InputError(Issue(wrong.problem, str(path), at, (where,), wrong.value, wrong.allowed)) from None
         return self.model_copy(update={"correlation": matrix, "correlation_file": None})
 
     @staticmethod

@@ -225,7 +225,7 @@ class JobSpec(Spec):
     analysis : AnalysisSpec
         Analysis of the monitor's images.
     refocus : bool
-        Whether the focal plane of a camera without a monitor is moved to its best position in this state, as the option
+        True to move the focal plane of a camera without a monitor to its best position in this state, as the option
         `--refocus` of `twin.camera` does; all results are those after refocusing.
     """
 

@@ -180,7 +180,7 @@ def checked(owner: Spec, key: KeyPath, spec: TableSpec) -> TableSpec:
     if ending in node_table.INPUT_DECKS:
         text = f"a {ending} file has no {'temperatures' if heat else 'displacements'} that this program can read"
         raise owner.error(
-            text, table_key, found=spec.table, allowed=node_table.HEAT_DECKS_NEED if heat else node_table.DECKS_NEED
+            text, table_key, value=spec.table, allowed=node_table.HEAT_DECKS_NEED if heat else node_table.DECKS_NEED
         )
     if ending not in known:
         text = "unknown type of table or mesh"
@@ -193,11 +193,11 @@ def checked(owner: Spec, key: KeyPath, spec: TableSpec) -> TableSpec:
             raise owner.error(text, (*key, wrong), allowed=f"no {wrong}")
     elif spec.unit is None:
         raise owner.error(
-            "a mesh file does not contain its unit", table_key, found=spec.table, allowed="a key unit: mm"
+            "a mesh file does not contain its unit", table_key, value=spec.table, allowed="a key unit: mm"
         )
     elif isinstance(spec, TableTemperatureSpec) and spec.values is None:
         text = "the file of a mesh does not say whether its temperatures are changes or absolute"
-        raise owner.error(text, table_key, found=spec.table, allowed="values: change, K or degC as a further key")
+        raise owner.error(text, table_key, value=spec.table, allowed="values: change, K or degC as a further key")
     if isinstance(spec, TableTemperatureSpec):
         node_table.read_temperatures(path, spec.unit, spec.field, spec.values, spec.sha256)
     else:
@@ -359,11 +359,11 @@ def checked_finishes(owner: Spec, key: KeyPath, spec: FinishesSpec) -> FinishesS
         suffixes = (ENDING,) if what == "bsdf" else node_table.TABLES
         if ending not in suffixes:
             text = f"not the file type of a {what} table"
-            raise owner.error(text, table_key, found=table.table, allowed=names_text(suffixes))
+            raise owner.error(text, table_key, value=table.table, allowed=names_text(suffixes))
         digest = digest_of(path)
         if table.sha256 is not None and digest != table.sha256:
             text = "not the table that was used: its checksum differs"
-            raise owner.error(text, table_key, found=digest, allowed=f"sha256 {table.sha256}")
+            raise owner.error(text, table_key, value=digest, allowed=f"sha256 {table.sha256}")
         if what == "bsdf":
             read_bsdf(path)
         else:

@@ -115,7 +115,7 @@ def _as_built(spec: AsBuiltInstrumentSpec) -> InstrumentSpec:
     if isinstance(data, dict) and DESIGN in data:
         problem, name = "this design is itself an instrument as built", shown(data[DESIGN])
         allowed = f"its design, {name}, with all deviations below as_built"
-        raise spec.error(problem, (DESIGN,), found=spec.design, allowed=allowed)
+        raise spec.error(problem, (DESIGN,), value=spec.design, allowed=allowed)
     disturbances = spec.disturbances
     if disturbances is not None and disturbances != NONE:
         disturbances = portable_reference(DISTURBANCES, disturbances, spec, ("disturbances",))
@@ -273,7 +273,7 @@ def load_camera_under_test(test: TestType) -> tuple[TestType, CameraSpec]:
     instrument = load_instrument(test.camera, test, key)
     if len(instrument.cameras) > 1:
         problem = f"the test needs a single camera, but {instrument.name} has {names_text(instrument.cameras)}"
-        raise test.error(problem, key, found=test.camera, allowed="an instrument as built to a camera's design")
+        raise test.error(problem, key, value=test.camera, allowed="an instrument as built to a camera's design")
     (name, mounted), *_ = instrument.cameras.items()
     built = dict(test.as_built)
     for node, what in (instrument.as_built or {}).items():

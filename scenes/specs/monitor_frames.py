@@ -186,8 +186,8 @@ class MeasurementSpec(Spec):
         for name, files in self.frames.items():
             where = ("frames", name, "after")
             if self.times is not None and len(files.after) != len(self.times):
-                found, allowed = f"{len(files.after)} of {len(self.times)} times", "one file or list of files a time"
-                raise Problem("not as many entries as times", found, allowed, within=where)
+                value, allowed = f"{len(files.after)} of {len(self.times)} times", "one file or list of files a time"
+                raise Problem("not as many entries as times", value, allowed, within=where)
             if self.times is None and any(len(entry) > 1 for entry in files.after):
                 text = "lists of files need several times"
                 raise Problem(text, None, "times: [...], or a plain list", within=where)
@@ -336,7 +336,7 @@ def _frame_files(
         return read_frame_table(path, channels)
     if is_file(path):
         allowed = "a folder of frames, a .csv table of files, or CAMERA/CHANNEL: {before: FILE, after: FILE}"
-        raise spec.error("neither a folder nor a table", ("frames",), found=spec.frames, allowed=allowed)
+        raise spec.error("neither a folder nor a table", ("frames",), value=spec.frames, allowed=allowed)
     try:
         names = sorted(entry.name for entry in path.iterdir())
     except (OSError, ValueError):

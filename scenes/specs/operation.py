@@ -191,7 +191,7 @@ class TermSpec(Spec):
     window : float | None
         Length of the window, ending at the reading, over which the input is averaged, in seconds.
     relative : bool
-        True if the newest sample minus its mean over `window` acts.
+        True if the effect follows the input's newest sample minus its mean over `window`.
     lag : TimeConstantSpec | None
         Time constant of a first-order lag with which the input acts.
     gap : float
@@ -264,8 +264,8 @@ class FocusSpec(Spec):
     camera : str
         Camera whose readings of kind `focus` are used.
     motion : str
-        Shift in whose amount the readings are, such as `base/telescope/M2 shift z`. The disturbances may only have this
-        motion, since no other is distinguishable.
+        Shift whose amount the readings give, such as `base/telescope/M2 shift z`. The disturbances may only have this
+        motion, since readings of focus cannot separate others from it.
     """
 
     camera: Name
@@ -367,7 +367,7 @@ def resolve_operation(spec: OperationSpec) -> OperationSetup:
         reference = getattr(spec, key)
         if reference == NONE:
             problem, allowed = "a plan of operation needs disturbances", "the name of a file of disturbances"
-            raise spec.error(problem, (key,), found=reference, allowed=allowed)
+            raise spec.error(problem, (key,), value=reference, allowed=allowed)
         update[key] = portable_reference(folder, reference, spec, (key,), others)
     spec = spec.model_copy(update=update)
     setup = OperationSetup.model_construct(operation=spec, model=resolve_on(spec, spec.instrument, spec.disturbances))
@@ -505,7 +505,7 @@ def _is_measured(kind: str, columns: ReadingColumnSpec, where: tuple[str, ...]) 
     try:
         value, sigma = value_kinds(kind, where[-1])
     except Problem as problem:
-        raise Problem(problem.problem, problem.found, problem.allowed, within=where) from None
+        raise Problem(problem.problem, problem.value, problem.allowed, within=where) from None
     count = {QUATERNION: 4}.get(columns.unit, 3) if kind == "attitude" else 1
     if len(columns.column) != count:
         text = f"{len(columns.column)} columns for one {kind}"

@@ -384,7 +384,7 @@ class NodeInfo:
     allows : frozenset[str]
         Names in ACTIONS of the changes that are allowed.
     cold : str
-        Reason why the body has no temperature of its own; empty if it has first or the reason is obvious.
+        Reason why the body has no temperature of its own; empty if it has one or the reason is obvious.
     """
 
     pivots: tuple[str, ...] = (course.DEFAULT_PIVOT,)

@@ -151,9 +151,9 @@ def _with_instrument(job: JobSpec, instrument: InstrumentSpec) -> ResolvedJob:
     if job.render.target_images:
         line_detectors = FrozenMap({name: line_detector(camera) for name, camera in cameras.items()})
     # The parts are already validated; validating again would require quantities as text.
-    found: dict[str, Any] = {"detector": detector, "line_detectors": line_detectors}
-    found["disturbances"] = load.find_disturbances(job, instrument)
-    return ResolvedJob.model_construct(job=job, instrument=instrument, cameras=cameras, **found)
+    parts: dict[str, Any] = {"detector": detector, "line_detectors": line_detectors}
+    parts["disturbances"] = load.find_disturbances(job, instrument)
+    return ResolvedJob.model_construct(job=job, instrument=instrument, cameras=cameras, **parts)
 
 
 def resolve_budget(budget: ErrorBudgetSpec) -> ResolvedJob:
@@ -167,7 +167,7 @@ def resolve_budget(budget: ErrorBudgetSpec) -> ResolvedJob:
     resolved = resolve_on(budget, budget.instrument, budget.disturbances)
     if resolved.disturbances is None:
         text = "an error budget needs disturbances"
-        raise budget.error(text, ("disturbances",), found=budget.disturbances, allowed="the name of a file of them")
+        raise budget.error(text, ("disturbances",), value=budget.disturbances, allowed="the name of a file of them")
     return resolved
 
 
@@ -491,7 +491,7 @@ class CameraSetup(Spec):
     perturb : Mapping[str, PerturbationSpec]
         Perturbations of bodies of the instrument, as in a job; for a camera alone of its parts.
     refocus : bool
-        Whether the camera is refocused in that state, as in a job.
+        True if the camera is refocused in that state, as in a job.
     """
 
     camera: CameraSpec

@@ -92,8 +92,8 @@ class SpectrumSpec(Spec):
             self, ("between", "wavelengths", curve_key), "the spectrum must be given in exactly one way", allowed
         )
         if self.weights is not None and len(self.weights) != len(self.wavelengths or ()):
-            problem, found = ("not one weight for each wavelength", f"{len(self.weights)} weights")
-            raise Problem(problem, found, f"{len(self.wavelengths or ())} of them", within=("weights",))
+            problem, value = ("not one weight for each wavelength", f"{len(self.weights)} weights")
+            raise Problem(problem, value, f"{len(self.wavelengths or ())} of them", within=("weights",))
         if self.weights is not None and not any(self.weights):
             raise Problem("all weights are zero", None, "one above zero", within=("weights",))
         if self.black_body is not None and self.wavelengths is not None:
@@ -105,8 +105,8 @@ class SpectrumSpec(Spec):
     @model_validator(mode="after")
     def _ascends(self) -> SpectrumSpec:
         if self.between is not None and not self.between[0] <= self.between[1]:
-            found = f"[{', '.join(format_quantity(w, LENGTH) for w in self.between)}]"
-            raise Problem("the spectrum's wavelengths are in the wrong order", found, "[shortest, longest]")
+            value = f"[{', '.join(format_quantity(w, LENGTH) for w in self.between)}]"
+            raise Problem("the spectrum's wavelengths are in the wrong order", value, "[shortest, longest]")
         for name, values in (("wavelengths", self.wavelengths), ("curve", tuple(w for w, _ in self.curve or ()))):
             descending = next((k for k, (a, b) in enumerate(pairwise(values or ()), 1) if not a < b), None)
             if descending is not None:
@@ -208,7 +208,7 @@ class SpectrumSpec(Spec):
         table = read_table(path, columns, least_rows=2)
         if len(table) > MOST_SAMPLES:
             raise owner.error(
-                "the table has too many rows", (*key, "table"), found=len(table), allowed=f"at most {MOST_SAMPLES}"
+                "the table has too many rows", (*key, "table"), value=len(table), allowed=f"at most {MOST_SAMPLES}"
             )
         wavelengths, response = table["wavelength"], table["response"]
         descending = np.flatnonzero(np.diff(wavelengths) <= 0.0)

@@ -258,8 +258,8 @@ class FactorSpec(spec.Spec):
             raise Problem("a factor needs a key, a motion or scales", "no key", allowed)
         kinds = [kind for kind in KINDS if getattr(self, kind) is not None]
         if len(kinds) != 1:
-            found = ", ".join(kinds) or "none of them"
-            raise Problem("a factor needs exactly one kind of values", found, f"one of {', '.join(KINDS)}")
+            value = ", ".join(kinds) or "none of them"
+            raise Problem("a factor needs exactly one kind of values", value, f"one of {', '.join(KINDS)}")
         if self.values is not None and not self.values:
             raise Problem("the factor is empty", "an empty list", "one value or more", within=("values",))
         if self.count is not None and self.kind != "range":
@@ -274,12 +274,12 @@ class FactorSpec(spec.Spec):
         return next(kind for kind in KINDS if getattr(self, kind) is not None)
 
     @property
-    def places(self) -> tuple[KeyPath, ...]:
+    def key_paths(self) -> tuple[KeyPath, ...]:
         """All key paths in the base that get the value of the factor."""
         return self.keys if self.keys is not None else (self.key,) if self.key is not None else ()
 
     def key_of(self, k: int) -> KeyPath:
-        """Return the key path, within this factor, of entry number ``k`` of ``places``."""
+        """Return the key path, within this factor, of entry number ``k`` of ``key_paths``."""
         return ("key",) if self.key is not None else ("keys", k)
 
     @property
@@ -303,7 +303,7 @@ class FactorSpec(spec.Spec):
 
     def _check_scales(self) -> None:
         """Raise `Problem` unless a factor that scales is a positive number, and a pure number if it has no key."""
-        same = next((k for k, scale in enumerate(self.scales) if scale.key in self.places), None)
+        same = next((k for k, scale in enumerate(self.scales) if scale.key in self.key_paths), None)
         if same is not None:
             raise Problem("the factor sets this value itself", None, "another key", within=("scales", same, "key"))
         if not self.scales or self.table is not None:
@@ -311,9 +311,9 @@ class FactorSpec(spec.Spec):
         numbers = self.numbers()
         if not numbers.numeric:
             raise Problem("not numbers", shown(list(self.scalars())), "numbers, for scales", within=(self.kind,))
-        if not self.places and numbers.unit is not None:
-            found, allowed = f"a number with {numbers.unit}", "pure numbers: values: [0.5, 1, 2]"
-            raise Problem("a factor without a key is a ratio", found, allowed, within=(self.kind,))
+        if not self.key_paths and numbers.unit is not None:
+            value, allowed = f"a number with {numbers.unit}", "pure numbers: values: [0.5, 1, 2]"
+            raise Problem("a factor without a key is a ratio", value, allowed, within=(self.kind,))
 
     def _check_numbers(self) -> None:
         """Raise `Problem` unless parameters of a distribution are ordered numbers of one kind with a positive sigma."""
@@ -330,8 +330,8 @@ class FactorSpec(spec.Spec):
             low, high = numbers.values[-2:]
             if not low < high:
                 within = (self.kind, "limits") if self.kind == "truncated" else (self.kind,)
-                found = f"{self.scalars()[-2]} to {self.scalars()[-1]}"
-                raise Problem("the range is empty", found, "the smaller value first", within=within)
+                value = f"{self.scalars()[-2]} to {self.scalars()[-1]}"
+                raise Problem("the range is empty", value, "the smaller value first", within=within)
 
 
 @dataclass(frozen=True)
@@ -380,7 +380,7 @@ class Numbers:
                 # a division gives exactly 0.3 for 300 mm / (1000 mm/m); a product with 0.001 would not
                 numbers.append(number if unit == first else number / unit_ratio(first, unit))
             except Problem as problem:
-                raise Problem(problem.problem, problem.found, problem.allowed, within=(kind,)) from None
+                raise Problem(problem.problem, problem.value, problem.allowed, within=(kind,)) from None
         return cls(tuple(numbers), True, first, False)
 
 
@@ -405,8 +405,7 @@ class DesignSpec(spec.Spec):
     @model_validator(mode="after")
     def _has_runs(self) -> DesignSpec:
         if self.kind == GRID and self.runs is not None:
-            found = f"runs: {self.runs}"
-            raise Problem("a grid has as many runs as combinations", found, "no runs", within=("runs",))
+            raise Problem("a grid has as many runs as combinations", f"runs: {self.runs}", "no runs", within=("runs",))
         if self.kind != GRID and self.runs is None:
             raise Problem(f"a design of kind {self.kind} needs its number of runs", None, "runs: 1000")
         return self
@@ -501,8 +500,8 @@ class ResponseSpec(spec.Spec):
     def _is_of_one_unit(self) -> ResponseSpec:
         for name, key in (("minus", self.minus), ("sigma", self.sigma), ("noise", self.noise)):
             if key is not None and unit_of(key) != unit_of(self.key):
-                found = f"{unit_of(key) or 'no unit'} and {unit_of(self.key) or 'no unit'}"
-                raise Problem("two units in one response", found, "keys that end in the same unit", within=(name,))
+                value = f"{unit_of(key) or 'no unit'} and {unit_of(self.key) or 'no unit'}"
+                raise Problem("two units in one response", value, "keys that end in the same unit", within=(name,))
         return self
 
     @property
@@ -634,7 +633,7 @@ class StudySpec(spec.TitledSpec):
     def _fits_together(self) -> StudySpec:
         factors: dict[Any, str] = {}
         for name, factor in self.factors.items():
-            for k, key_path in enumerate(factor.places):
+            for k, key_path in enumerate(factor.key_paths):
                 if key_path in factors:
                     text = f"the factor {factors[key_path]} already changes this value"
                     within = ("factors", name, *factor.key_of(k))

@@ -176,8 +176,8 @@ class ToleranceSpec(Varied):
                 raise Problem("only a figure error has terms", self.motion, "M1 figure", within=("terms",))
             first, last = (noll(term) for term in self.terms)
             if not 4 <= first < last <= MAX_NOLL:
-                found = f"{self.terms[0]} to {self.terms[1]}"
-                raise Problem("not a range of terms", found, f"Z5 to Z36, at most Z{MAX_NOLL}", within=("terms",))
+                actual = f"{self.terms[0]} to {self.terms[1]}"
+                raise Problem("not a range of terms", actual, f"Z5 to Z36, at most Z{MAX_NOLL}", within=("terms",))
             if self.law != "normal" or self.mean is not None or self.measured is not None:
                 problem = "the terms of a figure error are distributed normally about zero"
                 raise Problem(problem, None, "no law, mean or measured", within=("law",))

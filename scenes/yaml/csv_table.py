@@ -106,13 +106,13 @@ class Table:
         row: int,
         name: str,
         problem: str,
-        found: str | None = None,
+        value: str | None = None,
         allowed: str | None = None,
         suggestion: str | None = None,
     ) -> InputError:
         """Return the input error of one cell, or of the whole row if the name of the column is empty."""
         key = (self.heads[name],) if name else ()
-        return InputError(Issue(problem, self.file, int(self.lines[row]), key, found, allowed, suggestion))
+        return InputError(Issue(problem, self.file, int(self.lines[row]), key, value, allowed, suggestion))
 
 
 def read_table(path: str | Path, columns: Sequence[Column], least_rows: int = 1) -> Table:
@@ -319,7 +319,7 @@ def _heads(
     missing = next((c for c in columns if c.needed and not any(c is other for other, _, _ in layout)), None)
     if missing is not None:
         have = names_text([head.strip() for head in heads])
-        raise InputError(Issue(f"no column {missing.head!r}", file, line, found=have, allowed=allowed))
+        raise InputError(Issue(f"no column {missing.head!r}", file, line, value=have, allowed=allowed))
     return layout
 
 
@@ -347,7 +347,7 @@ def _scale(file: str, line: int, head: str, column: Column, unit: str | None) ->
         return unit_ratio(unit.strip(), column.kind.si), 0.0
     except Problem as problem:
         allowed = names_text(column.kind.units)
-        issue = Issue(problem.problem, file, line, (head,), problem.found, allowed, problem.suggestion)
+        issue = Issue(problem.problem, file, line, (head,), problem.value, allowed, problem.suggestion)
         raise InputError(issue) from None
 
 

@@ -1,4 +1,4 @@
-"""Input errors that a user can act on: file, line, key, the value found, the values allowed, the nearest valid name."""
+"""Input errors that a user can act on: file, line, key, the value there, the values allowed, the nearest valid name."""
 
 from __future__ import annotations
 
@@ -31,8 +31,8 @@ class Issue:
         Line number, counted from 1; None if unknown.
     key : KeyPath
         Position in the file; empty for the file as a whole.
-    found : str | None
-        The value found there; None if showing it would not help.
+    value : str | None
+        The value in the file; None if showing it would not help.
     allowed : str | None
         The values that are allowed there.
     suggestion : str | None
@@ -43,7 +43,7 @@ class Issue:
     file: str = ""
     line: int | None = None
     key: KeyPath = ()
-    found: str | None = None
+    value: str | None = None
     allowed: str | None = None
     suggestion: str | None = None
 
@@ -54,7 +54,7 @@ class Issue:
         if self.key:
             position += f": {key_text(self.key)}"
         text = f"{position}: {self.problem}"
-        details = [] if self.found is None else [f"found {self.found}"]
+        details = [] if self.value is None else [f"found {self.value}"]
         details += [] if self.allowed is None else [f"allowed: {self.allowed}"]
         rest = ", ".join(details)
         if self.suggestion is not None:  # comes first because the list of allowed values can be long
@@ -73,7 +73,7 @@ class InputError(Exception):
     ----------
     issues : tuple of Issue
         All issues.
-    file, line, key, found, allowed, suggestion
+    file, line, key, value, allowed, suggestion
         Fields of the first issue.
     """
 
@@ -83,7 +83,7 @@ class InputError(Exception):
         super().__init__(*issues)
         self.issues, first = issues, issues[0]
         self.file, self.line, self.key = first.file, first.line, first.key
-        self.found, self.allowed, self.suggestion = first.found, first.allowed, first.suggestion
+        self.value, self.allowed, self.suggestion = first.value, first.allowed, first.suggestion
 
     def __str__(self) -> str:
         return "\n".join(str(issue) for issue in self.issues)
@@ -94,7 +94,7 @@ class Problem(ValueError):
 
     Attributes
     ----------
-    problem, found, allowed, suggestion
+    problem, value, allowed, suggestion
         Fields as in `Issue`.
     within : KeyPath
         Position of the fault inside the value; empty for the value as a whole.
@@ -103,13 +103,13 @@ class Problem(ValueError):
     def __init__(
         self,
         problem: str,
-        found: str | None = None,
+        value: str | None = None,
         allowed: str | None = None,
         suggestion: str | None = None,
         within: KeyPath = (),
     ) -> None:
-        super().__init__(problem, found, allowed, suggestion, within)
-        self.problem, self.found, self.allowed, self.suggestion = problem, found, allowed, suggestion
+        super().__init__(problem, value, allowed, suggestion, within)
+        self.problem, self.value, self.allowed, self.suggestion = problem, value, allowed, suggestion
         self.within = within
 
     def __str__(self) -> str:
@@ -117,11 +117,11 @@ class Problem(ValueError):
 
     def below(self, *key: str | int) -> Problem:
         """Return the problem with a key put before its position, for a value inside a mapping or list."""
-        return Problem(self.problem, self.found, self.allowed, self.suggestion, (*key, *self.within))
+        return Problem(self.problem, self.value, self.allowed, self.suggestion, (*key, *self.within))
 
     def at(self, file: str = "", line: int | None = None, key: KeyPath = ()) -> Issue:
         """Return the issue of this problem for a value at a given file, line and key."""
-        return Issue(self.problem, file, line, (*key, *self.within), self.found, self.allowed, self.suggestion)
+        return Issue(self.problem, file, line, (*key, *self.within), self.value, self.allowed, self.suggestion)
 
 
 def unknown(
@@ -134,7 +134,7 @@ def unknown(
     problem : str
         Short text of the fault, such as "no such line".
     name : object
-        The name that was found.
+        The unknown name.
     known : Iterable[str]
         Names that are allowed.
     within : KeyPath

@@ -96,8 +96,8 @@ class _Lines:
         """Number of the next line, or of the last one at the end of the file."""
         return self.rows[min(self.at, len(self.rows) - 1)][0] if self.rows else 1
 
-    def error(self, problem: str, key: str = "", found: object = None, allowed: str | None = None) -> InputError:
-        text = None if found is None else shown(found)
+    def error(self, problem: str, key: str = "", value: object = None, allowed: str | None = None) -> InputError:
+        text = None if value is None else shown(value)
         return InputError(Issue(problem, self.file, self.line, (key,) if key else (), text, allowed))
 
     def next(self, key: str, allowed: str | None = None) -> list[str]:
@@ -303,14 +303,14 @@ def read_coating(path: str | Path) -> MeasuredCoating:
     reflected = _mean(table, "R")
     if reflected is None:
         heads = ", ".join(table.heads.values())
-        raise InputError(Issue("no reflectance", table.file, 1, found=heads, allowed="R, or Rs and Rp"))
+        raise InputError(Issue("no reflectance", table.file, 1, value=heads, allowed="R, or Rs and Rp"))
     through = _mean(table, "T")
     if through is not None:
         over = reflected + through > 1.0 + OVER
         if np.any(over):
             row = int(np.argmax(over))
-            found = f"{reflected[row]:.4g} and {through[row]:.4g}"
-            raise table.error(row, "", "more light leaves than arrives", found, "R + T of 1 at most")
+            actual = f"{reflected[row]:.4g} and {through[row]:.4g}"
+            raise table.error(row, "", "more light leaves than arrives", actual, "R + T of 1 at most")
         through = np.minimum(through, 1.0 - reflected)
     wavelength, angle = table["wavelength"], np.minimum(table["angle"], 0.5 * np.pi)
     first_rows: dict[tuple[float, float], int] = {}

@@ -152,7 +152,7 @@ def read_temperatures(
         if absolute and np.any(values < 0.0):
             number = int(np.argmax(values < 0.0))
             text = f"node number {number} (from 0) is colder than absolute zero"
-            raise InputError(Issue(text, str(path), found=shown(float(values[number])), allowed="values: change"))
+            raise InputError(Issue(text, str(path), value=shown(float(values[number])), allowed="values: change"))
         return WarmNodes(points, values, absolute)
     table = _table(path, HEAT_COLUMNS)
     columns = [name for name in (ABSOLUTE, CHANGE) if name in table]
@@ -169,7 +169,7 @@ def _checked(path: Path, sha256: str | None) -> None:
     """Raise `InputError` if the checksum of a file differs."""
     if sha256 is not None and is_file(path) and (digest := digest_of(path)) != sha256:
         text = "not the table that was used: its checksum differs"
-        raise InputError(Issue(text, str(path), found=digest, allowed=f"sha256 {sha256}, as the job says"))
+        raise InputError(Issue(text, str(path), value=digest, allowed=f"sha256 {sha256}, as the job says"))
 
 
 def _table(path: str | Path, columns: tuple[Column, ...]) -> Table:
@@ -227,7 +227,7 @@ def _of_mesh(path: Path, unit: str, field: str | None, what: str, need: str) -> 
     if field is None and len(fields) != 1:
         text = f"no {what} at its nodes" if not fields else f"several {what} at its nodes"
         remedy = need if not fields else "field: one of " + names_text(sorted(fields))
-        raise InputError(Issue(text, file, found=names_text(sorted(fields)) or None, allowed=remedy))
+        raise InputError(Issue(text, file, value=names_text(sorted(fields)) or None, allowed=remedy))
     name = field if field is not None else next(iter(fields))
     if name not in fields:
         known = sorted(fields)
@@ -273,4 +273,4 @@ def _within(file: str, values: np.ndarray, most: float, what: str, allowed: str)
     if np.any(bad):
         number = int(np.argmax(bad))
         text = f"node number {number} (from 0) has {what} out of range"
-        raise InputError(Issue(text, file, found=shown(values[number].tolist()), allowed=allowed))
+        raise InputError(Issue(text, file, value=shown(values[number].tolist()), allowed=allowed))

@@ -242,9 +242,9 @@ class Source:
 
 
 class _IssueDetails(TypedDict, total=False):
-    """Optional parts of an issue besides the problem: value found, values allowed, suggestion."""
+    """Optional parts of an issue besides the problem: value in the file, values allowed, suggestion."""
 
-    found: object
+    value: object
     allowed: str | None
     suggestion: str | None
 
@@ -282,11 +282,11 @@ class Spec(BaseModel):
         key : KeyPath
             Key path in this specification.
         details : keyword arguments
-            `found`, the value found; `allowed`, the values allowed; and `suggestion`, the nearest valid name.
+            `value`, the value in the file; `allowed`, the values allowed; and `suggestion`, the nearest valid name.
         """
         if not isinstance(problem, Problem):
-            found = details.get("found")
-            text = None if found is None else shown(found)
+            value = details.get("value")
+            text = None if value is None else shown(value)
             problem = Problem(problem, text, details.get("allowed"), details.get("suggestion"))
         source = self._source
         return problem.at(source.file, source.line((*key, *problem.within)), (*source.prefix, *key))
@@ -489,24 +489,24 @@ def _issue(model: type[Spec], detail: ErrorDetails, source: Source) -> Issue:
     of_key = bool(key) and key[-1] == "[key]"
     key = key[:-1] if of_key else key
     context: dict[str, Any] = detail.get("ctx", {})
-    found: str | None = shown(value)
+    actual: str | None = shown(value)
     allowed = suggestion = None
     problem = detail["msg"]
     kind = detail["type"]
     if kind == "value_error" and isinstance(context.get("error"), Problem):
         cause: Problem = context["error"]
-        problem, found, suggestion = cause.problem, cause.found, cause.suggestion
+        problem, actual, suggestion = cause.problem, cause.value, cause.suggestion
         named = _named(key)
         allowed = allowed_at(_field_metadata(model, named), named, cause.allowed)
         key = (*key, *cause.within)
     elif kind == "missing":
         names = _fields(model, key[:-1])
-        problem, found = f"{key[-1]!r} is missing", None
+        problem, actual = f"{key[-1]!r} is missing", None
         example = written(_field_metadata(model, key), key)
         allowed = f"{key[-1]}: {example}" if example else names_text(names)
     elif kind == "extra_forbidden":
         names = _fields(model, key[:-1])
-        problem, found, allowed = "unknown key", shown(key[-1]), names_text(names)
+        problem, actual, allowed = "unknown key", shown(key[-1]), names_text(names)
         suggestion = nearest(str(key[-1]), names)
     elif kind in ("model_type", "dict_type", "model_attributes_type"):
         names = _fields(model, key)
@@ -525,11 +525,11 @@ def _issue(model: type[Spec], detail: ErrorDetails, source: Source) -> Issue:
         if isinstance(value, str) and (comma := decimal_comma(value)) is not None:
             problem, allowed = comma.problem, comma.allowed
     elif kind == "too_short":
-        problem, found = "too few items", str(context["actual_length"])
+        problem, actual = "too few items", str(context["actual_length"])
         allowed = f"at least {context['min_length']}"
     elif kind == "too_long":
-        problem, found, allowed = "too many items", str(len(value)), f"at most {context['max_length']}"
-    return Issue(problem, source.file, source.line(key), (*source.prefix, *key), found, allowed, suggestion)
+        problem, actual, allowed = "too many items", str(len(value)), f"at most {context['max_length']}"
+    return Issue(problem, source.file, source.line(key), (*source.prefix, *key), actual, allowed, suggestion)
 
 
 def _fields(model: type[Spec], key: KeyPath) -> list[str]:

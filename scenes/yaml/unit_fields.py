@@ -155,10 +155,10 @@ class Vector:
         if isinstance(value, list | tuple) and len(value) == self.length:
             return value
         example = ", ".join([self.of.kind.example] * self.length)
-        found = f"{len(value)} of them" if isinstance(value, list | tuple) else shown(value)
+        actual = f"{len(value)} of them" if isinstance(value, list | tuple) else shown(value)
         allowed = f"{self.length} times {self.of.kind.name}: [{example}]"
         single = f"{self.of.kind.name} for all, {self.of.kind.example}, or " if self.alike else ""
-        raise Problem(f"not a list of {self.length} quantities", found, single + allowed)
+        raise Problem(f"not a list of {self.length} quantities", actual, single + allowed)
 
 
 @dataclass(frozen=True)

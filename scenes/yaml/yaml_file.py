@@ -264,7 +264,7 @@ class _Builder:
             raise InputError(issue)
         if event.implicit[0] and text[:1] in OTHER_MINUS and not isinstance(_number_or_text("-" + text[1:]), str):
             wrong = foreign_minus(text)
-            raise InputError(Issue(wrong.problem, self._file, line, self._here(), wrong.found, wrong.allowed))
+            raise InputError(Issue(wrong.problem, self._file, line, self._here(), wrong.value, wrong.allowed))
         # by the core schema of YAML 1.2; quoted scalars are always text
         return plain_scalar(text) if event.implicit[0] else text
 

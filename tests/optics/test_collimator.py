@@ -35,7 +35,7 @@ class Bench:
         path = TargetPath(self.test.assembly, ROOT, ROOT, self.test.model, self.backend, collimator)
         state = {f"{ROOT}/focal_plane": Motion(shift=(0.0, 0.0, detector))}
         direction = path.directions(place)
-        return path.pupils(state, direction, path.places(state, direction), shift)[0]
+        return path.pupils(state, direction, path.positions(state, direction), shift)[0]
 
 
 @pytest.fixture(scope="module")

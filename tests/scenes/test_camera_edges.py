@@ -264,7 +264,7 @@ def test_edges_take_the_share_of_their_area(backend, cut, bare) -> None:
         ("{clear: circle, radius: 1 m, inner: 75 mm}", 0.25),
         ("{clear: rectangle, half: [1 m, 1 m], centre: [1 m, 0 m]}", 0.5),
         ("{blocks: polygon, corners: [[0 m, 0 m], [1 m, 0 m], [0 m, 1 m]]}", 0.25),
-        ("{clear: ellipse, half: [150 mm, 75 mm], turn: 30 deg}", 0.5),
+        ("{clear: ellipse, half: [150 mm, 75 mm], rotation: 30 deg}", 0.5),
         ("{blocks: circle, radius: 75 mm}, {clear: rectangle, half: [1 m, 1 m], centre: [1 m, 0 m]}", 0.625),
     ):
         optics = CameraOptics.alone(with_edges(text), backend)
@@ -366,9 +366,9 @@ def test_rays_without_edges_are_as_they_were(bare, cut) -> None:
 def test_a_chief_ray_that_is_stopped_is_still_the_beams_middle(bare, cut) -> None:
     assert not cut.rays([(0.0, 0.0)], np.array([[0.0, 0.0], [0.5, 0.1]])).valid[0, 0]
     light = cut.directions([(1.0, 0.0)])
-    np.testing.assert_allclose(cut.path.places({}, light), bare.path.places({}, light), rtol=0, atol=1e-14)
+    np.testing.assert_allclose(cut.path.positions({}, light), bare.path.positions({}, light), rtol=0, atol=1e-14)
     # the light of 0.1 deg at f tan W; the chief ray starts where the hyperboloid of M2 has its other sheet
-    np.testing.assert_allclose(cut.path.places({}, light)[0], [np.tan(np.radians(0.1)) / 0.3, 0.0], rtol=0, atol=1e-7)
+    np.testing.assert_allclose(cut.path.positions({}, light)[0], [np.tan(np.radians(0.1)) / 0.3, 0.0], 0, 1e-7)
 
 
 @pytest.mark.second

@@ -198,7 +198,7 @@ def test_what_another_instrument_does_not_have_is_told_once_for_each_pattern(bac
     ) as caught:
         stated_of_job(tmp_path, instrument, "disturbances: ./own.yaml\n", backend)
     assert len(caught.value.issues) == 1
-    assert caught.value.found == "'base/backward'"
+    assert caught.value.value == "'base/backward'"
     assert stated_of_job(tmp_path, instrument, "", backend).components
     assert stated_of_job(tmp_path, instrument, "disturbances: none\n", backend) is None
 

@@ -268,7 +268,7 @@ def test_tabs_and_signs_of_units_are_texts() -> None:
 
 def test_error_gives_the_first_issue_and_all_of_them() -> None:
     error = InputError(Issue("one", "a.yaml", 1, ("x",), "f", "g", "h"), Issue("two", "a.yaml", 2))
-    first = (error.file, error.line, error.key, error.found, error.allowed, error.suggestion)
+    first = (error.file, error.line, error.key, error.value, error.allowed, error.suggestion)
     assert first == ("a.yaml", 1, ("x",), "f", "g", "h")
     assert str(error).splitlines() == ["a.yaml:1: x: one; did you mean 'h'? Found f, allowed: g", "a.yaml:2: two"]
     assert str(pickle.loads(pickle.dumps(error))) == str(error)

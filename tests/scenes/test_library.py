@@ -434,8 +434,8 @@ def test_what_it_says() -> None:
     study = read_study(TEXT)
     assert study.factors["a"].unit == "um"
     assert study.factors["a"].numbers().values == (0.0, 3.0)
-    assert study.factors["a"].places == (("job", "x"),)
-    assert study.factors["b"].places == (("y", 1), ("z",))
+    assert study.factors["a"].key_paths == (("job", "x"),)
+    assert study.factors["b"].key_paths == (("y", 1), ("z",))
     assert study.factors["b"].numbers().whole
     assert study.responses["r"].units == "um"
     assert study.responses["s"].units == "percent"

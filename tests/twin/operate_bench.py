@@ -174,7 +174,7 @@ class StandIn:
 
     def motions(self, time: int) -> Motions:
         """Every third motion grows to two of its standard deviations, the others to a tenth of that."""
-        stated = self.experiment.stated.components
+        stated = self.experiment.prior.components
         size = np.array([one.sigma / one.unit_size for one in stated])
         mean = 0.1 * (time - START) / DAY * size * np.where(np.arange(len(size)) % 3 == 0, 1.0, 0.1)
         labels, units = zip(*((one.name, one.unit) for one in stated), strict=True)

@@ -126,7 +126,7 @@ def test_the_bias_of_the_drawings_model_goes_away(backend, tmp_path, record_prop
     job = JobSpec.model_validate({"instrument": str(tmp_path / "instrument.yaml")})
     built = MonitorExperiment(resolve_job(job), backend)
     # states drawn from the posterior's file have the posterior's covariance
-    stated = built.stated
+    stated = built.prior
     assert stated is not None
     own = {one.name: k for k, one in enumerate(run.bench.parameters.components)}
     places = [own[one.name] for one in stated.components]

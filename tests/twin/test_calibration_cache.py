@@ -171,7 +171,7 @@ def test_an_experiment_names_each_of_its_inputs() -> None:
     keys["beams"] = MonitorExperiment(resolved, load_backend(), free_beams=False)._entry.key
     assert len(set(keys.values())) == 5
     one = MonitorExperiment(resolved, load_backend())
-    stated = [one._entry.part("disturbances", replace(one.stated, name=name)).key for name in ("launch", "other")]
+    stated = [one._entry.part("disturbances", replace(one.prior, name=name)).key for name in ("launch", "other")]
     assert len({*stated, one._entry.key}) == 3
 
 

@@ -80,7 +80,7 @@ def test_fans_along_the_vanes_of_a_spider_are_drawn(backend) -> None:
     )
 
     def fans(camera: CameraSpec, turns: tuple[float, ...]) -> RayFans:
-        edges = (whole[0], *(whole[1].model_copy(update={"turn": np.radians(turn)}) for turn in turns))
+        edges = (whole[0], *(whole[1].model_copy(update={"rotation": np.radians(turn)}) for turn in turns))
         spider = camera.mirrors["spider"].model_copy(update={"edges": edges})
         mirrors = {**camera.mirrors, "spider": spider} if camera is spec else camera.mirrors
         return ray_fans(CameraOptics.alone(camera.model_copy(update={"mirrors": mirrors}), backend), [(0.0, 0.0)])

@@ -38,7 +38,7 @@ from twin.camera.camera_run import aberration_name, perturbed_text, refocus_text
 from twin.camera.first_order_data import FIRST_ORDER, detector_beyond_field, first_order_data, obstacles
 from twin.camera.refocus import find_focus
 from twin.design.__main__ import app as design_app
-from twin.design.design_run import HELD_BY, _held_text, run_design
+from twin.design.design_run import ACTIVE_CONSTRAINT, _held_text, run_design
 from twin.design.layout_bench import BeamFacts
 from twin.design.layout_search import journal_of
 from twin.framework.run_folder import RunFolderError
@@ -92,7 +92,7 @@ def test_distortion_is_that_of_the_papers_formula(gf7_alone) -> None:
     assert found.point[0] == pytest.approx(0.0, abs=1e-9)
     assert found.point[1] == pytest.approx(-found.distance * np.tan(np.deg2rad(6.0)), rel=2e-3)
     assert found.rms < found.largest < 1e-3
-    away = (found.places - found.ideal).reshape(-1, 2)
+    away = (found.positions - found.ideal).reshape(-1, 2)
     np.testing.assert_allclose(away.mean(axis=0), 0.0, atol=1e-12)
     # as drawn: a grid whose departures stay within half of its spacing, and the line's in millimetres and micrometres
     left, right, *_ = camera_plots.distortion_figure(SimpleNamespace(distortion=found)).axes
@@ -403,13 +403,13 @@ def test_a_constraint_that_blocks_is_named(tmp_path) -> None:
     assert result.exit_code == 0, result.output
     told = json.loads((tmp_path / "out" / "design.json").read_text("utf-8"))
     assert not told["improved"]
-    (held,) = told["held_by"]
+    (held,) = told["active_constraints"]
     assert held["constraint"] == "principal distance"
     assert held["broken_at_start_m"] == 0.0
     # dz / (2 F)^2 / (4 sqrt 3) at F/9.32; a millimetre of focus goes with some micrometres of principal distance
     off = np.sqrt(np.mean(np.square(told["wfe_rms_waves"]["before"])))
     assert off == pytest.approx(5e-3 / 18.64**2 / (4 * np.sqrt(3)) / 650e-9, rel=0.02)
-    assert held["worth_waves_per_mm"] > off
+    assert held["sensitivity_waves_per_mm"] > off
     page = (tmp_path / "out" / "report.html").read_text("utf-8")
     limited = r"Not improved, limited by the principal distance \(5.5\d* m; easing it by 1 mm reduces the error by"
     assert re.search(limited, page)
@@ -421,9 +421,9 @@ def test_an_anamorphism_is_a_share(backend) -> None:
     one = ActiveConstraint("anamorphism", 0.005, 0.05, 0.4)
     text = _held_text((one,), "old", 5.0)
     assert text == "the anamorphism (0.5 %, violated by old by 1 %; easing it by 1 % reduces the error by 0.02 waves)"
-    row = HELD_BY(one)
+    row = ACTIVE_CONSTRAINT(one)
     assert (row["limit_m"], row["limit_percent"]) == (None, pytest.approx(0.5))
-    assert HELD_BY(replace(one, name="envelope", limit=2.0))["limit_m"] == 2.0
+    assert ACTIVE_CONSTRAINT(replace(one, name="envelope", limit=2.0))["limit_m"] == 2.0
     camera = load_camera("gf7")
     merit, found = initial_merit(
         backend, prescription_of(camera), (), beams_of(camera), Operands(650e-9, anamorphism=0.005)
@@ -447,10 +447,10 @@ def test_what_a_constraint_is_worth(tmp_path) -> None:
         assert result.exit_code == 0, result.output
         found.append(json.loads((out / "design.json").read_text("utf-8")))
     errors = [np.sqrt(np.mean(np.square(told["wfe_rms_waves"]["after"]))) for told in found]
-    first, *_ = found[0]["held_by"]
+    first, *_ = found[0]["active_constraints"]
     assert first["constraint"] == "clearance of the beams from scene to M1 beside M2"
     assert first["broken_at_start_m"] == pytest.approx(2.75e-3, abs=0.01e-3)
-    assert errors[0] - errors[1] == pytest.approx(0.1 * first["worth_waves_per_mm"], rel=0.1)
+    assert errors[0] - errors[1] == pytest.approx(0.1 * first["sensitivity_waves_per_mm"], rel=0.1)
     assert errors[1] > errors[0] / 2
 
 

@@ -220,8 +220,8 @@ def test_perturbed_instruments_are_not_taken_for_dirt(experiment):
     """Spots of instruments that are as far from nominal as launch leaves them have another shape, and are clean."""
     job = JobSpec.model_validate({"instrument": "gf7_pair", "disturbances": "launch"})
     pair = experiment("gf7_pair").stating(resolve_job(job))
-    amounts = pair.stated.draw(np.random.default_rng(4), 6)
-    states = [state_of(row, pair.stated.components, pair.thermal) for row in amounts]
+    amounts = pair.prior.draw(np.random.default_rng(4), 6)
+    states = [state_of(row, pair.prior.components, pair.thermal) for row in amounts]
     frames = pair.frames_after(pair.path.expected_photons(states), 9, 5)
     template, noise = pair.calibration.template, pair.calibration.noise
     measured = 0

@@ -71,7 +71,7 @@ def test_images_are_those_of_the_general_renderer():
     images = b.images(turn, place)[0]
     about_x = np.array([[1, 0, 0], [0, np.cos(turn), -np.sin(turn)], [0, np.sin(turn), np.cos(turn)]])
     light = (about_x @ b.centre_direction)[None]
-    (pupil,) = b.path.pupils(b.as_built, light, b.path.places(b.as_built, light))
+    (pupil,) = b.path.pupils(b.as_built, light, b.path.positions(b.as_built, light))
     node, weight = np.polynomial.legendre.leggauss(9)
     first, last = b.ccd.band.spectrum.ends
     wavelengths = first + 0.5 * (last - first) * (node + 1.0)
@@ -114,7 +114,7 @@ def test_noise_of_the_spots_is_as_stated():
     [
         ({"pinhole": 30e-6}, "pinhole", "too small"),
         ({"pinhole": 600e-6}, "pinhole", "does not fit"),
-        ({"setting": 2.0}, "reach", "calibrated"),
+        ({"setting": 2.0}, "extent", "calibrated"),
     ],
 )
 def test_bench_that_cannot_be_built(changes, key, text):
@@ -132,7 +132,7 @@ def test_bench_that_cannot_be_built(changes, key, text):
         [
             ({"light": 1.3}, "light", "saturated"),
             ({"light": 0.001, "frames": 1}, "light", "no spot"),
-            ({"zero": 3600 * ARCSEC}, "reach", "beside the line"),
+            ({"zero": 3600 * ARCSEC}, "extent", "beside the line"),
         ],
     ),
 )
@@ -144,10 +144,10 @@ def test_test_that_cannot_be_measured(changes, key, text):
     assert error.value.remedy
     assert ("less light" in error.value.remedy) is (text == "saturated")
     assert ("more light" in error.value.remedy) is (text == "no spot")
-    if key == "reach":
-        # with the reach that is advised all spots stay on the line; with another hundredth of it they do not
+    if key == "extent":
+        # with the extent that is advised all spots stay on the line; with another hundredth of it they do not
         for share in (0.99, 1.01):
-            turn = share * float(error.value.remedy.split()[3]) / b.setup.test.reach * b.field_angle[few]
+            turn = share * float(error.value.remedy.split()[3]) / b.setup.test.extent * b.field_angle[few]
             if share < 1.0:
                 measure(replace(b, field_angle=turn, design_offset=b.design_offset[few]), 3)
             else:

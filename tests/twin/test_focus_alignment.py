@@ -49,7 +49,7 @@ def reduced() -> FocusSetup:
     camera = setup.camera.model_copy(
         update={"bands": FrozenMap({name: setup.camera.bands[name] for name in ("P", "B4")})}
     )
-    scan = setup.test.scan.model_copy(update={"reach": 0.5e-3, "step": 0.12e-3, "points": 7})
+    scan = setup.test.scan.model_copy(update={"half_range": 0.5e-3, "step": 0.12e-3, "points": 7})
     test = setup.test.model_copy(update={"fields": (-0.9, 0.0, 0.9), "scan": scan})
     return setup.model_copy(update={"camera": camera, "test": test})
 
@@ -240,7 +240,7 @@ def scanned(best, search, misled=0.0, seen=lambda mtf: (mtf, SIGMA)):
         mtf = abs(through_focus(shift + misled * (take < 1000), best))
         return *seen(mtf), np.zeros((1, 1, 1), np.uint16), "too dark"
 
-    plan = SimpleNamespace(depth=0.6, points=9, step=20.0, reach=400.0)
+    plan = SimpleNamespace(depth=0.6, points=9, step=20.0, half_range=400.0)
     site = SimpleNamespace(band="P", field=0.5, nominal_per_shift=dict.fromkeys(DIRECTIONS, 1.0))
     bench = SimpleNamespace(setup=SimpleNamespace(test=SimpleNamespace(scan=plan)), sites=[site])
     bench.geometric_zero = lambda band: 145.0
@@ -384,7 +384,7 @@ def test_geometry_of_a_misset_focal_plane(tabled_bench) -> None:
     pose = Pose(rotation_matrix(np.array(MISSET.rotate)), np.array(MISSET.shift))
     state = {**tabled_bench.camera.as_built, f"{ROOT}/focal_plane": MISSET}
     directions = tabled_bench.path.directions(places(tabled_bench))
-    hits = tabled_bench.path.places(state, directions)
+    hits = tabled_bench.path.positions(state, directions)
     pupils = tabled_bench.path.pupils(state, directions, hits)
     defocused = 0
     for site, pupil, hit in zip(tabled_bench.sites, pupils, hits, strict=True):
@@ -423,7 +423,7 @@ def test_a_chips_height_counts_downstream(middle) -> None:
 def test_a_moved_target_is_a_moved_detector(tabled_bench, shift: float) -> None:
     """Pupils traced with the target 1 mm out of the collimator's focus, 80 um at the image."""
     directions = tabled_bench.path.directions(places(tabled_bench))
-    hits = tabled_bench.path.places(tabled_bench.camera.as_built, directions)
+    hits = tabled_bench.path.positions(tabled_bench.camera.as_built, directions)
     pupils = tabled_bench.path.pupils(tabled_bench.camera.as_built, directions, hits, shift)
     for site, pupil in zip(tabled_bench.sites, pupils, strict=True):
         for edge, imager in site.imagers.items():

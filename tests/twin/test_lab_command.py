@@ -19,7 +19,7 @@ CHANGES = {
     "camera: gf7\n": "camera: own_camera.yaml\n",
     "fields: [-0.9, -0.45, 0, 0.45, 0.9]": "fields: [-0.9, 0.9]",
     "points: 9": "points: 7",
-    "reach: 1.4 mm": "reach: 0.5 mm",
+    "half_range: 1.4 mm": "half_range: 0.5 mm",
     "step: 0.08 mm": "step: 0.15 mm",
     "shift: [0.2 mm, 0.2 mm, 0.3 mm]": "shift: [0.1 mm, 0.1 mm, 0.1 mm]",
 }

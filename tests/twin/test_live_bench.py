@@ -20,7 +20,7 @@ from twin.live.computer import RequestHandler, course_text, job_text
 from twin.live.knobs import KINDS, knob_name, perturbation
 from twin.live.live_bench import LiveBench
 from twin.live.messages import AskedState, AskedView, BlindState
-from twin.main_job.monitor_reading import stated
+from twin.main_job.monitor_reading import rounded
 from twin.main_job.render_job import render_job
 from twin.monitor.time_series import series_states
 
@@ -48,7 +48,7 @@ def test_the_first_state_is_the_main_job(bench, first, backend):
     """Readings, truth and images of `perturb.yaml`, to the bit."""
     run = render_job(resolve("scenes/examples/perturb.yaml"), backend)
     told, after = bench.state(first)
-    assert told["readings"] == stated(run.recovered_dict())
+    assert told["readings"] == rounded(run.recovered_dict())
     assert told["truth"] == run.truth_dict()
     assert np.array_equal(after, run.after[:, 0])
     assert np.array_equal(bench.before(first), run.before[:, 0])
@@ -63,7 +63,7 @@ def test_a_saved_job_repeats_what_was_shown(bench, first, backend, tmp_path):
     file.write_text(job_text(bench, asked), encoding="utf-8")
     assert f"source {program_digest()}, Python" in file.read_text("utf-8").splitlines()[1]
     run = render_job(resolve(file), backend)
-    assert told["readings"] == stated(run.recovered_dict())
+    assert told["readings"] == rounded(run.recovered_dict())
     assert np.array_equal(after, run.after[:, 0])
     blind = job_text(bench, BlindState.model_validate({**asked.model_dump(), "blind": 7})).splitlines()
     said = [line for line in blind if line not in file.read_text("utf-8").splitlines()]
@@ -189,7 +189,7 @@ def test_what_is_hidden_is_not_told(bench, first):
     assert other["guess"]["spots"] != told["guess"]["spots"]
     shown = bench.hidden(asked)
     sigmas = [abs(one["sigmas"]) for one in shown["hidden"]]
-    parts = {part.name: part for part in bench.twin.experiment.stated.components}
+    parts = {part.name: part for part in bench.twin.experiment.prior.components}
     for one in shown["hidden"]:
         part = parts[one["what"]]
         assert one["sigmas"] == pytest.approx(one["value"] * part.unit_size / part.sigma, rel=1e-12)
@@ -199,7 +199,7 @@ def test_what_is_hidden_is_not_told(bench, first):
 
 def test_hidden_motions_are_drawn_from_what_is_stated(bench, first):
     """Each component over its sigma is a unit normal: chi-square of 40 draws, two-sided false alarm 1e-4."""
-    sigma = bench.twin.experiment.stated.sigma
+    sigma = bench.twin.experiment.prior.sigma
     drawn = [bench._drawn(BlindState(**{**first.model_dump(), "blind": seed})) for seed in range(40)]
     white = (np.array(drawn) / np.where(sigma > 0.0, sigma, np.inf)).ravel()
     low, high = chi2.ppf([0.5e-4, 1 - 0.5e-4], 40 * np.count_nonzero(sigma))

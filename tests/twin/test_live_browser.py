@@ -13,7 +13,7 @@ from scenes.specs.resolved import resolve
 from tests.twin.live_page import CHROMIUM, FLAGS, Command, Page, running
 from twin.camera.camera_optics import CameraOptics
 from twin.framework.run_folder import RunFolder, write_manifest
-from twin.main_job.monitor_reading import stated
+from twin.main_job.monitor_reading import rounded
 from twin.main_job.render_job import render_job
 from twin.study.runs.plan import Plan
 from twin.study.runs.setup import resolve_study
@@ -85,7 +85,7 @@ def test_dragging_the_despace_moves_the_spots_as_twin_render_does(page, backend,
     assert run.resolved.job.perturb[M2].shift[2] == pytest.approx(1e-6 * value, rel=1e-12)
     page.page.select_option("#crop", "whole")
     told = page.page.evaluate("liveTwin.last")
-    assert told["readings"] == json.loads(json.dumps(stated(run.recovered_dict())))
+    assert told["readings"] == json.loads(json.dumps(rounded(run.recovered_dict())))
     assert told["truth"] == json.loads(json.dumps(run.truth_dict()))
     top, floor = int(run.before[:, 0].max()), page.page.evaluate("liveTwin.hello.offset")
     for k, channel in enumerate(run.experiment.path.channels):

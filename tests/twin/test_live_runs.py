@@ -25,7 +25,7 @@ from twin.live.computer import job_text
 from twin.live.live_bench import LiveBench
 from twin.live.messages import MOST_FRAMES, AskedState
 from twin.live.source import Source, read_source
-from twin.main_job.monitor_reading import stated
+from twin.main_job.monitor_reading import rounded
 from twin.main_job.render_files import config_text
 from twin.main_job.render_job import render_job
 from twin.orbit.monitoring.monitor_series import states_of
@@ -114,7 +114,7 @@ def test_a_run_opens_in_the_state_that_was_saved(pair, backend, tmp_path, monkey
     bench = bench_of(source, pair)
     assert (bench.initial_state.frames, bench.initial_state.seed, bench.initial_state.time) == (3, 11, None)
     shown, after = bench.state(bench.initial_state)
-    assert shown["readings"] == stated(run.recovered_dict())
+    assert shown["readings"] == rounded(run.recovered_dict())
     assert shown["truth"] == run.truth_dict()
     assert np.array_equal(after, run.after[:, 0])
     assert np.array_equal(bench.before(bench.initial_state), run.before[:, 0])

@@ -207,7 +207,7 @@ def stack(folder: Path, images: Path) -> Path:
 def test_a_stack_that_the_twin_did_not_make(stack: Path) -> None:
     run = align_files(PROCEDURES["lab focus"].resolve(stack / "focus.yaml").test)  # type: ignore[arg-type]
     true = np.array([-20e-6, -40e-6, -20e-6, -40e-6])
-    by_place = {tuple(np.rint(1e3 * place)): k for k, place in enumerate(run.places)}
+    by_place = {tuple(np.rint(1e3 * place)): k for k, place in enumerate(run.positions)}
     order = [by_place[place] for place in ((0, -100), (0, 100), (20, -100), (20, 100))]
     # a Gaussian's curve is even, its form another than a pupil's: half a micrometre is stated for that
     sigma = np.hypot(run.states[0].defocus_sigma[order], run.test.vertex_error)

@@ -214,7 +214,7 @@ def test_conventions_units_and_order_do_not_matter(files) -> None:
             edit(folder / f"{table}.csv", shuffled)
     said = {
         "frame": "itrs",
-        "quaternion": {"scalar": "first", "turns": "frame_to_body"},
+        "quaternion": {"scalar": "first", "direction": "frame_to_body"},
         "body_axes": ["forward", "left", "up"],
         "time_scale": "utc",
         "line_moment": "start",
@@ -229,7 +229,7 @@ def test_conventions_units_and_order_do_not_matter(files) -> None:
 
 @pytest.mark.second
 @pytest.mark.parametrize("procedure", ["calibrate", "adjust"])
-@pytest.mark.parametrize(("key", "value"), [("scalar", "first"), ("turns", "frame_to_body")])
+@pytest.mark.parametrize(("key", "value"), [("scalar", "first"), ("direction", "frame_to_body")])
 def test_a_wrong_quaternion_is_named_as_the_likeliest_cause(tmp_path, procedure, key, value) -> None:
     shutil.copytree(SCENES / ORBIT / "measured", tmp_path, dirs_exist_ok=True)
     data = read_yaml(tmp_path / "data.yaml").data
@@ -238,7 +238,7 @@ def test_a_wrong_quaternion_is_named_as_the_likeliest_cause(tmp_path, procedure,
     result = run(procedure, tmp_path / f"{procedure}.yaml", "--out", tmp_path / "run")
     said = " ".join(result.stderr.split())
     assert (result.exit_code, (tmp_path / "run").exists()) == (2, False)
-    assert "see the points: `scalar` first or last, `turns`, `body_axes`" in said
+    assert "see the points: `scalar` first or last, `direction`, `body_axes`" in said
     assert "`twin.orbit check` finds" in said
 
 

@@ -133,7 +133,7 @@ def test_batch_and_single_pupils_agree(gf7_pair, backend) -> None:
     directions = path.directions(places)
     frequency = 0.5 / band.pitch * np.eye(2)
     ccd = LineCcd.from_specs(band, load_band_detectors(model.spec)[band.detector])
-    for k, pupil in enumerate(path.pupils({}, directions, path.places({}, directions))):
+    for k, pupil in enumerate(path.pupils({}, directions, path.positions({}, directions))):
         found = polychromatic_transfer(pupil, frequency, *band_wavelengths(band), np.zeros(1))[0]
         want = np.abs(found * ccd.transfer(*frequency.T))
         # wavelengths are others; kinks of shadows' overlaps over the band leave some 1e-5

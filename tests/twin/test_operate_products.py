@@ -41,7 +41,7 @@ from twin.orbit.flight.line_camera import corrected_line, traced_line_cameras
 
 SCENE = SCENES / ORBIT / "angle_gf7.yaml"
 NOISE = 0.005**2 * np.eye(8)
-KNOWN = ("stated", "instrument", "thermal", "cameras", "ground")
+KNOWN = ("prior", "instrument", "thermal", "cameras", "ground")
 """Of an experiment, what products ask for beside its disturbances."""
 
 
@@ -56,7 +56,7 @@ def experiment_of(plan: OperationSetup) -> MonitorExperiment:
 
 def drawn(seed: int, count: int = 1) -> np.ndarray:
     """Amounts (count, M), SI."""
-    stated = experiment().stated
+    stated = experiment().prior
     assert stated is not None
     return stated.draw(np.random.default_rng(seed), count)
 
@@ -65,7 +65,7 @@ def stand_in(amounts: np.ndarray, times: tuple[int, ...] = (START,), **more: obj
     """Readings of states by their linear effect on the spots."""
     stated = experiment().disturbances
     assert stated is not None
-    unit = stated.sigmas * np.array([one.unit_size for one in experiment().stated.components])
+    unit = stated.sigmas * np.array([one.unit_size for one in experiment().prior.components])
     return StandIn(experiment(), np.array(times), (amounts / unit) @ stated.spots.T, NOISE, **more)
 
 
@@ -272,7 +272,7 @@ def test_the_version_goes_with_the_record_and_the_plan(tmp_path: Path) -> None:
 def test_events_jumps_and_requirements_limit_the_span(history: History) -> None:
     """With motions that do not go on in time nothing else does."""
     told = SimpleNamespace(**{name: getattr(experiment(), name) for name in KNOWN})
-    told.disturbances = replace(experiment().disturbances, laws=(TimeLaw(),) * len(experiment().stated.components))
+    told.disturbances = replace(experiment().disturbances, laws=(TimeLaw(),) * len(experiment().prior.components))
     hour = 3600 * MICRO
     quantity = "ground height_m"
     base = {
@@ -397,7 +397,7 @@ def test_models_see_what_the_changed_instrument_sees(one: Products) -> None:
     what ERR_BIAS says, where the models of the laboratory's cameras are wrong by several times more.
     """
     backend = load_backend()
-    state = state_of(drawn(3)[0], experiment().stated.components, experiment().thermal)
+    state = state_of(drawn(3)[0], experiment().prior.components, experiment().thermal)
     true = traced_line_cameras(experiment().instrument, backend, state)
     written, numbers = product_files(one)
     for name, line in one.export.lines.items():
@@ -544,7 +544,7 @@ def test_a_state_has_the_temperatures_that_do_what_was_found(tmp_path: Path) -> 
     """
     plan = records.plan_of(tmp_path, "gf7_pair")
     own = experiment_of(plan)
-    stated, components = own.disturbances, own.stated.components
+    stated, components = own.disturbances, own.prior.components
     heat = [k for k, one in enumerate(components) if one.kind == "temperature"]
     life = records.life_of(stated, 12.0, 1.0, 4, {})
     acting = life.motions.copy()

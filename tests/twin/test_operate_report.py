@@ -137,7 +137,7 @@ def test_motions_are_those_of_most_sigmas_with_all_causes_together(history, over
     rows, days = section.artefacts[0].rows, (overview.time - START) / DAY
     assert len(rows) == 12
     best: dict[str, list[float]] = {}
-    for k, one in enumerate(overview.operation.experiment.stated.components):
+    for k, one in enumerate(overview.operation.experiment.prior.components):
         own = best.setdefault(f"{one.name} [{one.unit}]", [0.0, 0.0])
         size = one.sigma / one.unit_size
         own[0] += 0.1 * days * size * (0.1 if k % 3 else 1.0)

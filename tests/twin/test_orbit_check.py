@@ -47,7 +47,7 @@ def checked(files: tuple[Path, dict[str, Any]], *changes: tuple[tuple[str, ...],
 ATTITUDE = ("platform", "attitude")
 FOUND = {
     "swapped quaternion order": (((*ATTITUDE, "scalar"), "first"), "quaternion_scalar", "last"),
-    "conjugate quaternion": (((*ATTITUDE, "turns"), "frame_to_body"), "quaternion_turns", "body_to_frame"),
+    "conjugate quaternion": (((*ATTITUDE, "direction"), "frame_to_body"), "quaternion_turns", "body_to_frame"),
     "UTC for GPS time, lines": ((("lines", "time_scale"), "GPS"), "line_time_scale", "UTC"),
     "UTC for GPS time, attitude": (((*ATTITUDE, "time_scale"), "GPS"), "attitude_time_scale", "UTC"),
     "UTC for GPS time, orbit": ((("platform", "orbit", "time_scale"), "GPS"), "orbit_time_scale", "UTC"),

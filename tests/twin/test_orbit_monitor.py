@@ -234,7 +234,7 @@ def test_smoothed_heights(stated) -> None:
         (large, f"{1.1 * chosen.limit:.1f} σ at most (limit {chosen.limit:.1f} σ)"),
     ):
         run = replace(stated)
-        run.__dict__["smoothing"] = {**stated.smoothing, stated.spec.every: smoothing}
+        run.__dict__["smoothing"] = {**stated.smoothing, stated.spec.cadence: smoothing}
         assert words in monitoring_report._gain(run)
     assert chosen.factor == stated.cases["interval"].camera_height_rms / stated.cases["smoothed"].camera_height_rms
     # the linear error is the intersected one but for products of two arcseconds
@@ -345,7 +345,7 @@ def idle(loop_setup: MonitorSetup, backend) -> LoopRun:
     test = loop_setup.test
     still = {name: one.model_copy(update={"gain": 0.0}) for name, one in test.loop.corrections.items()}
     images = LoopImagesSpec.model_validate(
-        {"times": ["10 min"], "side": 200, "points": {"control": 0, "tie": 20, "reach": 10}}
+        {"times": ["10 min"], "side": 200, "points": {"control": 0, "tie": 20, "search_radius": 10}}
     )
     readings = test.loop.readings.model_copy(update={"count": 2})
     loop = test.loop.model_copy(update={"corrections": still, "images": images, "readings": readings})
@@ -453,9 +453,9 @@ def test_a_mode_that_no_spot_shows_moves_heights_by_the_exact_trace(loop_setup, 
     first[model.row("forward", "defocus")] = second[model.row("backward", "defocus")] = 1.0
     modes = unobservable_modes(model.prior, np.stack([angle, first, second]), np.array([ARCSEC, 1e-5, 1e-5]))
     assert len(modes) == 3
-    components = experiment.stated.components
+    components = experiment.prior.components
     for mode in modes:
-        amounts = mode.motions * experiment.stated.sigma
+        amounts = mode.motions * experiment.prior.sigma
         state = state_of(amounts, components, experiment.thermal)
         spots = experiment.path.mean_spots([{}, state])
         moved = np.abs(spots[1] - spots[0]).max()

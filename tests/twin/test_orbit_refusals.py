@@ -519,7 +519,7 @@ PAGE = Path(__file__).resolve().parents[2] / "docs/orbit_files.md"
 BLOCKS = re.findall(r"^```csv\n(.*?)^```", PAGE.read_text("utf-8"), re.M | re.S)
 assert len(BLOCKS) == 8  # and all are read here
 GPS = {"frame": "ITRS", "time_scale": "GPS"}
-TURN = {"scalar": "last", "turns": "body_to_frame", "body_axes": ["forward", "right", "down"]}
+TURN = {"scalar": "last", "direction": "body_to_frame", "body_axes": ["forward", "right", "down"]}
 ANGLES = {"sequence": "xyz", "nadir": "geodetic", "steering": "yaw", "body_axes": ["forward", "right", "down"]}
 
 

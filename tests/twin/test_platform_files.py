@@ -35,7 +35,7 @@ EARTH = {
     "ut1_utc": f"{bench.EARTH.dut1} s",
     "polar_motion": [f"{v / ARCSEC!r} arcsec" for v in bench.EARTH.polar_motion],
 }
-TURN = {"scalar": "last", "turns": "body_to_frame", "body_axes": bench.AXES}
+TURN = {"scalar": "last", "direction": "body_to_frame", "body_axes": bench.AXES}
 CSV_ORBIT = {"file": "orbit.csv", "frame": "ITRS", "time_scale": "UTC"}
 CSV_ATTITUDE = {"file": "attitude.csv", "frame": "ITRS", "time_scale": "UTC", **TURN}
 
@@ -101,7 +101,7 @@ def test_quaternions_of_tables_in_every_convention(tmp_path: Path, scalar: str, 
     bench.orbit_csv(tmp_path / "orbit.csv")
     order = "xyzw" if scalar == "last" else "wxyz"
     bench.attitude_csv(tmp_path / "attitude.csv", order=order, inverse=turns == "frame_to_body")
-    attitude = {**CSV_ATTITUDE, "scalar": scalar, "turns": turns}
+    attitude = {**CSV_ATTITUDE, "scalar": scalar, "direction": turns}
     is_the_pass(read(tmp_path, CSV_ORBIT, attitude), 0.0, 0.0, 1e-14)
 
 

@@ -20,7 +20,7 @@ from optics.geometry import zernike
 from optics.numerics import array_math, quadrature
 from tests.twin.commands import files
 from tests.twin.study_bench import ROOT, write_study
-from twin.main_job.monitor_reading import stated
+from twin.main_job.monitor_reading import rounded
 from twin.monitor.monitor_beams import MAP_TERMS
 
 KERNELS = {
@@ -122,7 +122,7 @@ sigmas = st.floats(1e-9, 1e3)
 @pytest.mark.second
 @given(finite, sigmas)
 def test_stated_readings(value, sigma) -> None:
-    out = stated({"a": {"x": value, "x_sigma": sigma}, "row": value, "row_sigma": sigma, "frames": 3, "text": "ml"})
+    out = rounded({"a": {"x": value, "x_sigma": sigma}, "row": value, "row_sigma": sigma, "frames": 3, "text": "ml"})
     assert out["frames"] == 3
     assert out["text"] == "ml"
     for number, spread in ((out["a"]["x"], out["a"]["x_sigma"]), (out["row"], out["row_sigma"])):
@@ -130,13 +130,13 @@ def test_stated_readings(value, sigma) -> None:
         assert abs(number - value) <= 0.5e-6 * 1.001 * sigma + 2.0 * math.ulp(value)
         assert abs(spread - sigma) <= 0.5e-7 * 1.001 * sigma
         assert math.copysign(1.0, number) == 1.0 or number != 0.0
-    assert stated(out) == out
+    assert rounded(out) == out
 
 
 @pytest.mark.parametrize("sigma", [0.0, math.inf, math.nan])
 def test_a_reading_whose_sigma_says_nothing_is_stated_whole(sigma) -> None:
-    assert stated({"x": 1.0 / 3.0, "x_sigma": sigma})["x"] == 1.0 / 3.0
-    assert stated({"x": 1.0 / 3.0})["x"] == 1.0 / 3.0
+    assert rounded({"x": 1.0 / 3.0, "x_sigma": sigma})["x"] == 1.0 / 3.0
+    assert rounded({"x": 1.0 / 3.0})["x"] == 1.0 / 3.0
 
 
 @pytest.mark.second
@@ -145,6 +145,6 @@ def test_last_digits_are_not_stated() -> None:
     rng = np.random.default_rng(3)
     values, sigma = rng.standard_normal(20_000), 3e-4
     moved = values + 1e-11 * sigma * rng.standard_normal(values.shape)
-    one, other = ([stated({"x": x, "x_sigma": sigma})["x"] for x in column.tolist()] for column in (values, moved))
+    one, other = ([rounded({"x": x, "x_sigma": sigma})["x"] for x in column.tolist()] for column in (values, moved))
     # 0.8e-5 of 20 000 are 0.2 expected; six have a chance of 1e-7
     assert sum(a != b for a, b in zip(one, other, strict=True)) < 6

@@ -108,7 +108,7 @@ def run(procedure: Any, folder: Path, **keys: Any) -> Any:
 
 @pytest.fixture(scope="module")
 def found(folder: Path) -> Any:
-    made = run(MATCH, folder, heights=["300 m", "500 m"], points={"tie": 60, "reach": 8})
+    made = run(MATCH, folder, heights=["300 m", "500 m"], points={"tie": 60, "search_radius": 8})
     (folder / "ties.csv").write_text(MATCH.export(made)["image_points.csv"])
     return made
 

@@ -32,7 +32,7 @@ from tests.tiers import quick
 from tests.twin.commands import invoke
 from tests.twin.study_bench import REFUSED, ROOT
 from twin.framework.data_files import FrameFacts, tiff
-from twin.main_job.monitor_reading import stated
+from twin.main_job.monitor_reading import rounded
 from twin.main_job.render_job import render_job
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.monitor.time_series import TimeSeries, run_series, series_states
@@ -73,7 +73,7 @@ def measured(folder, text, backend, run, name="measurement.yaml"):
 def test_rendered_frames_give_the_main_jobs_numbers_to_the_last_digit(run, images, backend):
     found = measured(images.parent, HEAD + "frames: images\n", backend, run)
     assert all(spot.clean for channel in found.channels for _, spot in channel.states())
-    numbers, expected = recover_numbers(found), stated(run.recovered_dict())
+    numbers, expected = recover_numbers(found), rounded(run.recovered_dict())
     assert {key: numbers[key] for key in expected} == expected
     assert found.last.recovered_dict() == run.recovered_dict()
     assert "The frames are clean." in recover_report(found).lead

@@ -30,7 +30,7 @@ from twin.framework.data_files import (
     tiff,
 )
 from twin.framework.run_folder import RunFolder, write_manifest
-from twin.main_job.monitor_reading import stated
+from twin.main_job.monitor_reading import rounded
 from twin.main_job.render_files import irradiance_file, write_results
 from twin.main_job.render_job import render_job
 from twin.recover.recover_run import recover_numbers, run_recover
@@ -76,7 +76,7 @@ def test_exported_frames_give_the_same_readings_to_the_bit(job, exported, backen
     file = tmp_path / "measurement.yaml"
     file.write_text(f"instrument: gf7_pair\ndisturbances: orbit\nframes: {exported['fits'] / 'images'}\n")
     found = run_recover(MeasurementSetup.read(file), backend, experiment=job.experiment)
-    expected = stated(job.recovered_dict())
+    expected = rounded(job.recovered_dict())
     numbers = recover_numbers(found)
     assert {key: numbers[key] for key in expected} == expected
     assert found.last.recovered_dict() == job.recovered_dict()

@@ -23,7 +23,7 @@ from scenes.specs.procedures import PROCEDURES
 from scenes.yaml.errors import InputError, Problem
 from tests.twin.commands import files, invoke
 from tests.twin.study_bench import TEXTS, refusals, without_mtf_and_many_rays
-from twin.main_job.monitor_reading import stated
+from twin.main_job.monitor_reading import rounded
 from twin.monitor.truth import trace_truth
 from twin.study import scripted
 from twin.study.runs.setup import study_from_text
@@ -65,7 +65,7 @@ def test_it_is_what_the_command_gives(pair: twin.InstrumentTwin, shot: twin.Shot
             parts = {"": found.values, "_sigma": found.sigma, "_sigma_noise": found.sigma_noise}
             one = {"camera": camera, "estimator": name}
             own = {f"{key}{end}": float(v.sel(parameter=key, **one)) for end, v in parts.items() for key in PARAMETERS}
-            assert stated(own) == {key: recovered["cameras"][camera][name][key] for key in own}
+            assert rounded(own) == {key: recovered["cameras"][camera][name][key] for key in own}
     # and the run folder that it saves is the command's
     saved = twin.load("scenes/examples/perturb.yaml").render().save(tmp_path / "saved")
     listed = [json.loads((folder / "manifest.json").read_text())["sha256"] for folder in (out, saved)]

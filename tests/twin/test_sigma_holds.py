@@ -198,7 +198,7 @@ def test_no_false_alarm_in_200_clean_runs(orbit) -> None:
     expected, and none may be. Contradictions of the statement have their own rate, 1e-3 a state: 3 of 20 have 1e-6.
     """
     experiment, frames, each, draws = orbit.experiment, 9, 10, 10
-    calibration, stated, known = experiment.calibration, experiment.stated, experiment.disturbances
+    calibration, stated, known = experiment.calibration, experiment.prior, experiment.disturbances
     noise, spots, shape = calibration.noise, calibration.spots, experiment.path.shape
     rng = np.random.default_rng(77)
     rows = np.stack([quantity.row for quantity in quantities(experiment.cameras, experiment.ground)])

@@ -124,7 +124,7 @@ def test_targets_are_imaged_on_the_same_pixels(with_camera, backend) -> None:
     frequency = 0.5 / model.spec.line.pitch * np.array([[1.0, 0.0], [0.0, 1.0], [0.6, 0.3]])
     for motions in ({}, MOVED):
         state = heated(instrument, ALUMINIUM, motions=motions)
-        before, after = path.places(motions, directions), path.places(state, directions)
+        before, after = path.positions(motions, directions), path.positions(state, directions)
         np.testing.assert_allclose(after, before, rtol=0, atol=1e-13)
         maps = [path.local_map(s, directions[0], 1e-3) for s in (motions, state)]
         np.testing.assert_allclose(maps[1].jacobian, maps[0].jacobian, rtol=1e-9, atol=1e-9)

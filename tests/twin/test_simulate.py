@@ -30,7 +30,7 @@ EXAMPLE = SCENES / ORBIT / "simulate.yaml"
 SIZE = "lines: 1000, pixels: 1000}"
 SMALL = "lines: 64, pixels: 80}"
 # such small images have no room for templates
-POINTS = "points: {control: 200, check: 100, tie: 200, reach: 40, template: 31}"
+POINTS = "points: {control: 200, check: 100, tie: 200, search_radius: 40, template: 31}"
 LINES = ("forward", "nadir", "backward")
 
 

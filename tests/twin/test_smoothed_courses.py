@@ -105,7 +105,7 @@ class Courses:
 
 
 def states_of(experiment: MonitorExperiment, times: np.ndarray, count: int, seed: int) -> list[State]:
-    stated, motions = experiment.disturbances, experiment.stated
+    stated, motions = experiment.disturbances, experiment.prior
     assert stated is not None
     assert motions is not None
     rng = np.random.default_rng(seed)

@@ -147,7 +147,7 @@ def test_against_brute_force(before_gf7, backend):
     )
     step = PITCH / fine
     direction = before_gf7.directions[:1]
-    hit = path.places(ABERRATED, direction)
+    hit = path.positions(ABERRATED, direction)
     systems, to_stop = (
         assemble(path.assembly, [f"forward/{way}"], [ABERRATED]).take(np.zeros(1, int))
         for way in ("imaging", "to_stop")
@@ -330,7 +330,7 @@ def path(backend) -> TargetPath:
 
 def test_there_and_back(path) -> None:
     """Both ways are traced to 1e-12 m on the stop; the image is that much nearer."""
-    np.testing.assert_allclose(path.places({}, path.directions(POSITIONS)), POSITIONS, rtol=0.0, atol=1e-12)
+    np.testing.assert_allclose(path.positions({}, path.directions(POSITIONS)), POSITIONS, rtol=0.0, atol=1e-12)
 
 
 def test_sense_of_the_axes(path) -> None:
@@ -365,7 +365,7 @@ def test_local_map_between_its_points(path, number: int) -> None:
     assert second @ axes[:, 0] > 0.99
     turned = direction + (points[:, :1] * first + points[:, 1:] * second) / LONG
     turned = turned / np.linalg.norm(turned, axis=-1, keepdims=True)
-    places = path.places(state, np.concatenate([direction[None], turned]))
+    places = path.positions(state, np.concatenate([direction[None], turned]))
     np.testing.assert_allclose(local(points), places[1:] - places[0], rtol=0.0, atol=1e-9)
     assert local.residual < 1e-9
 

@@ -328,7 +328,7 @@ def test_derivatives_are_those_of_central_differences(pair_bench: ToleranceBench
     assert monitor is not None
     x = amounts(pair_bench, {"tilt": 1.0, "radius": 1.0})
     about = states_of((*pair_bench.numbers, *pair_bench.compensators), x)
-    motions, designed = experiment.stated, experiment.disturbances
+    motions, designed = experiment.prior, experiment.disturbances
     assert motions is not None
     assert designed is not None
     steps = np.array([{**STEPS, **SMALL}[c.kind] for c in motions.components])

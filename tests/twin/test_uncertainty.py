@@ -103,7 +103,7 @@ def test_what_rests_on_the_stated_numbers(monkeypatch):
     # sigma with the part of one number doubled: its square grows by three times the elasticity
     assert first["doubled"] == pytest.approx(sigma * np.sqrt(1.0 + 3.0 * first["elasticity"]))
     tail = height["student_t"]
-    assert tail["held_997"] > 4.0 * tail["held_68"] > 4.0 * sigma
+    assert tail["half_width_997"] > 4.0 * tail["half_width_68"] > 4.0 * sigma
     assert 0.01 < tail["beyond_3_sigma"] < 0.1
 
 
@@ -197,13 +197,13 @@ def test_counts_of_random_states_are_held_against_the_binomial_distribution():
         assert good.limits(BEST, level).tolist() == [[low] * count, [high] * count]
     # of 400 states one in a thousand is an alarm: of two there is a chance of 6 %, of more than three 0.1 %
     assert good.alarm_limit == binom.ppf(0.99, 400, 1e-3) == 2
-    assert good.sigma_holds
+    assert good.sigma_agrees
     told = STATES(good)["estimators"][BEST][good.quantities[1].group][good.quantities[1].key]
-    assert (told["held_68"], told["held_95"]) == (good.covered(BEST, 0)[1] / 400.0, good.covered(BEST, 1)[1] / 400.0)
+    assert [400.0 * told[f"covered_{level}"] for level in (68, 95)] == [good.covered(BEST, k)[1] for k in (0, 1)]
     assert (told["rms"], told["rms_over_sigma"]) == (good.rms(BEST)[1], good.ratio(BEST)[1])
     for other in (counted(1.25), counted(0.8), counted(alarms=3), counted(doubted=1)):
-        assert not other.sigma_holds
-    assert counted(alarms=2).sigma_holds
+        assert not other.sigma_agrees
+    assert counted(alarms=2).sigma_agrees
     assert {outlier[3] for outlier in counted(1.25).outliers} == {0.68, 0.95}
 
 

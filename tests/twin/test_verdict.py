@@ -382,7 +382,7 @@ WARNED_ELSEWHERE = {
     ("Content of block.json", "agrees"): "twin.orbit.block.block_report",
     ("Results with the loop closed and open", "stable"): "that of margins_hold",
     ("course.json", "sigma_holds"): "twin.monitor.time_series, and twin.main_job.systematics for single times",
-    ("Coverage in random states", "sigma_holds"): "twin.uncertainty.uncertainty_report",
+    ("Coverage in random states", "sigma_agrees"): "twin.uncertainty.uncertainty_report",
     ("focus.json of a measured series", "curves_agree"): "twin.laboratory.focus_report",
     ("turntable.json", "heldout_agrees"): "twin.laboratory.turntable_report",
     ("Angles of one pass", "resection_agrees"): "twin.orbit.angle.angle_report",

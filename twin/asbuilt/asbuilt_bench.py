@@ -115,15 +115,15 @@ class AsBuiltBench(Site):
         if setup.base.instrument.as_built:
             problem = "this instrument is already as built: list its earlier measurements here with the others"
             allowed = "the nominal instrument"
-            raise self.test.error(problem, ("instrument",), found=self.test.instrument, allowed=allowed)
+            raise self.test.error(problem, ("instrument",), value=self.test.instrument, allowed=allowed)
         self.experiment = MonitorExperiment(setup.base, backend)
         self.camera = judged_camera(self.test, self.experiment.instrument)
         self.line = line_points(self.experiment.instrument, self.camera)
-        assert self.experiment.stated is not None
-        prior = with_wavefront(self.experiment.stated, self.test.wavefront)
+        assert self.experiment.prior is not None
+        prior = with_wavefront(self.experiment.prior, self.test.wavefront)
         if not prior.components:
             allowed = "a disturbances file with standard deviations greater than zero, such as `assembled`"
-            raise self.test.error("the prior has no motions", ("prior",), found=self.test.prior, allowed=allowed)
+            raise self.test.error("the prior has no motions", ("prior",), value=self.test.prior, allowed=allowed)
         self.prior: DisturbancePrior = prior
         self.parameters = Parameters.of(self.test, prior, self.experiment.instrument, self.experiment.thermal)
         self._beams: dict[tuple[tuple[tuple[float, float], ...], bool], VariedBeams] = {}
@@ -135,7 +135,7 @@ class AsBuiltBench(Site):
                     "monitor merits depend on the disturbances in operation, not on the assembly errors of this prior"
                 )
                 allowed = "`twin.uncertainty` on the resulting instrument"
-                raise self.test.error(problem, ("merits", name, "kind"), found=merit.kind, allowed=allowed)
+                raise self.test.error(problem, ("merits", name, "kind"), value=merit.kind, allowed=allowed)
         self.merits = self.bench(dict(self.test.merits))
 
     def _kinds(self, measured: MeasurementsSpec, where: str) -> tuple[MeasuredKind, ...]:
@@ -383,7 +383,7 @@ class AsBuiltBench(Site):
             strange = sorted(set(drawn_index) - set(names))
             if strange:
                 raise self.test.error(
-                    "motions that the prior does not have", ("simulate", "prior"), found=names_text(strange[:3])
+                    "motions that the prior does not have", ("simulate", "prior"), value=names_text(strange[:3])
                 )
             rows = [k for k, name in enumerate(names) if name in drawn_index]
             drawn_rows = [drawn_index[names[k]] for k in rows]

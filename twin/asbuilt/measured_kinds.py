@@ -218,9 +218,9 @@ class MeasuredKind(ABC):
         """Return the path of a file that the measurement names."""
         return Path(self.spec.file_at((key,), value, Path(self.site.test.source.file).parent, description))
 
-    def wrong(self, text: str, key: str, allowed: str | None = None, found: str | None = None) -> InputError:
+    def wrong(self, text: str, key: str, allowed: str | None = None, value: str | None = None) -> InputError:
         """Return an InputError whose position is a key of the measurement in the file."""
-        return InputError(self.spec.issue(Problem(text, found, allowed), (key,)))
+        return InputError(self.spec.issue(Problem(text, value, allowed), (key,)))
 
 
 def field_text(field: tuple[float, float]) -> str:
@@ -464,7 +464,7 @@ class SpotReadings(MeasuredKind):
         out = []
         for channel in self.path.channels:
             if (channel.camera, channel.name) not in spots:
-                raise self.wrong(f"no spot {channel.name} of {channel.camera}", "file", found=str(path))
+                raise self.wrong(f"no spot {channel.name} of {channel.camera}", "file", value=str(path))
             out.append(np.array(spots[channel.camera, channel.name]))
         return np.concatenate(out) - self.nominal
 
@@ -608,4 +608,4 @@ def read_json(measurement: MeasuredKind, path: Path) -> Any:
     try:
         return json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
-        raise measurement.wrong(f"not a JSON file ({error})", "file", found=str(path)) from error
+        raise measurement.wrong(f"not a JSON file ({error})", "file", value=str(path)) from error

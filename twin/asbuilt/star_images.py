@@ -31,7 +31,7 @@ _RINGS, _SHADOW = 80, 24
 """Rings of the quadrature over the stop, and nodes along each side of a shadow's box."""
 COARSE = 0.1
 """Noise of the first estimate relative to the brightest pixel."""
-CUT, NEAR = 0.02, 0.25
+MOST_OUTSIDE, NEAR = 0.02, 0.25
 """Share of a star's light outside its cut-out, and distance of its centroid from the middle as a share of the width.
 
 The report warns above them.
@@ -283,7 +283,7 @@ class StarResidual:
             ratio = f"chi-square {self.chi_square_per_degree:.2f} per degree of freedom"
             out.append(f"{name} does not have the predicted image: {ratio}")
         light = centroid(np.maximum(self.fit.model - self.fit.background, 0.0))
-        if self.outside > CUT:
+        if self.outside > MOST_OUTSIDE:
             out.append(f"{name} has {100 * self.outside:.0f} % of its light outside its cut-out: use larger cut-outs")
         elif np.max(np.abs(light / self.fit.model.shape)) > NEAR:
             out.append(f"{name} lies at the edge of its cut-out")

@@ -116,7 +116,7 @@ class StarReading:
             return last[-1][1:]
 
         first = np.array([*start, blur / unit] if free else start)
-        found = least_squares(
+        solution = least_squares(
             lambda x: at(x)[0],
             first,
             lambda x: at(x)[1],
@@ -126,7 +126,7 @@ class StarReading:
             gtol=1e-12,
             max_nfev=_STEPS,
         ).x
-        place = np.array([*found[:2], found[2] * unit if free else blur])
+        place = np.array([*solution[:2], solution[2] * unit if free else blur])
         share = self.image.pixels(irradiance, place[:2], place[2]) * weight
         flux, background = np.linalg.lstsq(np.stack([share.ravel(), weight.ravel()], axis=-1), counts, rcond=None)[0]
         return self._at(irradiance, place, flux, background)

@@ -36,7 +36,7 @@ class WavefrontMeasurement(Protocol):
     def file(self, key: str, value: str, description: str) -> Path:
         """Return the path of a file given under a key; raise InputError if it does not exist."""
 
-    def wrong(self, text: str, key: str, allowed: str | None = None, found: str | None = None) -> InputError:
+    def wrong(self, text: str, key: str, allowed: str | None = None, value: str | None = None) -> InputError:
         """Return an InputError whose position is a key of the measurement in the file."""
 
 
@@ -45,7 +45,7 @@ def specified_orientation(measurement: WavefrontMeasurement) -> Orientation:
     try:
         return Orientation.named(measurement.spec.orientation, measurement.spec.sign)
     except ValueError as error:
-        raise measurement.wrong(str(error), "orientation", found=measurement.spec.orientation) from error
+        raise measurement.wrong(str(error), "orientation", value=measurement.spec.orientation) from error
 
 
 def read_coefficients(measurement: WavefrontMeasurement, orientation: Orientation | None = None) -> np.ndarray:
@@ -68,18 +68,18 @@ def read_coefficients(measurement: WavefrontMeasurement, orientation: Orientatio
     recorded = specified_orientation(measurement) if orientation is None else orientation
     spec, terms = measurement.spec, tuple(measurement.spec.numbers)
 
-    def turned(table: np.ndarray) -> np.ndarray:
+    def rotated(table: np.ndarray) -> np.ndarray:
         try:
             return recorded.coefficients(table, terms)
         except MapError as error:
             raise measurement.wrong(str(error), "terms") from error
 
     if spec.zernikes is not None:
-        table = turned(_of_table(measurement, "zernikes", spec.zernikes, len(spec.fields)))
+        table = rotated(_of_table(measurement, "zernikes", spec.zernikes, len(spec.fields)))
     else:
         table = np.stack([_of_map(measurement, k, name, recorded) for k, name in enumerate(spec.maps)])
     if spec.reference is not None and Path(spec.reference).suffix.lower() in TABLES:
-        table = table - turned(_of_table(measurement, "reference", spec.reference, 1))
+        table = table - rotated(_of_table(measurement, "reference", spec.reference, 1))
     return np.asarray(table * (0.5 if spec.double_pass else 1.0))
 
 

@@ -88,7 +88,7 @@ def main(
 
     Exit codes: 0 success, 2 bad input (nothing is written), 1 anything else.
     """
-    turned = tilt or what is not None  # the second argument of earlier versions
+    with_tilt = tilt or what is not None  # the second argument of earlier versions
 
     def read() -> Any:
         from scenes.specs.instrument import BASE
@@ -104,8 +104,8 @@ def main(
 
     procedure = PROCEDURES["camera"]
     # a refocused camera is not judged: its verdict states its image quality
-    run = partial(procedure.run, refocus=refocus, tilt=turned)
-    words = (*(("--refocus",) if refocus else ()), *((f"--{TILT}",) if turned else ()))
+    run = partial(procedure.run, refocus=refocus, tilt=with_tilt)
+    words = (*(("--refocus",) if refocus else ()), *((f"--{TILT}",) if with_tilt else ()))
     named = file if camera is None else Path(f"{file.stem}-{camera}.yaml")
     run_test("camera", named, options, read=read, words=words, run=run, judged=not refocus)
 

@@ -287,7 +287,7 @@ class Distortion:
     ----------
     fields : (A, B, 2) ndarray
         Grid of A fields along the line and B along the track, as fractions of the half field.
-    places : (A, B, 2) ndarray
+    positions : (A, B, 2) ndarray
         Chief rays on the focal plane, along the line and along the track, metres.
     ideal : (A, B, 2) ndarray
         Positions by the best distortion-free camera, metres.
@@ -310,7 +310,7 @@ class Distortion:
     """
 
     fields: np.ndarray
-    places: np.ndarray
+    positions: np.ndarray
     ideal: np.ndarray
     distance: float
     point: np.ndarray
@@ -324,12 +324,12 @@ class Distortion:
     @property
     def rms(self) -> float:
         """Rms distance between chief rays and the distortion-free camera's image points over the field, metres."""
-        return float(np.sqrt(np.mean(np.sum((self.places - self.ideal) ** 2, axis=-1))))
+        return float(np.sqrt(np.mean(np.sum((self.positions - self.ideal) ** 2, axis=-1))))
 
     @property
     def largest(self) -> float:
         """Largest distance between a chief ray and the distortion-free camera's image point over the field, metres."""
-        return float(np.max(np.linalg.norm(self.places - self.ideal, axis=-1)))
+        return float(np.max(np.linalg.norm(self.positions - self.ideal, axis=-1)))
 
     @property
     def line_rms(self) -> float:
@@ -352,20 +352,20 @@ def distortion(optics: CameraOptics) -> Distortion:
     """Compute the distortion from chief rays over the field and along the line."""
     fields = field_grid()
     light = optics.directions(fields.reshape(-1, 2))
-    places = optics.path.places(optics.state, light)
+    positions = optics.path.positions(optics.state, light)
     plane = optics.assembly.nominal_pose(f"{optics.path.root}/focal_plane").rotation
     local = light @ plane
     # the light comes along +-Z of the focal plane; its image of a direction lies the way that the light goes
     tangent = local[:, 1::-1] / np.abs(local[:, 2:])
     # an intermediate image turns the image over
-    upright = float(np.sign(np.sum((tangent - tangent.mean(axis=0)) * (places - places.mean(axis=0)))))
+    upright = float(np.sign(np.sum((tangent - tangent.mean(axis=0)) * (positions - positions.mean(axis=0)))))
     tangent = upright * tangent
-    count = len(places)
+    count = len(positions)
     design = np.zeros((2 * count, 3))
     design[:, 0] = tangent.T.ravel()
     design[:count, 1] = 1.0
     design[count:, 2] = 1.0
-    solution, *_ = np.linalg.lstsq(design, places.T.ravel(), rcond=None)
+    solution, *_ = np.linalg.lstsq(design, positions.T.ravel(), rcond=None)
     ideal = (design @ solution).reshape(2, count).T
     spec = optics.model.spec
     half = 0.5 * spec.line.pixels * spec.line.pitch
@@ -383,7 +383,7 @@ def distortion(optics: CameraOptics) -> Distortion:
     t = np.tan(angle)
     return Distortion(
         fields=fields,
-        places=places.reshape(fields.shape),
+        positions=positions.reshape(fields.shape),
         ideal=ideal.reshape(fields.shape),
         distance=float(solution[0]),
         point=solution[1:],

@@ -38,7 +38,7 @@ from optics.waves.pupil_shadow import SMALLEST
 from optics.waves.pupil_stack import PupilFunction
 from optics.waves.pupil_terms import products, smooth_terms
 from scenes.models.camera_model import ROOT, CameraModel, camera_alone, derive_camera, field_direction, lenses
-from scenes.models.camera_sharpness import FIELDS, Cut, FieldBeams, FocalPlane, stop_nodes
+from scenes.models.camera_sharpness import FIELDS, FieldBeams, FocalPlane, Vignetting, stop_nodes
 from scenes.models.instrument_model import Instrument
 from scenes.models.shadow import ImagingShadows, imaging_shadows
 from scenes.specs.camera import CameraSpec
@@ -190,7 +190,7 @@ class CameraOptics:
         return float(0.5 / self.model.spec.line.pitch)
 
     @cached_property
-    def cut(self) -> Cut | None:
+    def vignetting(self) -> Vignetting | None:
         """Mask of the stop's points that bodies of the nominal instrument block; None where they block none."""
         if not np.any(area(self.path.shadow_pieces({}, self._designed(np.array(FIELDS)))) > SMALLEST):
             return None
@@ -261,7 +261,7 @@ class CameraOptics:
             In this state the light misses the stop or the plane of the line CCD.
         """
         fields = self.fractions(fields)
-        nodes = stop_nodes(self.model, RINGS, self.cut is not None)
+        nodes = stop_nodes(self.model, RINGS, self.vignetting is not None)
         axis = np.linspace(-1.0, 1.0, points)
         x, y = np.meshgrid(axis, axis)
         inside = np.hypot(x, y) <= 1.0
@@ -277,7 +277,8 @@ class CameraOptics:
         error = in_waves(rays)
         out = []
         node_slice = slice(1, 1 + nodes.count)
-        light, is_vignetted = rays.valid[:, node_slice] @ nodes.share, self.cut is not None or bool(self.model.edges)
+        light = rays.valid[:, node_slice] @ nodes.share
+        is_vignetted = self.vignetting is not None or bool(self.model.edges)
         sight = self.directions(fields)[:, None]
         state = self.path.coloured(self.state, wavelength)
         for k, where in enumerate(fields):
@@ -326,7 +327,7 @@ class CameraOptics:
             In this state the light misses the stop or the plane of the line CCD.
         """
         fields, moved = self.fractions(fields), in_si(defocus, LENGTH, "defocus")
-        nodes = stop_nodes(self.model, RINGS, self.cut is not None)
+        nodes = stop_nodes(self.model, RINGS, self.vignetting is not None)
         rings = [r / SPOT_RINGS * rim(6 * r) for r in range(1, SPOT_RINGS + 1)]
         stop = np.concatenate([np.zeros((1, 2)), np.stack([nodes.x, nodes.y], axis=-1), *rings])
         rays = self.rays(fields, stop)
@@ -383,18 +384,19 @@ class CameraOptics:
         InputError
             Edges block all of a field's light.
         """
-        places = tuple((float(x), float(y)) for x, y in self.fractions(fields))
+        positions = tuple((float(x), float(y)) for x, y in self.fractions(fields))
         if not self.state and not self.built:
-            return FieldBeams.trace(self.model, self.path.backend, places, rings, self.cut, wavelength=self.wavelength)
-        nodes = stop_nodes(self.model, rings, self.cut is not None)
+            model, blocked = self.model, self.vignetting
+            return FieldBeams.trace(model, self.path.backend, positions, rings, blocked, wavelength=self.wavelength)
+        nodes = stop_nodes(self.model, rings, self.vignetting is not None)
         rays = self.rays(fields, np.concatenate([np.zeros((1, 2)), np.stack([nodes.x, nodes.y], axis=-1)]))
         plane = self.model.focal_plane
         position, direction = plane.apply(rays.position), rays.direction @ plane.rotation.T
         last = self.model.mirror_pose(self.model.mirrors[-1]).translation
         room = np.sum((position[:, 0] - last) * direction[:, 0], -1)
-        passed = rays.valid[:, 1:] if self.model.edges or self.cut is not None else None
+        passed = rays.valid[:, 1:] if self.model.edges or self.vignetting is not None else None
         distance = float(self.model.first_order.exit_pupil_distance[0])
-        spec, fields = self.model.spec, np.array(places)
+        spec, fields = self.model.spec, np.array(positions)
         return FieldBeams(spec, fields, nodes, position, direction, rays.path, distance, room, passed)
 
     @one_blas_thread()
@@ -409,7 +411,7 @@ class CameraOptics:
             In this state the light misses the stop or the plane of the line CCD.
         """
         all_fields, plane = self.fractions(fields), FocalPlane.of(self.model.spec)
-        step = max(1, MAX_RAYS // stop_nodes(self.model, rings, self.cut is not None).count)
+        step = max(1, MAX_RAYS // stop_nodes(self.model, rings, self.vignetting is not None).count)
         parts = [all_fields[start : start + step] for start in range(0, len(all_fields), step)]
         return np.concatenate([self.beams(part, rings).errors(plane) for part in parts])
 
@@ -427,8 +429,8 @@ class CameraOptics:
             Edges cut a pupil into too many pieces, or a wavefront is too irregular for its polynomials.
         """
         light = self.directions(fields)
-        places = self.path.places(self.state, light)
-        pupils = self.path.pupils(self.state, light, places, wavelength=self.wavelength)
+        positions = self.path.positions(self.state, light)
+        pupils = self.path.pupils(self.state, light, positions, wavelength=self.wavelength)
         check_range("the light that a pupil's shadow leaves", np.array([p.light for p in pupils]), 0.0, 1.0, ROUNDING)
         if self.model.edges:
             nodes = stop_nodes(self.model, RINGS, True)
@@ -504,14 +506,14 @@ class CameraOptics:
     ) -> tuple[Mtf, ...]:
         """Compute the MTF of vignetted pupils at evenly spaced frequencies, line by line over the pupil."""
         light = self.directions(fields)
-        places = self.path.places(self.state, light)
+        positions = self.path.positions(self.state, light)
         used = colours if lenses(self.model.spec) else [np.min(colours)]
-        cut = [self.path.vignetted_pupils(self.state, light, places, float(colour)) for colour in used]
+        vignetted = [self.path.vignetted_pupils(self.state, light, positions, float(colour)) for colour in used]
         if frequency is None:
             shortest = float(np.min(colours))
-            cutoff = max(float(np.max(v.pupil.cutoff(np.eye(2), shortest))) for pupils in cut for v in pupils)
+            cutoff = max(float(np.max(v.pupil.cutoff(np.eye(2), shortest))) for pupils in vignetted for v in pupils)
             frequency = np.linspace(0.0, min(cutoff, 2.0 * self.nyquist), MTF_POINTS)
-        pupils_by_colour = [cut[n if len(cut) > 1 else 0] for n in range(len(colours))]
+        pupils_by_colour = [vignetted[n if len(vignetted) > 1 else 0] for n in range(len(colours))]
         transfers = [
             line_transfers(pupils, [float(colour)] * len(pupils), np.eye(2), float(frequency[1]), len(frequency))
             for pupils, colour in zip(pupils_by_colour, colours, strict=True)

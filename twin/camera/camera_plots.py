@@ -297,9 +297,9 @@ def light_mtf_figure(run: CameraRun) -> Figure:
             um, um, np.sqrt(np.maximum(psf.values, 0.0)), cmap="YlGnBu", shading="nearest", rasterized=True
         )
         # up to a thousandth of the peak
-        lit = np.abs(um)[np.max(psf.values, axis=0) + np.max(psf.values, axis=1) > 1e-3 * np.max(psf.values)]
-        lower.set_xlim(-np.max(lit), np.max(lit))
-        lower.set_ylim(-np.max(lit), np.max(lit))
+        illuminated = np.abs(um)[np.max(psf.values, axis=0) + np.max(psf.values, axis=1) > 1e-3 * np.max(psf.values)]
+        lower.set_xlim(-np.max(illuminated), np.max(illuminated))
+        lower.set_ylim(-np.max(illuminated), np.max(illuminated))
         lower.set_aspect("equal")
         lower.set_title(f"Strehl {psf.strehl:.2f}", fontsize=8.0)
         lower.set_xlabel(MICRO)
@@ -368,7 +368,7 @@ def distortion_figure(run: CameraRun) -> Figure:
     d = run.distortion
     figure = svg.new_figure(3.6)
     left, right = figure.subplots(1, 2, gridspec_kw={"width_ratios": [1.35, 1.0]})
-    away = d.places - d.ideal
+    away = d.positions - d.ideal
     spacing = 0.5 * float(np.min(np.ptp(d.ideal, axis=(0, 1)) / (np.array(d.fields.shape[:2]) - 1)))
     factor = rounded_down(spacing / max(d.largest, 1e-12))
     for places, colour, width in ((d.ideal, svg.GREY, 0.6), (d.ideal + factor * away, svg.BLUE, 1.0)):

@@ -76,14 +76,14 @@ def _first_order_text(run: CameraRun) -> str:
     """Return a sentence on focal length, F-number and other first-order data, and on the obscuration."""
     n, d = FIRST_ORDER(run.first_order), run.distortion
     blocked = ", ".join(f"{body} {100 * share:.1f}%" for body, share in n["obscuration"].items())
-    own = f"{'further ' if run.optics.model.edges else ''}obscuration by its own parts"
+    obscuration = f"{'further ' if run.optics.model.edges else ''}obscuration by its own parts"
     unmodelled = unmodelled_obscuration(run.optics.model, run.first_order.obscuration)
     return (
         f"f {n['focal_length_m']:.4g} m, F/{n['f_number']:.3g}, field {n['field_deg'][0]:.3g} by "
         f"{n['field_deg'][1]:.3g} deg; principal distance along the line {d.line_distance:.6g} m, "
         f"distortion at most {1e6 * d.line_largest:.3g} µm there; "
         + (f"its edges block {100.0 * _blocked(run):.1f} % of the light; " if run.optics.model.edges else "")
-        + (f"{own}: {blocked}." if blocked else f"no {own}.")
+        + (f"{obscuration}: {blocked}." if blocked else f"no {obscuration}.")
         + "".join(f" {text}." for text in (unmodelled, detector_beyond_field(run.first_order)) if text)
     )
 
@@ -233,11 +233,11 @@ def _wavefronts(run: CameraRun) -> Section:
         term_values = (w.parts if w.is_vignetted else w.coefficients for w in run.waves)
         rows.append([f"Z{j} {zernike.name(j)}", *(float(terms[j - 1]) for terms in term_values)])
     caption = "Waves; Zernike terms in Noll's order, waves rms, piston and tilt removed."
-    cut = [w for w in run.waves if w.is_vignetted]
-    if cut:
-        sets = "; ".join(dict.fromkeys(w.polynomials for w in cut))
+    vignetted = [w for w in run.waves if w.is_vignetted]
+    if vignetted:
+        sets = "; ".join(dict.fromkeys(w.polynomials for w in vignetted))
         caption += f" Polynomials: {sets}. Circle terms fitted to the same light are in optics.json."
-        caption += f" The relative error of the rms is {max(w.accuracy for w in cut):.1g}, by a finer quadrature."
+        caption += f" The relative error of the rms is {max(w.accuracy for w in vignetted):.1g}, by a finer quadrature."
     table = Table("zernike", "Wavefront error by field", caption, heads, rows, (None, *[4] * len(run.waves)))
     kinds = ", ".join(f"{kind} {size:.3g}" for kind, size in run.limits[:3])
     text = f"At the worst field, {field_text(run.camera, run.worst[1])}: {kinds} waves rms."

@@ -83,14 +83,14 @@ def draw_spot(axes: Axes, spot: Spot, half: float | None = None) -> None:
         Half the width of the box, metres; by default it contains all rays and the Airy disk.
     """
     rays = 1e6 * (spot.rays - spot.centroid)
-    reach = 1e6 * (spot.half_width if half is None else half)
+    half_width = 1e6 * (spot.half_width if half is None else half)
     axes.plot(rays[:, 0], rays[:, 1], ".", ms=2.2, color=BLUE, mew=0.0)
     axes.add_patch(patches.Circle((0.0, 0.0), 1e6 * spot.airy, fill=False, lw=0.8, color=INK))
     axes.axhline(0.0, lw=0.4, color=LIGHT, zorder=0)
     axes.axvline(0.0, lw=0.4, color=LIGHT, zorder=0)
     axes.set_aspect("equal")
-    axes.set_xlim(-reach, reach)
-    axes.set_ylim(-reach, reach)
+    axes.set_xlim(-half_width, half_width)
+    axes.set_ylim(-half_width, half_width)
 
 
 def draw_mtf(axes: Axes, mtf: Mtf, labels: tuple[str, str] | None = ("along the line", "along the track")) -> None:
@@ -252,7 +252,7 @@ class CameraView(CameraOptics, Plottable):
                 "prescription: it describes the nominal camera, and this one is perturbed or as built; take that of "
                 "the nominal camera and set decenter, tilt or figure of its surfaces"
             )
-        if self.cut is not None:
+        if self.vignetting is not None:
             raise ValueError(
                 "prescription: prisms of the instrument block light of this camera, which optics.Camera cannot "
                 "describe; camera(NAME, obstruction=False) has its full beam"
@@ -579,8 +579,8 @@ def _label(axes: Axes, model: CameraModel, lines: Mapping[str, np.ndarray], axis
         drawn = section[:, [2, axis]]
         text = f"{name}, stop" if name == model.spec.stop else _title(name)
         # beyond the end that is farther from the axis; in the top view all ends are alike, and neighbours alternate
-        turn = name == IMAGE or model.mirrors.index(name) == 0
-        first = int(np.argmax(np.abs(drawn[[0, -1], 1]))) if axis == 1 else int(turn)
+        alternate = name == IMAGE or model.mirrors.index(name) == 0
+        first = int(np.argmax(np.abs(drawn[[0, -1], 1]))) if axis == 1 else int(alternate)
         right = isinstance(model.apertures.get(name), Circle) or name == IMAGE
         for level, end in itertools.product(range(_LEVELS), (drawn[-first], drawn[first - 1])):
             up = 1 if end[1] >= np.mean(drawn[:, 1]) else -1

@@ -167,7 +167,7 @@ def lateral_colour(
     light = optics.directions(fields)
 
     def places(wavelength: float) -> np.ndarray:
-        return optics.path.places(optics.path.coloured(optics.state, wavelength), light)
+        return optics.path.positions(optics.path.coloured(optics.state, wavelength), light)
 
     start = places(reference)
     return np.stack([places(float(wavelength)) - start for wavelength in wavelengths], axis=1)

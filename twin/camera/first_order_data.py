@@ -426,7 +426,7 @@ def first_order_data(optics: CameraOptics) -> FirstOrderData:
     state = path.coloured(optics.state, optics.wavelength)
     placed = path.assembly.place([state])
     imaging, to_stop = (
-        assemble(path.assembly, [f"{path.name}/{way}"], [state], placed=placed) for way in ("imaging", "to_stop")
+        assemble(path.assembly, [f"{path.name}/{beams}"], [state], placed=placed) for beams in ("imaging", "to_stop")
     )
     frame = placed.pose(path.root) @ model.camera_frame.inverse()
     axis, first = model.axis.moved(frame), frame.rotation @ LINE_AXIS

@@ -69,8 +69,8 @@ def refocused_state(
         Name of the camera in its instrument.
     """
     plane = focal_plane_body(optics.path.root)
-    found = find_focus(optics, tilt, mounted, existing.get(plane))
-    return found, compose(optics.state, {plane: found.motion}, {plane: optics.assembly.tree[plane]})
+    focus = find_focus(optics, tilt, mounted, existing.get(plane))
+    return focus, compose(optics.state, {plane: focus.motion}, {plane: optics.assembly.tree[plane]})
 
 
 def job_state_in_focus(experiment: MonitorExperiment, job: JobSpec) -> State:

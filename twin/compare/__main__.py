@@ -51,7 +51,7 @@ def main(
     Exit codes: 0 no result differs, 1 results differ, 2 bad input.
     """
 
-    def work(given: None, session: Session) -> Result:
+    def work(prepared: None, session: Session) -> Result:
         from twin.compare.compare_report import KIND, PROGRAM, compare, compare_report, numbers
 
         comparison = compare(runs, rtol, sigmas)

@@ -307,7 +307,7 @@ def differences(reference: Run, other: Run, rtol: float, sigmas: float | None) -
     if reference.manifest.kind != other.manifest.kind:
         kinds = f"{reference.manifest.kind} and {other.manifest.kind}"
         raise InputError(
-            Issue("the runs are of different kinds", str(other.folder), found=kinds, allowed="runs of one command")
+            Issue("the runs are of different kinds", str(other.folder), value=kinds, allowed="runs of one command")
         )
     inputs = [
         {"key": key, "reference": here, "other": there}
@@ -404,7 +404,7 @@ def compare(folders: Sequence[Path], rtol: float, sigmas: float | None) -> Compa
         There are fewer than two folders, a folder is not a run folder, or the runs are of different kinds.
     """
     if len(folders) < 2:
-        raise InputError(Issue("a comparison needs two runs or more", found=f"{len(folders)}"))
+        raise InputError(Issue("a comparison needs two runs or more", value=f"{len(folders)}"))
     runs = tuple(read_run(folder) for folder in folders)
     return Comparison(runs, tuple(differences(runs[0], other, rtol, sigmas) for other in runs[1:]), rtol, sigmas)
 

@@ -156,14 +156,14 @@ def _anamorphism(held: optimiser.ActiveConstraint) -> bool:
     return held.name.startswith("anamorphism")
 
 
-HELD_BY: Record[optimiser.ActiveConstraint] = Record(
+ACTIVE_CONSTRAINT: Record[optimiser.ActiveConstraint] = Record(
     "An active constraint, which limits the camera.",
     Quantity("constraint", lambda held: held.name, "its name"),
     Quantity("limit_m", lambda held: None if _anamorphism(held) else held.limit, "its limit"),
     Quantity("limit_percent", lambda held: held.limit if _anamorphism(held) else None, "limit of the anamorphism"),
     Quantity("broken_at_start_m", lambda held: max(held.start, 0.0), "violation by the start"),
     Quantity(
-        "worth_waves_per_mm",
+        "sensitivity_waves_per_mm",
         lambda held: 1e-3 * held.sensitivity,
         "decrease of the error per millimetre of easing",
         converted=False,
@@ -201,7 +201,7 @@ DESIGN: Record[DesignRun] = Record(
     Quantity("chief_ray_deg", _chief_rays, "angle of the chief ray from the normal of the focal plane, by field"),
     Quantity("clearance_m", _pair(lambda design: design.clearances), "room between beams and edges, by passage"),
     Quantity("improved", lambda run: run.best.improved, "whether the new camera is better"),
-    Quantity("held_by", lambda run: run.best.active, "active constraints, the most costly first", record=HELD_BY),
+    Quantity("active_constraints", lambda run: run.best.active, "the most costly first", record=ACTIVE_CONSTRAINT),
     Quantity("jacobians", lambda run: run.best.evaluations, "Jacobians that were traced for the best"),
     Quantity("converged", lambda run: run.best.converged, "true if the best search converged", warning=_unsettled),
     Quantity("starts", lambda run: run.searched.attempts, "results of all starts", record=START),

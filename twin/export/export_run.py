@@ -380,11 +380,11 @@ def export(source: Path, manifest: Manifest, frames: str, tables: str, folder: R
             try:
                 content = TABLE_FORMATS[tables](table)
             except MissingPackage as error:
-                raise InputError(Issue(str(error), found=f"--tables {tables}", allowed="csv, fits")) from None
+                raise InputError(Issue(str(error), value=f"--tables {tables}", allowed="csv, fits")) from None
             files.append(_put(folder, f"tables/{table.name}.{tables}", content, made_of, table.title, table.rows))
             advance("tables", k + 1, len(described))
     if not files:
-        raise InputError(Issue("this run has nothing to export", str(source), found=manifest.kind))
+        raise InputError(Issue("this run has nothing to export", str(source), value=manifest.kind))
     return Exported(source, manifest, frames, tables, tuple(files), tuple(described), changed)
 
 

@@ -51,7 +51,7 @@ def free_memory() -> float:
         amount = _AMOUNT.fullmatch(named)
         if amount is None:
             problem = f"the environment variable {LIMIT} is not an amount of memory"
-            raise InputError(Issue(problem, found=shown(named), allowed="a number with MB or GB, as 8 GB"))
+            raise InputError(Issue(problem, value=shown(named), allowed="a number with MB or GB, as 8 GB"))
         return float(amount["number"]) * _UNITS[amount["unit"]]
     return min(_of_system(), _of_group(), _of_limits())
 
@@ -162,7 +162,7 @@ def largest(fits: Callable[[int], bool], most: int, least: int = 0) -> int:
 class Owner(Protocol):
     """Interface of the source of a number: a part of a file (`Spec`), or the options of a command."""
 
-    def error(self, problem: str, key: KeyPath, *, found: object, allowed: str) -> Exception:
+    def error(self, problem: str, key: KeyPath, *, value: object, allowed: str) -> Exception:
         """Return an error that names the number and its allowed values, for the caller to raise."""
         ...
 
@@ -232,6 +232,6 @@ def require_memory(
         f"this needs about {amount_text(need)} of memory,{f' {shares},' if shares else ''} and "
         f"{amount_text(min(file_limit, free))} may be used",
         lower.key,
-        found=lower.number,
+        value=lower.number,
         allowed=f"at most {most} {lower.unit}, or {more}" if most >= lower.least else more,
     )

@@ -767,7 +767,7 @@ class Reader:
         half_range = 1.02 * max(p.small, p.table, p.large) * p.steps
         angles = np.linspace(-half_range, half_range, CALIBRATION_POINTS)
         rotations = np.stack(np.meshgrid(angles, angles, 0.0, indexing="ij"), axis=-1).reshape(-1, 3)
-        windows = self.path(p.narrow).windows([{axis_body("X"): Motion(rotate=triple(turn))} for turn in rotations])
+        windows = self.path(p.narrow).windows([{axis_body("X"): Motion(rotate=triple(r))} for r in rotations])
         photons, corner = windows.photons[0], windows.corner[0]
         positions, _ = self.positions(self.detector.expected_dn(photons, self.exposure), corner)
         normals = rotation_matrix(rotations) @ np.array([0.0, 0.0, -1.0])

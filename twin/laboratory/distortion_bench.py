@@ -120,7 +120,7 @@ class PinholeImages:
         BeamMissedError, AimError, ValueError
             The beam does not pass, or its wavefront is too irregular for a fit.
         """
-        pupils = path.pupils(state, light, path.places(state, light))
+        pupils = path.pupils(state, light, path.positions(state, light))
         wavelengths, weights = band_wavelengths(ccd.band)
         rim = np.stack([np.cos(_RIM), np.sin(_RIM)], axis=-1)
         cutoff = max(float(np.max(pupil.cutoff(rim, wavelengths[0]))) for pupil in pupils)
@@ -179,7 +179,7 @@ def centroid_offset(path: TargetPath, state: State, directions: np.ndarray) -> n
     It is the mean slope of the wavefront over the pupil, the same for all wavelengths, and is computed from the phase
     of the transfer function at a ten-thousandth of the cut-off frequency.
     """
-    pupils: tuple[PupilFunction, ...] = path.pupils(state, directions, path.places(state, directions))
+    pupils: tuple[PupilFunction, ...] = path.pupils(state, directions, path.positions(state, directions))
     wavelength, along = path.model.spec.wavelength, np.array([[1.0, 0.0]])
     out = []
     for pupil in pupils:
@@ -335,7 +335,7 @@ class DistortionBench:
         ccd = LineCcd.from_specs(band, setup.detectors[band.detector])
         _check_pinhole(setup, camera.model.line_principal_distance)
         half_length = 0.5 * band.pixels * band.pitch
-        edge = np.arctan(test.reach * half_length / camera.model.line_principal_distance)
+        edge = np.arctan(test.extent * half_length / camera.model.line_principal_distance)
         field_angle = edge * np.linspace(-1.0, 1.0, test.points)
         _check_table(setup, field_angle)
         try:
@@ -377,7 +377,7 @@ class DistortionBench:
         ``axis`` is the table's axis, a unit vector; ``field_angle`` are the rotations about it, (...), radians.
         """
         light = _rotated(axis, np.ravel(field_angle), self.centre_direction)
-        return self.path.places(self.as_built, light).reshape(*np.shape(field_angle), 2)
+        return self.path.positions(self.as_built, light).reshape(*np.shape(field_angle), 2)
 
     def record(
         self, table: TurntableModel, seed: int, advance: Advance = silent
@@ -422,9 +422,9 @@ class DistortionBench:
         column = first[..., 0]
         if np.min(column) < 0 or np.max(column) + test.window > self.ccd.band.pixels:
             overshoot = 0.5 * test.window + np.max(np.abs(position[..., 0])) / pitch - 0.5 * self.ccd.band.pixels
-            most = test.reach - 2.0 * max(overshoot, 0.0) / self.ccd.band.pixels
+            most = test.extent - 2.0 * max(overshoot, 0.0) / self.ccd.band.pixels
             allowed = f"at most about {most:.4f} for this zero of the table"
-            raise BenchError("the first or last spot falls beside the line", ("reach",), allowed)
+            raise BenchError("the first or last spot falls beside the line", ("extent",), allowed)
         inside = (spot - first) * pitch
         light = np.stack([self.images(w, at) for w, at in zip(self.field_angle, inside, strict=True)])
         # far tails of the Fourier sum may ring below zero by rounding
@@ -456,7 +456,7 @@ def _aim(path: TargetPath, state: State, offset: float) -> np.ndarray:
         # light that travels along -Z + t has its image at +f t; slopes are (along, across)
         light = np.stack([around[:, 1], around[:, 0], -np.ones(3)], axis=-1)
         light /= np.linalg.norm(light, axis=1)[:, None]
-        positions = path.places(state, light)
+        positions = path.positions(state, light)
         slope = slope + np.linalg.solve((positions[1:] - positions[0]).T / step, target - positions[0])
     out = np.array([slope[1], slope[0], -1.0])
     return np.asarray(out / np.linalg.norm(out))
@@ -486,6 +486,6 @@ def _check_table(setup: DistortionSetup, field_angle: np.ndarray) -> None:
         raise BenchError(
             f"the camera's field requires +-{np.rad2deg(field_angle[-1]):.3f} deg of the turntable, but about its "
             f"camera_angle only +-{np.rad2deg(max(margin, 0.0)):.3f} deg are calibrated",
-            ("reach",),
-            "a smaller reach, or a turntable file that is calibrated over the field",
+            ("extent",),
+            "a smaller extent, or a turntable file that is calibrated over the field",
         )

@@ -396,7 +396,7 @@ def _check_region(
     allowed = f"{measured_readings.calibrated_text(series.angle)}, the calibrated range"
     if not covered(series.angle, zero):
         shown = f"{np.degrees(files.zero):.9g} deg"
-        raise files.error("the turntable is not calibrated at this reading", ("zero",), found=shown, allowed=allowed)
+        raise files.error("the turntable is not calibrated at this reading", ("zero",), value=shown, allowed=allowed)
     beyond = ~covered(series.angle, readings.reading) & (readings.lines > 0)
     if np.any(beyond):
         first = np.argwhere(beyond)[0]

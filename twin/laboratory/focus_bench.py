@@ -195,7 +195,7 @@ class FocusBench:
         half = {n: 0.5 * (b.pixels - 2.0 * test.edge.region) * b.pitch for n, b in bands.items()}
         positions = np.array([[field * half[name], bands[name].offset] for name, field in keys])
         directions = self.path.directions(positions)
-        hits = self.path.places(self.camera.as_built, directions)
+        hits = self.path.positions(self.camera.as_built, directions)
         pupils = self.path.pupils(self.camera.as_built, directions, hits)
         sites = []
         for i, (name, field) in enumerate(keys):
@@ -533,8 +533,8 @@ def _search(recorder: Recorder, number: int, zero: float, first: int = 0) -> flo
     site = recorder.bench.sites[number]
     # a wide peak needs only as many positions as place some of them on the peak
     step = max(plan.step, 2.0 * zero / _COARSE)
-    shift_range = plan.reach / site.nominal_per_shift[ALONG]
-    shift = np.linspace(-shift_range, shift_range, 2 * int(np.ceil(plan.reach / step)) + 1)
+    shift_range = plan.half_range / site.nominal_per_shift[ALONG]
+    shift = np.linspace(-shift_range, shift_range, 2 * int(np.ceil(plan.half_range / step)) + 1)
     measurements = [recorder.attempt(number, ALONG, float(s), k) for k, s in enumerate(shift, first)]
     if all(np.isinf(m[1]) for m in measurements):
         there = f"in {site.band} at field {site.field:g}"
@@ -546,7 +546,7 @@ def _search(recorder: Recorder, number: int, zero: float, first: int = 0) -> flo
         where = "the lower" if best == 0 else "the upper"
         focus = f"best focus of {site.band} at field {site.field:g}"
         problem = f"{focus} is not inside the scan: contrast is highest at {where} end"
-        raise BenchError(problem, ("scan", "reach"), "a longer reach")
+        raise BenchError(problem, ("scan", "half_range"), "a larger half_range")
     return float(shift[best])
 
 

@@ -107,7 +107,7 @@ def _defocus(axes: Axes, run: FocusRun, number: int, state: FocusState) -> None:
     """Draw the defocus of the sites in one state (placement of the focal plane), band by band."""
     for k, band in enumerate(dict.fromkeys(run.bands)):
         of_band = np.array(run.bands) == band
-        colour, positions = FIELD_COLOURS[k % len(FIELD_COLOURS)], run.places[of_band]
+        colour, positions = FIELD_COLOURS[k % len(FIELD_COLOURS)], run.positions[of_band]
         along, sigma = 1e3 * positions[:, 1], UM * state.defocus_sigma[of_band]
         style: dict[str, Any] = {"fmt": "o", "ms": 3.5, "lw": 1.0, "color": colour, "label": band or "all sites"}
         axes.errorbar(along, UM * state.defocus[of_band], sigma, **style)
@@ -229,7 +229,7 @@ def _facts(run: FocusRun, test: MeasuredFocusSpec) -> tuple[tuple[str, str], ...
     unread = "not read: the rotation about Z′ is not corrected"
     read = unread if level is None else f"{level.angle / ARCMIN:.3f} arcmin"
     return (
-        ("Sites", f"{len(run.places)} in {len(set(run.bands))} bands, MTF {edges}"),
+        ("Sites", f"{len(run.positions)} in {len(set(run.bands))} bands, MTF {edges}"),
         ("Scanned by moving", MOVED[test.measured.moved]),
         ("Level of the line", read),
         (

@@ -230,7 +230,7 @@ class FocusRun:
         Seed of all random numbers.
     bands : tuple of str
         Band of the CCD at each of the N sites; empty where a table has no bands.
-    places : (N, 2) ndarray
+    positions : (N, 2) ndarray
         Positions (X', Y') of the sites, metres.
     states : tuple of FocusState
         Measured states.
@@ -243,7 +243,7 @@ class FocusRun:
     test: FocusTestSpec | MeasuredFocusSpec
     seed: int
     bands: tuple[str, ...]
-    places: np.ndarray
+    positions: np.ndarray
     states: tuple[FocusState, ...]
     shimmings: tuple[Shimming, ...]
     readings: FocusReadings | None = None
@@ -363,7 +363,7 @@ def align_files(spec: MeasuredFocusSpec, seed: int = 0, advance: Advance = silen
         test=spec,
         seed=seed,
         bands=readings.bands,
-        places=readings.positions,
+        positions=readings.positions,
         states=(state,),
         shimmings=(shimming,),
         readings=readings,
@@ -407,7 +407,7 @@ def align(bench: FocusBench, seed: int, advance: Advance = silent) -> SimulatedF
         test=test,
         seed=seed,
         bands=tuple(site.band for site in bench.sites),
-        places=positions,
+        positions=positions,
         states=tuple(states),
         shimmings=tuple(shimmings),
         bench=bench,
@@ -563,8 +563,8 @@ def _on_new_shims(pose: Pose, plan: plane_fit.ShimPlan, mount: plane_fit.Mount, 
     Its rotation in the mounting surface is set with an error of ``setting`` radians.
     """
     achieved = plan.achieved
-    turned = rotation_matrix(setting * mount.normal) @ achieved.matrix
-    return pose @ Pose(turned, achieved.shift)
+    rotated = rotation_matrix(setting * mount.normal) @ achieved.matrix
+    return pose @ Pose(rotated, achieved.shift)
 
 
 def _holes(values: Iterable[Any]) -> dict[str, Any]:
@@ -709,8 +709,8 @@ _PlaneState: TypeAlias = tuple[FocusRun, FocusState, Shimming]
 SITE: Record[_PlaneState] = Record(
     "One site of the focal plane, before the shims are changed.",
     Quantity("band", lambda s: list(s[0].bands), "name of the band"),
-    Quantity("x_mm", lambda s: s[0].places[:, 0], "X', in the flight direction", "x", 3),
-    Quantity("y_mm", lambda s: s[0].places[:, 1], "Y', along the line", "y", 3),
+    Quantity("x_mm", lambda s: s[0].positions[:, 0], "X', in the flight direction", "x", 3),
+    Quantity("y_mm", lambda s: s[0].positions[:, 1], "Y', along the line", "y", 3),
     Quantity(
         "defocus_um",
         lambda s: s[1].defocus,

@@ -182,7 +182,7 @@ def _per_shift(table: Table, files: FocusFiles) -> Array | float:
     if files.per_shift is None:
         text = "the ratio of image shift to target shift is not specified"
         allowed = "per_shift: (f of the camera / f of the collimator)^2, or a column 'per shift'"
-        raise files.error(text, ("moved",), found="target", allowed=allowed)
+        raise files.error(text, ("moved",), value="target", allowed=allowed)
     return files.per_shift
 
 

@@ -332,10 +332,10 @@ def _spot_positions(table: Table, files: DistortionFiles) -> tuple[Array, Array,
     The first sigma is of the error that is independent in every exposure, the second of one that is fixed.
     """
     if ("along" in table) is ("column" in table):
-        found = "neither" if "along" not in table else "both"
+        value = "neither" if "along" not in table else "both"
         text = "a column with the positions of the spots is needed"
         allowed = "'along [mm]' from the line's middle, or 'column' with `line:` in the test's file"
-        raise InputError(Issue(text, files.spots, 1, (), found, allowed))
+        raise InputError(Issue(text, files.spots, 1, (), value, allowed))
     none = np.zeros(len(table))
     if "along" in table:
         wrong = next((n for n in ("column sigma", "column fixed sigma") if n in table), None)
@@ -347,7 +347,7 @@ def _spot_positions(table: Table, files: DistortionFiles) -> tuple[Array, Array,
         raise table.error(0, wrong, "a sigma in lengths for positions in pixels", allowed=f"'column {wrong}'")
     if files.line is None:
         text, allowed = "positions in pixels need the pixel pitch of the line", "line: {pitch: 7 um, middle: 6143.5}"
-        raise files.error(text, ("spots",), found="column", allowed=allowed)
+        raise files.error(text, ("spots",), value="column", allowed=allowed)
     pitch = files.line.pitch
     temporal, fixed = (table.columns.get(n, none) for n in ("column sigma", "column fixed sigma"))
     return (table["column"] - files.line.middle) * pitch, temporal * pitch, fixed * pitch

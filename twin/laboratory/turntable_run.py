@@ -380,10 +380,10 @@ def _check_count(spec: TurntableTestSpec, names: Sequence[str]) -> None:
     left = dividing_error.angles_left(plan.count, plan.folds)
     short = [name for name in names if left < dividing_error.fewest(name)]
     if short:
-        found = f"{plan.count} angles, {left} of them without a fold of the cross-validation"
+        value = f"{plan.count} angles, {left} of them without a fold of the cross-validation"
         problem, allowed = f"too few angles for the fit {short[0]!r}", dividing_error.fewest(short[0])
         key = ("calibration", "step")
-        raise spec.error(problem, key, found=found, allowed=f"steps that leave {allowed} or more")
+        raise spec.error(problem, key, value=value, allowed=f"steps that leave {allowed} or more")
 
 
 def usable_fits(
@@ -401,7 +401,7 @@ def usable_fits(
     enough = tuple(name for name in names if left >= dividing_error.fewest(name))
     if not enough:
         text = f"{count} angles, {left} of them without a fold of the cross-validation"
-        issue = files.error("too few angles for any fit", ("comparisons",), found=text, allowed="more angles or folds")
+        issue = files.error("too few angles for any fit", ("comparisons",), value=text, allowed="more angles or folds")
         raise issue
     return enough, tuple(name for name in names if name not in enough)
 

@@ -190,7 +190,7 @@ def changed_camera(spec: CameraSpec, values: Mapping[str, float]) -> CameraSpec:
         gap = places[k + 1] - places[k]
         if longer and abs(gap) + 1e-3 * longer < 0.0:
             problem = f"{names[k + 1]} would be on the other side of {name}"
-            raise InputError(Issue(problem, found=f"{longer:g} mm", allowed=f"{-1e3 * abs(gap):.6g} mm or more"))
+            raise InputError(Issue(problem, value=f"{longer:g} mm", allowed=f"{-1e3 * abs(gap):.6g} mm or more"))
         moved += math.copysign(1e-3 * longer, longer * (gap or heading))
     image = spec.image.model_copy(update={"z": spec.image.z + moved})
     # without the file that it came from, whose lines have other numbers

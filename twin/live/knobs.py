@@ -212,7 +212,7 @@ def checked_knob(name: str, value: float, knobs: Mapping[str, Knob]) -> Knob:
         raise InputError(unknown("no such knob", name, knobs).at())
     if not abs(value) <= knob.limit:
         found, allowed = f"{value:g} {knob.unit}".strip(), f"up to {knob.limit:g} {knob.unit}".strip()
-        raise InputError(Issue(f"{name} is too large", found=found, allowed=allowed))
+        raise InputError(Issue(f"{name} is too large", value=found, allowed=allowed))
     return knob
 
 
@@ -333,12 +333,12 @@ def _factor(name: str, factor: FactorSpec, setup: StudySetup) -> FactorKnob | No
         mean, sigma = values[:2]
         values = [mean - 4.0 * sigma, mean + 4.0 * sigma] if factor.kind == "normal" else values[2:]
     base = 1.0
-    if factor.places:
+    if factor.key_paths:
         try:
-            base = number_at(setup.base, factor.places[0], unit)
+            base = number_at(setup.base, factor.key_paths[0], unit)
         except Problem as problem:
             raise setup.error(problem, ("factors", name, *factor.key_of(0))) from None
-    knobs = {} if factor.scales else _knobs(factor.places, unit)
+    knobs = {} if factor.scales else _knobs(factor.key_paths, unit)
     return FactorKnob(name, unit, min(*values, base), max(*values, base), base, numbers.whole, knobs)
 
 

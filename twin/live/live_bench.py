@@ -31,7 +31,7 @@ from twin.framework.random_streams import stream
 from twin.live.camera_design import BLURRED, DESIGN, CameraDesign, changed_camera, optics_data, with_traced_focal_length
 from twin.live.knobs import Knob, checked_knob, knobs_of, perturbation
 from twin.live.messages import LARGEST_SEED, MOST_FRAMES, AskedState, BlindState
-from twin.main_job.monitor_reading import stated
+from twin.main_job.monitor_reading import rounded
 from twin.main_job.render_job import MIN_LIGHT, require_one_state
 from twin.main_job.render_results import JobRun, RenderRun
 from twin.main_job.systematics import contradiction, doubted
@@ -368,20 +368,20 @@ class LiveBench:
     def _hidden(self, asked: AskedState) -> State:
         """Return body -> its motion that is hidden from the page, for the user to guess; empty if nothing is hidden."""
         experiment = self.twin.experiment
-        if not isinstance(asked, BlindState) or experiment.stated is None:
+        if not isinstance(asked, BlindState) or experiment.prior is None:
             return {}
-        return state_of(self._drawn(asked), experiment.stated.components, experiment.thermal)
+        return state_of(self._drawn(asked), experiment.prior.components, experiment.thermal)
 
     @property
     def _components(self) -> tuple[Component, ...]:
-        stated = self.twin.experiment.stated
-        return () if stated is None else stated.components
+        prior = self.twin.experiment.prior
+        return () if prior is None else prior.components
 
     def _drawn(self, asked: BlindState) -> np.ndarray:
         """Return the random amounts of the hidden motions, SI units."""
-        stated = self.twin.experiment.stated
-        assert stated is not None
-        return stated.draw(np.random.default_rng(stream(asked.blind, BLIND)), 1)[0]
+        prior = self.twin.experiment.prior
+        assert prior is not None
+        return prior.draw(np.random.default_rng(stream(asked.blind, BLIND)), 1)[0]
 
     def hidden(self, asked: BlindState) -> dict[str, Any]:
         """Return the motions hidden for the user to guess, most significant first, and the true changes due to them."""
@@ -463,7 +463,7 @@ class LiveBench:
         They are estimated and true changes, spots and warnings.
         """
         instrument = self.twin.experiment.instrument
-        message: dict[str, Any] = {"readings": stated(run.recovered_dict())}
+        message: dict[str, Any] = {"readings": rounded(run.recovered_dict())}
         if not isinstance(asked, BlindState):
             message["truth"] = run.truth_dict()
             message["motions"] = motions(instrument, run.state, placed)

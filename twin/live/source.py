@@ -185,7 +185,7 @@ def _of_file(file: Path, run: int | None, manifest: Manifest | None = None) -> S
 def _require_no_run(what: str, run: int | None) -> None:
     """Raise InputError if the number of a run is given for a source that is not a study."""
     if run is not None:
-        raise InputError(Issue("--run chooses a run of a study, but this is not a study", what, found=f"--run {run}"))
+        raise InputError(Issue("--run chooses a run of a study, but this is not a study", what, value=f"--run {run}"))
 
 
 def _run_of(kind: FileKind | None, manifest: Manifest) -> str:
@@ -285,7 +285,7 @@ def _of_study(file: Path, run: int | None) -> Source:
     plan = Plan.of(setup)
     if not 0 <= run < plan.runs:
         text = "the study has no such run"
-        raise InputError(Issue(text, str(file), found=f"--run {run}", allowed=f"0 to {plan.runs - 1}"))
+        raise InputError(Issue(text, str(file), value=f"--run {run}", allowed=f"0 to {plan.runs - 1}"))
     one, scalars = plan.run(run), {column.name: column.cell(run) for column in plan.columns}
     try:
         resolved = validate(ResolvedJob, YamlFile("", base_with_factors(setup, scalars), {}))

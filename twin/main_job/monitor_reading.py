@@ -418,7 +418,7 @@ def _to_digits(value: float) -> float:
     return float(f"{value:.{_SIGMA_DIGITS - 1}e}")
 
 
-def stated(readings: Mapping[str, Any]) -> dict[str, Any]:
+def rounded(readings: Mapping[str, Any]) -> dict[str, Any]:
     """Round estimated changes for files: each to a millionth of its sigma, the sigmas to eight digits.
 
     Further digits carry no information and differ between processors, with the order in which linear algebra sums.
@@ -434,7 +434,7 @@ def stated(readings: Mapping[str, Any]) -> dict[str, Any]:
         names = (f"{key}_sigma_noise", f"{key}_sigma")
         sigma = next((readings[name] for name in names if name in readings), None)
         if isinstance(value, Mapping):
-            out[key] = stated(value)
+            out[key] = rounded(value)
         elif isinstance(value, float) and key.endswith(_SIGMAS):
             out[key] = _to_digits(value)
         elif isinstance(value, float) and isinstance(sigma, float) and 0.0 < sigma < math.inf:

@@ -172,7 +172,7 @@ def _mtf_table(targets: TargetRun, kinds: list[str]) -> Table:
     for name, camera in targets.cameras.items():
         nyquist, pitch = plain(1e-3 * NYQUIST / camera.pitch, 4), plain(1e6 * camera.pitch)
         bands[len(rows)] = f"Camera {name}, band {camera.band}, Nyquist {nyquist} cycles/mm, {pitch} µm pixels"
-        for position, images in camera.places.items():
+        for position, images in camera.positions.items():
             biases += [edge.nyquist_bias for shots in images.shots.values() for edge in shots.edges.values()]
             for direction in DIRECTIONS:
                 row: list[Cell] = [f"{position}, {DIRECTION_NAMES[direction]}"]
@@ -211,7 +211,7 @@ def _mtf_table(targets: TargetRun, kinds: list[str]) -> Table:
 def _mtf_rows(name: str, camera: CameraTargets) -> list[list[Cell]]:
     """Return table rows with the MTF measured in each of a camera's targets, with all digits."""
     rows: list[list[Cell]] = []
-    for position, targets in camera.places.items():
+    for position, targets in camera.positions.items():
         for direction in DIRECTIONS:
             for when, shots in targets.shots.items():
                 for kind, reading in (("edge", shots.edges.get(direction)), ("bars", shots.bars.get(direction))):

@@ -129,7 +129,7 @@ def render_job(
     times = 0 if resolved.job.course is None else len(resolved.job.course.times)
     require_memory(resolved, experiment.size(frame_count, times, target_pixels(resolved)), experiment.detector)
     resolved = resolved.with_job(checked_nodes(resolved.job, experiment.instrument.nodes))
-    experiment.stated  # noqa: B018 - what is wrong with it is said before the long parts
+    experiment.prior  # noqa: B018 - what is wrong with it is said before the long parts
     stage.begin(1)
     course = resolved.job.course
     states = (
@@ -395,8 +395,8 @@ def _too_large(resolved: ResolvedJob, reason: str) -> InputError:
     allowed = "smaller motions, which keep the beams on the mirrors and the spots on their CCDs"
     if any(what.deformation is not None for what in resolved.job.perturb.values()):
         allowed += "; with a table of rippled nodes, a job without image quality and targets"
-    text, found = f"the perturbed instrument cannot be rendered: {reason}", f"motions of {moved}"
-    return resolved.job.error(text, ("perturb",), found=found, allowed=allowed)
+    text, value = f"the perturbed instrument cannot be rendered: {reason}", f"motions of {moved}"
+    return resolved.job.error(text, ("perturb",), value=value, allowed=allowed)
 
 
 def _no_spots(experiment: MonitorExperiment, reason: str) -> InputError:

@@ -159,7 +159,7 @@ def _state_table(run: RenderRun, name: str, title: str) -> Table:
     table = run.reading.table
     rows: list[list[Cell]] = []
     good = dict.fromkeys(run.estimators, 0)
-    has_prior = run.experiment.stated is not None
+    has_prior = run.experiment.prior is not None
     for rows_of_change in table.by_change():
         first, p = rows_of_change[0], rows_of_change[0].parameter
         key = first.group if first.where == "both" else f"{first.group}.{p.key}"
@@ -420,7 +420,7 @@ def residual_section(run: RenderRun, drawn: Mapping[str, str]) -> Section:
     heads = ["camera", "parameter", "unit", f"{title} - true", "sigma", "sigma noise", "expected from the crosstalk"]
     far = (
         "Far outside: larger motions than the prior expects, or other ones."
-        if run.experiment.stated is not None
+        if run.experiment.prior is not None
         else "Inside the band: noise. Far outside: the formula has a wrong factor, or a body moved that the "
         "estimators do not model."
     )
@@ -448,7 +448,7 @@ ZERO_CELSIUS = 273.15
 def facts(run: JobRun) -> tuple[tuple[str, str], ...]:
     """Return the facts about the set-up and assumptions of a run, as pairs of title and text."""
     resolved, instrument = run.resolved, run.experiment.instrument
-    spec, has_prior = resolved.instrument, run.experiment.stated is not None
+    spec, has_prior = resolved.instrument, run.experiment.prior is not None
     instrument_fact = ("Instrument", f"{spec.name}: {spec.description}" if spec.description else spec.name)
     as_built_fact = () if not spec.as_built else (("As built", f"{perturbation_text(spec.as_built)}. {_BUILT}"),)
     expansion_text = (
@@ -523,13 +523,13 @@ def setup_section(run: JobRun) -> Section:
     heads += ["pitch [µm]", "line [mm]", *(["distance of the area CCDs [mm]"] if instrument.channels else [])]
     decimals = (None, None, 2, 4, 1, None, None, 1, 2)[: len(heads)]
     cameras = Table("cameras", "Cameras", "", heads, rows, decimals, within=IN_PAGE)
-    prior_tables = () if run.experiment.stated is None else (_prior_table(run),)
+    prior_tables = () if run.experiment.prior is None else (_prior_table(run),)
     title = "Cameras, and the prior on disturbances" if prior_tables else "Cameras"
     return Section(title, (), (*prior_tables, cameras), closed=True)
 
 
 def _prior_table(run: JobRun) -> Table:
-    prior, spec = run.experiment.stated, run.resolved.disturbances
+    prior, spec = run.experiment.prior, run.resolved.disturbances
     assert prior is not None
     assert spec is not None
     rows: list[list[Cell]] = []

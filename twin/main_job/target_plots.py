@@ -51,9 +51,9 @@ def curves_svg(name: str, camera: CameraTargets) -> str:
         figure = svg.new_figure(8.4)
         heights = (3.0, 1.2) * len(DIRECTIONS)
         panels = figure.subplots(
-            len(heights), len(camera.places), sharex=True, sharey="row", squeeze=False, height_ratios=heights
+            len(heights), len(camera.positions), sharex=True, sharey="row", squeeze=False, height_ratios=heights
         )
-        for column, (position, targets) in enumerate(camera.places.items()):
+        for column, (position, targets) in enumerate(camera.positions.items()):
             for row, direction in enumerate(DIRECTIONS):
                 axes, below = panels[2 * row : 2 * row + 2, column]
                 nyquist = 1e-3 * NYQUIST / camera.pitch
@@ -126,15 +126,15 @@ def _norm(target: str, image: np.ndarray) -> Normalize:
 
 def images_svg(name: str, camera: CameraTargets) -> str:
     """Draw mean images: a row for each target, columns for the positions in the field, each before and after."""
-    columns = [(position, when) for position in camera.places for when in COLOURS]
-    names = [name for name in next(iter(camera.places.values())).before.frames if name in {*_IMAGE_NAMES, *TARGETS}]
+    columns = [(position, when) for position in camera.positions for when in COLOURS]
+    names = [name for name in next(iter(camera.positions.values())).before.frames if name in {*_IMAGE_NAMES, *TARGETS}]
     with svg.look(f"targets-{name}"):
         figure = svg.new_figure(
             0.45 + 1.68 * len(names), {"w_pad": 0.02, "h_pad": 0.02, "wspace": 0.01, "hspace": 0.01}
         )
         grid = figure.subplots(len(names), len(columns), squeeze=False)
         for column, (position, when) in enumerate(columns):
-            shots = camera.places[position].shots[when]
+            shots = camera.positions[position].shots[when]
             for row, target in enumerate(names):
                 axes = grid[row, column]
                 mean = np.asarray(shots.frames[target].mean(axis=0))

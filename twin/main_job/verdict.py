@@ -18,7 +18,7 @@ from scenes.models.job_state import beyond_prior
 from scenes.specs.course import moment
 from twin.framework.artefact import FAR, SAME, plain, residual_text, significant
 from twin.framework.report import answer
-from twin.main_job.monitor_reading import stated
+from twin.main_job.monitor_reading import rounded
 from twin.main_job.render_results import JobRun, RenderRun
 from twin.main_job.systematics import (
     NOISE,
@@ -130,7 +130,7 @@ def _changed(run: JobRun) -> tuple[str, str]:
 def recovered_numbers(run: RenderRun) -> dict[str, Any]:
     """Return the contents of recovered.json: estimated changes, verdict and warnings."""
     judgement = judge(run)
-    return {**stated(run.recovered_dict()), "verdict": judgement.verdict, "warnings": list(judgement.warnings)}
+    return {**rounded(run.recovered_dict()), "verdict": judgement.verdict, "warnings": list(judgement.warnings)}
 
 
 def _moves(motion: Motion) -> bool:
@@ -422,13 +422,13 @@ def _beyond_prior(run: RenderRun, rows: tuple[Reading, ...], warned: tuple[str, 
     wrong = [r for r in rows if abs(r.ratio) > limit]
     if not wrong or run.series is not None:
         return ()
-    excesses = beyond_prior(run.resolved, run.experiment.stated)
+    excesses = beyond_prior(run.resolved, run.experiment.prior)
     unwarned = [excess for excess in excesses if not any(text.startswith(f"{excess.body}:") for text in warned)]
     if not unwarned:
         return ()
     largest = joined([excess.text for excess in unwarned[:NAMED]])
     more = f" and {len(unwarned) - NAMED} more" if len(unwarned) > NAMED else ""
-    prior = run.experiment.stated
+    prior = run.experiment.prior
     reason = "there is no prior" if prior is None else f"the prior {prior.name} expects less"
     return (
         f"σ does not hold for {joined([r.name for r in wrong])}: the job moves {largest}{more}, but {reason}; a real "

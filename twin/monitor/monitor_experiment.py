@@ -175,7 +175,7 @@ class MonitorExperiment:
         """
         other = copy(self)
         other.resolved = resolved
-        for name in ("stated", "disturbances", "motion_models"):
+        for name in ("prior", "disturbances", "motion_models"):
             vars(other).pop(name, None)
         return other
 
@@ -188,7 +188,7 @@ class MonitorExperiment:
             Instrument, which may differ from the job's files; its calibration is therefore not cached on disk.
         """
         other = copy(self)
-        for name in (*_CALIBRATED, "stated", "disturbances", "motion_models", "thermal"):
+        for name in (*_CALIBRATED, "prior", "disturbances", "motion_models", "thermal"):
             vars(other).pop(name, None)
         other.instrument = instrument
         other._entry = replace(self._entry, key=None)
@@ -365,7 +365,7 @@ class MonitorExperiment:
         return ground_geometry(self.instrument, self.nominal_truth.principal_distance)
 
     @cached_property
-    def stated(self) -> DisturbancePrior | None:
+    def prior(self) -> DisturbancePrior | None:
         """Motions of the bodies in the job's prior, by component; None without a prior.
 
         Raises
@@ -384,7 +384,7 @@ class MonitorExperiment:
 
         InputError is raised if the prior names a body that does not exist or cannot move in this way.
         """
-        prior = self.stated
+        prior = self.prior
         if prior is None:
             return None
         return self._entry.part("disturbances", prior).get(
@@ -397,7 +397,7 @@ class MonitorExperiment:
 
         InputError is raised if the prior names a body that does not exist or cannot move in this way.
         """
-        prior, known = self.stated, self.disturbances
+        prior, known = self.prior, self.disturbances
         return motion_models(self.path, self.sight, self.cameras, self.thermal, prior, known)
 
     def geometry(self, camera: str) -> MonitorGeometry:

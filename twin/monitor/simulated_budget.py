@@ -114,7 +114,7 @@ class ErrorBudget:
         self.spec = spec
         self.resolved = resolved.model_copy(update={"instrument": spec.applied_to(resolved.instrument)})
         self.experiment = MonitorExperiment(self.resolved, backend)
-        prior = self.experiment.stated
+        prior = self.experiment.prior
         assert prior is not None  # resolve_budget refuses a budget without them
         assert self.resolved.disturbances is not None
         self.prior = prior

@@ -270,7 +270,7 @@ def run_series(
         raise course.error(
             "the images of all times do not fit into memory",
             ("times",),
-            found=f"{len(states)} times",
+            value=f"{len(states)} times",
             allowed=f"at most {LARGEST_SERIES // each} with area CCDs of {shape[0]} x {shape[1]} pixels",
         )
     advance(0)
@@ -343,7 +343,7 @@ def too_large(job: JobSpec, k: int, reason: str) -> InputError:
     return course.error(
         f"the instrument at {moment(course.times[k])} of the course cannot be rendered: {reason}",
         (next(iter(parts)),),
-        found=" and ".join(parts.values()),
+        value=" and ".join(parts.values()),
         allowed="temperatures and motions that keep the beams on the mirrors and the spots on their CCDs",
     )
 

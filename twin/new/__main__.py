@@ -168,7 +168,7 @@ def _reason(error: InputError) -> str:
     return str(replace(error.issues[0], file="", line=None, key=())).removeprefix("input: ")
 
 
-def _answers(kind: str, given: Mapping[str, str | None], numbers: CameraNumbers) -> dict[str, str]:
+def _answers(kind: str, options: Mapping[str, str | None], numbers: CameraNumbers) -> dict[str, str]:
     """Return the answer to every question: the option, what the user types in a terminal, or the default.
 
     Each is checked at once in the new file, the options before the questions.
@@ -183,7 +183,7 @@ def _answers(kind: str, given: Mapping[str, str | None], numbers: CameraNumbers)
         changed = {name: value} if name else {}
         checked_text(kind, numbers, {**out, **changed, "file": f"{kind}.yaml", "base": "job.yaml"})
 
-    for name, value in given.items():
+    for name, value in options.items():
         if value is not None:
             try:
                 check(name, value)
@@ -192,7 +192,7 @@ def _answers(kind: str, given: Mapping[str, str | None], numbers: CameraNumbers)
             out[name] = value
     check()
     for name in questions:
-        if given[name] is None and _is_terminal():
+        if options[name] is None and _is_terminal():
             out[name] = _ask(QUESTIONS[name].text, out[name], partial(check, name))
     return out
 
@@ -209,7 +209,7 @@ def _targets(kind: str, out: Path, force: bool) -> list[Path]:
     return targets
 
 
-def _write_new(kind: str, camera: str | None, out: Path | None, force: bool, given: Mapping[str, str | None]) -> None:
+def _write_new(kind: str, camera: str | None, out: Path | None, force: bool, options: Mapping[str, str | None]) -> None:
     """Write a new file of a kind, or print it."""
     errors = Console(stderr=True)
     with cli.explained(errors):
@@ -227,7 +227,7 @@ def _write_new(kind: str, camera: str | None, out: Path | None, force: bool, giv
                 "Camera or instrument: name in the library, or file", None, lambda name: numbers_of(name, Path())
             )
         numbers = numbers_of(camera, Path())
-        answers = _answers(kind, given, numbers)
+        answers = _answers(kind, options, numbers)
         if out is None and _is_terminal():
             asked = _ask(_FILE, "-", lambda name: name == "-" or _targets(kind, Path(name), force))
             out = None if asked == "-" else Path(asked)
@@ -257,8 +257,8 @@ def _job_of(study: Path) -> Path:
 def _command(kind: str) -> Callable[..., None]:
     """Return the command that writes a kind of file, with an option for each of its questions."""
 
-    def command(camera: str | None, out: Path | None, force: bool, **given: Any) -> None:
-        _write_new(kind, camera, out, force, given)
+    def command(camera: str | None, out: Path | None, force: bool, **options: Any) -> None:
+        _write_new(kind, camera, out, force, options)
 
     new = NEW[kind]
     command.__doc__ = f"Write {new.about}.\n\n    python -m twin.new {kind} --camera my.yaml --out {kind}.yaml\n"

@@ -282,7 +282,7 @@ class CameraNumbers:
         stop = self.camera.mirrors[self.camera.stop].light == "passes"
         if lens or stop:
             problem = "a monitor needs a camera of mirrors, one of which is its stop"
-            raise InputError(Issue(problem, self.reference, found=lens or f"stop: {self.camera.stop}"))
+            raise InputError(Issue(problem, self.reference, value=lens or f"stop: {self.camera.stop}"))
         plain = all(surface.light is None and surface.edges is None for surface in self.camera.mirrors.values())
         return plain and list(self.camera.mirrors) == [f"M{k + 1}" for k in range(len(self.camera.mirrors))]
 

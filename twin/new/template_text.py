@@ -74,7 +74,7 @@ def checked_text(kind: str, numbers: CameraNumbers, values: Mapping[str, str]) -
     try:
         text = template.render(n=numbers, index=INDEX, radius=RADIUS, nested=kind == "operation", **values)
     except Problem as problem:  # an option that is no quantity
-        raise InputError(Issue(problem.problem, found=problem.found, allowed=problem.allowed)) from None
+        raise InputError(Issue(problem.problem, value=problem.value, allowed=problem.allowed)) from None
     model = next(file_kind for file_kind in file_kinds() if file_kind.name == kind).model
     validate(model, parse_yaml(text))
     return text

@@ -351,7 +351,7 @@ def _figure(name: str, title: str, svg: str) -> SvgFigure:
 
 def _motion_section(overview: Overview) -> Section | None:
     """Return the section of the most significant motions of bodies, all causes together; None without any."""
-    motions, prior = overview.operation.motions(overview.time), overview.operation.experiment.stated
+    motions, prior = overview.operation.motions(overview.time), overview.operation.experiment.prior
     moving = () if prior is None else [component for component in prior.components if component.kind not in HEAT]
     rows: list[tuple[float, list[Cell]]] = []
     for name, unit in {moving_component.name: moving_component.unit for moving_component in moving}.items():

@@ -338,7 +338,7 @@ def make_products(
 
 def _components(operation: Operation) -> list[Component]:
     """Return the specified components in the order of the model, which may have been traced in a different order."""
-    prior = operation.experiment.stated
+    prior = operation.experiment.prior
     assert prior is not None, "a plan states what moves"
     by_key = {(component.cause, component.name): component for component in prior.components}
     disturbances = operation.model.series_filter.prior

@@ -29,7 +29,7 @@ from twin.framework.procedure import Advance
 from twin.framework.random_streams import stream
 from twin.framework.reference_frames import described
 from twin.framework.run_folder import RunFolder
-from twin.main_job.monitor_reading import MonitorReading, stated
+from twin.main_job.monitor_reading import MonitorReading, rounded
 from twin.monitor.crosstalk import CameraCrosstalk, crosstalk
 from twin.monitor.monitor_experiment import MonitorExperiment, largest_piece
 from twin.monitor.observation import Observation, ObservationOptions, observe, shared_detector
@@ -336,7 +336,7 @@ def simulate_record(
     advance : Advance
         Callback that receives the progress.
     """
-    motions = experiment.stated
+    motions = experiment.prior
     assert motions is not None  # a plan states them
     causes = plan.operation.events
     life = drawn_life(motions, what.times, what.start, what.seed, causes, what.dates, what.coefficient_error)
@@ -383,7 +383,7 @@ def _readings(
     centroid = experiment.resolved.job.analysis.centroid
     for k in range(len(observation.numbers)):
         reading = MonitorReading(*common, observation.recovery.at(slice(k, k + 1)), suspects, frames, centroid)
-        yield stated(reading.recovered_dict())
+        yield rounded(reading.recovered_dict())
 
 
 def write_simulated(

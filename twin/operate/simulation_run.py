@@ -125,8 +125,8 @@ def _require_name(option: str, name: str, names: Collection[str]) -> None:
 class _Options:
     """Source of error messages about too little memory, which refer to the command-line options."""
 
-    def error(self, problem: str, key: KeyPath, *, found: object, allowed: str) -> InputErrorText:
-        return InputErrorText(f"{key[0]}: {problem}; {found} readings, allowed: {allowed}")
+    def error(self, problem: str, key: KeyPath, *, value: object, allowed: str) -> InputErrorText:
+        return InputErrorText(f"{key[0]}: {problem}; {value} readings, allowed: {allowed}")
 
 
 def simulate_into(
@@ -268,8 +268,8 @@ def _require_empty(history: History) -> None:
 
 def _require_known_sensors(experiment: MonitorExperiment, what: Simulation) -> None:
     """Raise InputErrorText for a sensor on a body without a prior temperature, or a faulty one not simulated."""
-    assert experiment.stated is not None  # a plan states something
-    warm = {component.body for component in experiment.stated.components if component.kind == "temperature"}
+    assert experiment.prior is not None  # a plan states something
+    warm = {component.body for component in experiment.prior.components if component.kind == "temperature"}
     for body in what.sensors or ():
         _require_name("--sensor", body, warm)
     options: Mapping[str, Mapping[str, int]] = {"--dead": what.dead, "--stuck": what.stuck}

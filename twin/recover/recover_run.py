@@ -26,7 +26,7 @@ from scenes.specs.monitor_frames import MeasurementSetup
 from scenes.yaml.errors import InputError, Issue
 from twin.framework.frame_store import mean_of
 from twin.framework.procedure import Advance, silent
-from twin.main_job.monitor_reading import MonitorReading, contradicted, stated
+from twin.main_job.monitor_reading import MonitorReading, contradicted, rounded
 from twin.monitor.crosstalk import CameraCrosstalk, crosstalk
 from twin.monitor.monitor_experiment import MonitorExperiment, pieces
 from twin.monitor.time_series import CourseSmoother, SmoothedCourse
@@ -492,7 +492,7 @@ def _noise_warnings(
 
 def recover_numbers(run: RecoverRun) -> dict[str, Any]:
     """Return the contents of recovered.json: the main job's keys for the last state, artefacts, and all states."""
-    out: dict[str, Any] = {**stated(run.last.recovered_dict())}
+    out: dict[str, Any] = {**rounded(run.last.recovered_dict())}
     out["warnings"] = list(run.all_warnings)
     out["channels"] = {
         result.channel.name: {name.replace(" ", "_"): _spot_numbers(spot) for name, spot in result.states()}
@@ -503,7 +503,7 @@ def recover_numbers(run: RecoverRun) -> dict[str, Any]:
         out["photon_transfer"] = {name: vars(transfer) for name, transfer in transfers.items()}
     if run.times is not None:
         out["times_s"] = list(run.times)
-        out["series"] = [stated(reading.recovered_dict()) for reading in run.readings]
+        out["series"] = [rounded(reading.recovered_dict()) for reading in run.readings]
     if run.smoothed is not None:
         between = run.smoothed.between_dict()
         out["smoothed"] = {**run.smoothed.changes.groups(), "disturbances": run.smoothed.to_dict(), "between": between}

@@ -398,7 +398,7 @@ class InstrumentTwin:
         prior = find_disturbances(job, self.resolved.instrument)
         resolved = self.resolved.model_copy(update={"job": job, "disturbances": prior})
         twin = InstrumentTwin(resolved, self._bench.stating(resolved))
-        twin.experiment.stated  # noqa: B018 - raises now if the instrument lacks a body
+        twin.experiment.prior  # noqa: B018 - raises now if the instrument lacks a body
         return twin
 
     def render(self, frames: int | None = None, seed: int | None = None, **render: Any) -> Shot:
@@ -732,4 +732,4 @@ def _motion_named(text: str, nodes: Mapping[str, NodeInfo]) -> ElementaryMotion:
 
 def _wrong(problem: str, value: str, allowed: str, suggestion: str | None = None) -> InputError:
     """Return an error about a motion's text, with what is allowed and the nearest valid name as suggestion."""
-    return InputError(Issue(problem, found=repr(value), allowed=allowed, suggestion=suggestion))
+    return InputError(Issue(problem, value=repr(value), allowed=allowed, suggestion=suggestion))

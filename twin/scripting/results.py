@@ -110,7 +110,7 @@ class Shot:
         rows = {
             (camera, name, direction): _edge_row(targets_at, direction)
             for camera, targets in cameras.items()
-            for name, targets_at in targets.places.items()
+            for name, targets_at in targets.positions.items()
             for direction in targets_at.before.edges
         }
         return _indexed(rows, ["camera", "place", "direction"])
@@ -549,7 +549,7 @@ def _with_options(procedure: Procedure, chosen: Mapping[str, Any]) -> Procedure:
     """Return the procedure of a command with some of its options set; raise `InputError` where they are not allowed."""
     for key, value in chosen.items():
         if not isinstance(value, bool):
-            raise InputError(Issue("an option is set or not", key=(key,), found=repr(value), allowed="True or False"))
+            raise InputError(Issue("an option is set or not", key=(key,), value=repr(value), allowed="True or False"))
     if chosen.get("tilt") and not chosen.get("refocus"):
         raise InputError(Issue("tilt goes with refocus", key=("tilt",), allowed="refocus=True, tilt=True"))
     # a refocused camera is not judged: its verdict states its image quality

@@ -376,4 +376,4 @@ def _factor(match: re.Match[str], unit: str) -> Mapping[str, Any]:
 
 
 def _wrong(problem: str, key: KeyPath, found: str) -> InputError:
-    return InputError(Issue(problem, key=("vary", *key), found=found, allowed=_FORMS))
+    return InputError(Issue(problem, key=("vary", *key), value=found, allowed=_FORMS))

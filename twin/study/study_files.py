@@ -43,7 +43,7 @@ def make_dataset(plan: Plan, result: BlockResult) -> xr.Dataset:
     for column in plan.columns:
         factor = study.factors[column.name]
         scaled = [f"{_path(scale.key)} ~ power {scale.power:g}" for scale in factor.scales]
-        key = "; ".join([" = ".join(_path(path) for path in factor.places)] * bool(factor.places) + scaled)
+        key = "; ".join([" = ".join(_path(path) for path in factor.key_paths)] * bool(factor.key_paths) + scaled)
         values = column.values.astype(object) if column.values.dtype.kind == "U" else column.values
         values = values.astype(np.int8) if values.dtype.kind == "b" else values
         long_name = f"factor {column.name}, {key}"
@@ -137,7 +137,7 @@ def summary(data: xr.Dataset, plan: Plan) -> dict[str, Any]:
         "factors": {
             column.name: {
                 "unit": column.unit,
-                "keys": [list(key) for key in study.factors[column.name].places],
+                "keys": [list(key) for key in study.factors[column.name].key_paths],
                 "scaled_keys": [list(scale.key) for scale in study.factors[column.name].scales],
                 **_span(column.values),
             }

@@ -524,7 +524,7 @@ class TargetCamera:
             Light is lost, or an image moves off the line.
         """
         try:
-            hits = self.path.places(state, self.directions)
+            hits = self.path.positions(state, self.directions)
             lights = self._lights(state, hits)
             extent = self.region * self.ccd.band.pitch
             maps = [self.path.local_map(state, direction, extent) for direction in self.directions]
@@ -551,7 +551,7 @@ class TargetCamera:
     @cached_property
     def _wavelengths(self) -> int:
         """Number of wavelengths for the MTF of the camera as designed; it is used for perturbed states as well."""
-        hits = self.path.places({}, self.directions)
+        hits = self.path.positions({}, self.directions)
 
         def at_nyquist(count: int) -> np.ndarray:
             frequency = self.ccd.band.nyquist * np.eye(2)

@@ -164,13 +164,13 @@ class CameraTargets:
         Name of the line CCD's band.
     pitch : float
         Pixel pitch, in metres.
-    places : mapping of str to PlaceTargets
+    positions : mapping of str to PlaceTargets
         Targets by position on the line: left, centre, right.
     """
 
     band: str
     pitch: float
-    places: Mapping[str, PlaceTargets]
+    positions: Mapping[str, PlaceTargets]
 
 
 @dataclass(frozen=True, eq=False)
@@ -206,14 +206,14 @@ class TargetRun:
     def _shots(self) -> Iterator[tuple[str, str, str, TargetShots]]:
         """Yield camera, position and state of all targets, with their frames and readings."""
         for camera, targets_of_camera in self.cameras.items():
-            for position, targets in targets_of_camera.places.items():
+            for position, targets in targets_of_camera.positions.items():
                 for when, shots in targets.shots.items():
                     yield camera, position, when, shots
 
     @property
     def has_edges(self) -> bool:
         """True if knife edges were rendered, so that there are MTF curves."""
-        return any(targets.before.edges for camera in self.cameras.values() for targets in camera.places.values())
+        return any(targets.before.edges for camera in self.cameras.values() for targets in camera.positions.values())
 
     @property
     def warnings(self) -> tuple[str, ...]:
@@ -238,7 +238,7 @@ class TargetRun:
         cameras, truth = {}, {}
         for name, camera in self.cameras.items():
             measured, true_values = {}, {}
-            for position, targets in camera.places.items():
+            for position, targets in camera.positions.items():
                 along, across = (1e3 * targets.position + 0.0).tolist()
                 columns = {when: shots.column for when, shots in targets.shots.items()}
                 where = {"along_mm": along, "across_mm": across, "columns": columns}
@@ -345,7 +345,7 @@ def check_targets(resolved: ResolvedJob) -> None:
         raise job.error(
             "the frames of the test targets do not fit into memory",
             ("render", "targets", "frames"),
-            found=str(settings.frames),
+            value=str(settings.frames),
             allowed=f"at most {LARGEST_FRAMES // each} with regions of {settings.region} pixels",
         )
     for key, mounted in resolved.instrument.cameras.items():
@@ -356,7 +356,7 @@ def check_targets(resolved: ResolvedJob) -> None:
             raise job.error(
                 f"the images of targets do not fit the line CCD {name} of camera {mounted.camera!r}",
                 ("render", "targets", "region"),
-                found=f"{settings.region} pixels on a line of {pixels}",
+                value=f"{settings.region} pixels on a line of {pixels}",
                 allowed="a smaller region or a longer line",
             )
 

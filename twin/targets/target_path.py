@@ -206,7 +206,7 @@ class TargetPath:
         """
         return coloured(self.model.spec, self.root, state, wavelength)
 
-    def places(self, state: State, directions: np.ndarray) -> np.ndarray:
+    def positions(self, state: State, directions: np.ndarray) -> np.ndarray:
         """Return the positions (along, across) at which F chief rays hit the line CCD, (F, 2), in metres.
 
         ``directions`` (F, 3) are those of the light. Positions are in metres of the nominal CCD: in these coordinates
@@ -463,7 +463,7 @@ class TargetPath:
         points = np.stack([a.ravel() for a in np.meshgrid(step, step)], axis=-1)
         around = direction + (points[:, :1] * along + points[:, 1:] * across) / self.target_distance
         around = around / np.linalg.norm(around, axis=-1, keepdims=True)
-        positions = self.places(state, np.concatenate([direction[None], around]))
+        positions = self.positions(state, np.concatenate([direction[None], around]))
         design, wanted = _monomials(points / extent), positions[1:] - positions[0]
         terms, *_ = np.linalg.lstsq(design, wanted, rcond=None)
         residual = float(np.max(np.linalg.norm(design @ terms - wanted, axis=-1)))

@@ -116,7 +116,7 @@ class MonitorMerit:
         if not wanted:
             return None
         _require_monitor(setup, experiment, next(iter(wanted)))
-        known, motions = experiment.disturbances, experiment.stated
+        known, motions = experiment.disturbances, experiment.prior
         assert known is not None
         assert motions is not None
         path = SpotPath(experiment.instrument, experiment.backend)
@@ -176,7 +176,7 @@ class MonitorMerit:
 
     def exact(self, states: Sequence[State]) -> dict[str, np.ndarray]:
         """Return the variances of every merit's estimates, with derivatives that are traced in every state."""
-        motions = self.experiment.stated
+        motions = self.experiment.prior
         assert motions is not None
         known = self.experiment
         changes = derivative_changes(motions, self.path, known.sight, known.thermal, states)
@@ -250,7 +250,7 @@ def _require_monitor(setup: ToleranceSetup, experiment: MonitorExperiment, name:
         allowed = "an instrument with a monitor, such as gf7_pair; or other merits"
         problem = f"{kind} needs a monitor, and {setup.base.instrument.name} has none"
         raise test.error(problem, ("merits", name, "kind"), allowed=allowed)
-    if experiment.stated is None:
+    if experiment.prior is None:
         allowed = "`disturbances: NAME` at the top of this file, or in the instrument's"
         problem = f"{kind} needs a prior on disturbances, and there is none"
         raise test.error(problem, ("merits", name, "kind"), allowed=allowed)

@@ -129,7 +129,7 @@ class ParameterMaker:
         if issues:
             raise InputError(*issues)
         if kind in HEAT and "temperature" not in self.instrument.nodes[body].allows:
-            raise self.test.error("this node does not allow temperature", (*key, "motion"), found=spec.motion)
+            raise self.test.error("this node does not allow temperature", (*key, "motion"), value=spec.motion)
         return body
 
     def _moves(self, spec: Varied, key: KeyPath, limit: float) -> FrozenMap[str, BodyMove]:
@@ -148,7 +148,7 @@ class ParameterMaker:
             above = next((path for path in bodies if other.startswith(f"{path}/")), None)
             if above is not None or bodies.count(other) > 1:
                 problem = f"{other} is carried already" if above is None else f"{other} moves with {above} already"
-                raise self.test.error(problem, (*key, "carrying"), found=shown(list(spec.carrying)))
+                raise self.test.error(problem, (*key, "carrying"), value=shown(list(spec.carrying)))
         first = self.instrument.assembly.nominal_pose(body)
         direction = first.rotation[:, AXES[axis]]
         point = first.apply(np.array(self._body(body).pivots[pivot or "origin"]))

@@ -144,7 +144,7 @@ class Coverage:
         return int(binom.ppf(1.0 - FALSE, self.measured, FALSE_ALARM))
 
     @property
-    def sigma_holds(self) -> bool:
+    def sigma_agrees(self) -> bool:
         """True if no count of covered intervals is outside its limits and sigma is doubted in no state."""
         return not self.outliers and self.alarms <= self.alarm_limit and not self.doubted
 
@@ -188,7 +188,7 @@ def run_states(
     advance : Advance
         Called with the number of states done.
     """
-    prior, disturbances = experiment.stated, experiment.disturbances
+    prior, disturbances = experiment.prior, experiment.disturbances
     assert prior is not None
     assert disturbances is not None
     amounts = prior.draw(np.random.default_rng(stream(seed, _DRAWN)), count)
@@ -380,7 +380,7 @@ def run_uncertainty(
         raise InputError(
             Issue(
                 "no disturbance of the prior changes a camera, so that there is nothing to measure",
-                found=str(resolved.disturbances.name),
+                value=str(resolved.disturbances.name),
                 allowed="disturbances of cameras, their mirrors or focal planes",
             )
         )

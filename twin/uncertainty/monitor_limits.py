@@ -205,15 +205,15 @@ def expected_covariance(experiment: MonitorExperiment, frames: int) -> np.ndarra
     centroid, calibration = experiment.resolved.job.analysis.centroid, experiment.calibration
     nominal = experiment.expected_frames(experiment.nominal_photons)
     before = judged_spots(nominal, frames, calibration, centroid)
-    if experiment.stated is None:
+    if experiment.prior is None:
         spread = difference_covariance(before[0], before[0], calibration.noise)
         return np.asarray(joint(spread[None])[0])
 
     def record(photons: np.ndarray, numbers: np.ndarray) -> tuple[MeasuredSpots, np.ndarray]:
         return before, experiment.expected_frames(photons)
 
-    amounts = experiment.stated.draw(np.random.default_rng(1), _STATES)
-    states = states_of(amounts, experiment.stated.components, experiment.thermal)
+    amounts = experiment.prior.draw(np.random.default_rng(1), _STATES)
+    states = states_of(amounts, experiment.prior.components, experiment.thermal)
     observing = ObservationOptions(record, centroid, max(1, _PIXELS // nominal.size), use_prior=False, frames=frames)
     try:
         covariances = [observation.recovery.shift_covariance for observation in observe(experiment, states, observing)]
@@ -292,8 +292,8 @@ def _second_monitor(experiment: MonitorExperiment) -> Disturbances:
     mirrored = {name: mounted.mirrored for name, mounted in resolved.instrument.cameras.items()}
     instrument = resolved.instrument.model_copy(update={"cameras": mirrored})
     other = MonitorExperiment(resolved.model_copy(update={"instrument": instrument}), experiment.backend)
-    assert experiment.stated is not None
-    return disturbances_of(experiment.stated, other.path, other.thermal, other.instrument, other.backend)
+    assert experiment.prior is not None
+    return disturbances_of(experiment.prior, other.path, other.thermal, other.instrument, other.backend)
 
 
 def _outside(experiment: MonitorExperiment, prior: Disturbances, noise: np.ndarray) -> float:

@@ -116,9 +116,9 @@ _HEAVY_TAIL: Record[_Limited] = Record(
     "Errors of the posterior if each number of the prior is the scale of Student's t distribution.",
     Quantity("degrees", lambda r: r.limits.heavy_tail.degrees, "degrees of freedom of that distribution"),
     Quantity("rms", lambda r: float(r.limits.heavy_tail.rms[r.q]), "root mean square of the error"),
-    Quantity("held_68", lambda r: r.half_width(0), "half-width of the interval that contains 68.3 % of the errors"),
-    Quantity("held_95", lambda r: r.half_width(1), "half-width of the interval that contains 95.4 % of the errors"),
-    Quantity("held_997", lambda r: r.half_width(2), "half-width of the interval that contains 99.7 % of the errors"),
+    Quantity("half_width_68", lambda r: r.half_width(0), "half-width of the interval with 68.3 % of the errors"),
+    Quantity("half_width_95", lambda r: r.half_width(1), "half-width of the interval with 95.4 % of the errors"),
+    Quantity("half_width_997", lambda r: r.half_width(2), "half-width of the interval with 99.7 % of the errors"),
     Quantity(
         "beyond_3_sigma",
         lambda r: float(r.limits.heavy_tail.beyond[r.q]),
@@ -193,12 +193,12 @@ COUNT: Record[_Counted] = Record(
         lambda c: float(c.coverage.ratio(c.estimator)[c.q]),
         "root mean square of the errors over their sigmas",
     ),
-    Quantity("held_68", lambda c: c.covered(0), "share of the 68 % intervals that contain the truth"),
-    Quantity("held_95", lambda c: c.covered(1), "share of the 95 % intervals that contain the truth"),
+    Quantity("covered_68", lambda c: c.covered(0), "share of the 68 % intervals that contain the truth"),
+    Quantity("covered_95", lambda c: c.covered(1), "share of the 95 % intervals that contain the truth"),
     Quantity("expected_68", lambda c: c.expected(0), "expected share of the 68 % intervals that contain the truth"),
     Quantity("expected_95", lambda c: c.expected(1), "expected share of the 95 % intervals that contain the truth"),
-    Quantity("limits_68", lambda c: c.limits(0), "limits of held_68 if every sigma is right"),
-    Quantity("limits_95", lambda c: c.limits(1), "limits of held_95 if every sigma is right"),
+    Quantity("limits_68", lambda c: c.limits(0), "limits of covered_68 if every sigma is right"),
+    Quantity("limits_95", lambda c: c.limits(1), "limits of covered_95 if every sigma is right"),
 )
 _OUTLIER: Record[tuple[str, str, str, float, int]] = Record(
     "A count outside its limits.",
@@ -206,7 +206,7 @@ _OUTLIER: Record[tuple[str, str, str, float, int]] = Record(
     Quantity("group", itemgetter(1), "group of the quantity"),
     Quantity("key", itemgetter(2), "key of the quantity"),
     Quantity("level", itemgetter(3), "confidence level of the intervals"),
-    Quantity("held", itemgetter(4), "number of intervals that contain the truth"),
+    Quantity("covered", itemgetter(4), "number of intervals that contain the truth"),
 )
 STATES: Record[Coverage] = Record(
     "Coverage in random states.",
@@ -227,7 +227,7 @@ STATES: Record[Coverage] = Record(
     Quantity("alarms", lambda r: r.alarms, "number of states whose chi-square exceeds its limit"),
     Quantity("alarms_limit", lambda r: r.alarm_limit, "largest number of alarms by chance"),
     Quantity("doubted", lambda r: r.doubted, "number of states in which the measurement contradicts sigma"),
-    Quantity("sigma_holds", lambda r: r.sigma_holds, "no count outside its limits, no state doubted"),
+    Quantity("sigma_agrees", lambda r: r.sigma_agrees, "no count outside its limits, no state doubted"),
 )
 
 

@@ -354,7 +354,7 @@ class Printed:
         return float(value)
 
     def _error(self, path: KeyPath, problem: str, value: Any) -> InputError:
-        return InputError(Issue(problem, self.content.file, self.content.lines.get(path), path, found=repr(value)))
+        return InputError(Issue(problem, self.content.file, self.content.lines.get(path), path, value=repr(value)))
 
 
 @cache

@@ -81,10 +81,9 @@ class StripsSpec(Spec):
     @model_validator(mode="after")
     def _is_a_strip(self) -> "StripsSpec":
         if self.points < LEAST_POINTS:
-            found = f"{self.points} on each strip"
             allowed = f"{LEAST_POINTS} or more; paper 000 asks for n >= {LEAST_POINTS}"
             problem = "too few points to fit a plane"
-            raise Problem(problem, found, allowed, within=("points",))
+            raise Problem(problem, f"{self.points} on each strip", allowed, within=("points",))
         check_ends(self.first, self.last, "the strip has no length")
         return self
 

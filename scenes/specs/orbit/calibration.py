@@ -145,8 +145,8 @@ class PointsSpec(Spec):
     @model_validator(mode="after")
     def _are_enough(self) -> "PointsSpec":
         if self.control < LEAST_POINTS:
-            found = f"{self.control} control points"
-            raise Problem("too few points to calibrate", found, f"{LEAST_POINTS} or more", within=("control",))
+            value = f"{self.control} control points"
+            raise Problem("too few points to calibrate", value, f"{LEAST_POINTS} or more", within=("control",))
         check_ends(self.first, self.last, "the field has no width")
         return self
 
@@ -198,13 +198,12 @@ class CalibrationImagesSpec(Spec):
     @model_validator(mode="after")
     def _are_enough(self) -> "CalibrationImagesSpec":
         if len(self.patches) < LEAST_PATCHES:
-            found = f"{len(self.patches)}"
             problem = "too few patches to separate principal distance from attitude"
-            raise Problem(problem, found, f"{LEAST_PATCHES} or more", within=("patches",))
+            raise Problem(problem, str(len(self.patches)), f"{LEAST_PATCHES} or more", within=("patches",))
         if self.points.control < 1 or self.points.check < 1:
-            found = f"control {self.points.control}, check {self.points.check}"
+            value = f"control {self.points.control}, check {self.points.check}"
             problem = "a calibration needs control and check points"
-            raise Problem(problem, found, "1 or more of each", within=("points",))
+            raise Problem(problem, value, "1 or more of each", within=("points",))
         return self
 
 
@@ -281,8 +280,8 @@ def checked_schemes(schemes: Sequence[Sequence[str]], fields: Mapping[str, objec
             if name not in fields:
                 raise unknown("no such field", name, fields, ("schemes",))
         if not scheme or len(set(scheme)) != len(scheme):
-            found = names_text(scheme) or "none"
-            raise Problem("a scheme without fields, or with a repeated field", found, "each once", within=("schemes",))
+            value = names_text(scheme) or "none"
+            raise Problem("a scheme without fields, or with a repeated field", value, "each once", within=("schemes",))
 
 
 class OrbitCalibrationSpec(TitledSpec):

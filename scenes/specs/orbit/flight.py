@@ -61,8 +61,8 @@ class JitterBandSpec(Spec):
     @model_validator(mode="after")
     def _has_a_width(self) -> "JitterBandSpec":
         if not self.first < self.last:
-            found = f"{format_quantity(self.first, FREQUENCY)} to {format_quantity(self.last, FREQUENCY)}"
-            raise Problem("the band is empty", found, "`last` above `first`", within=("last",))
+            value = f"{format_quantity(self.first, FREQUENCY)} to {format_quantity(self.last, FREQUENCY)}"
+            raise Problem("the band is empty", value, "`last` above `first`", within=("last",))
         return self
 
 
@@ -212,8 +212,7 @@ class ElementsSpec(Spec):
     @model_validator(mode="after")
     def _is_complete(self) -> "ElementsSpec":
         if not 0.0 <= self.eccentricity <= 0.1:
-            found = str(self.eccentricity)
-            raise Problem("outside the limits", found, "a number from 0 to 0.1", within=("eccentricity",))
+            raise Problem("outside the limits", str(self.eccentricity), "0 to 0.1", within=("eccentricity",))
         if (self.node is None) == (self.node_local_time is None):
             raise Problem("the node must be given in exactly one way", None, "either node or node_local_time")
         return self
@@ -265,8 +264,8 @@ class OrbitSpec(Spec):
         names = ("passing", "elements", "state")
         require_one(self, names, "the orbit must be given in exactly one way", "one of passing, elements, state")
         if self.before + self.after == 0.0:
-            found = f"before and after are {format_quantity(0.0, MOMENT)}"
-            raise Problem("the orbit has no length", found, "a time before or after the epoch", within=("after",))
+            value = f"before and after are {format_quantity(0.0, MOMENT)}"
+            raise Problem("the orbit has no length", value, "a time before or after the epoch", within=("after",))
         return self
 
     def misses(self, time: float) -> Problem | None:

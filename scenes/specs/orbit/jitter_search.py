@@ -90,8 +90,8 @@ class JitterSearchSpec(Spec):
     @model_validator(mode="after")
     def _looks_somewhere(self) -> "JitterSearchSpec":
         if not self.lowest < self.highest:
-            found = f"{format_quantity(self.lowest, FREQUENCY)} to {format_quantity(self.highest, FREQUENCY)}"
-            raise Problem("the range of frequencies is empty", found, "`highest` above `lowest`", within=("highest",))
+            value = f"{format_quantity(self.lowest, FREQUENCY)} to {format_quantity(self.highest, FREQUENCY)}"
+            raise Problem("the range of frequencies is empty", value, "`highest` above `lowest`", within=("highest",))
         return self
 
 

@@ -117,7 +117,7 @@ class AttitudeFileSpec(Spec):
         Time that is added to all times of the file, in seconds.
     scalar : {'last', 'first'} | None
         Position of a quaternion's scalar part, the cosine of half the rotation angle.
-    turns : {'body_to_frame', 'frame_to_body'} | None
+    direction : {'body_to_frame', 'frame_to_body'} | None
         Sense of the quaternion q: v' = q v q* transforms the components of a vector v from body axes to the frame
         (`body_to_frame`), or from the frame to body axes (`frame_to_body`).
     body_axes : tuple[str, str, str]
@@ -140,7 +140,7 @@ class AttitudeFileSpec(Spec):
     leap_seconds: Literal["counted", "skipped"] | None = None
     offset: ClockOffset = 0.0
     scalar: Literal["last", "first"] | None = None
-    turns: Literal["body_to_frame", "frame_to_body"] | None = None
+    direction: Literal["body_to_frame", "frame_to_body"] | None = None
     body_axes: BodyAxes
     sequence: Sequence | None = None
     nadir: Literal["geodetic", "geocentric"] | None = None
@@ -285,13 +285,13 @@ class QuaternionSpec(Spec):
     ----------
     scalar : {'first', 'last'}
         Position of the scalar part (the cosine of half the rotation angle) among the four.
-    turns : {'body_to_frame', 'frame_to_body'}
+    direction : {'body_to_frame', 'frame_to_body'}
         Sense of the quaternion q: v' = q v q* transforms the components of a vector v from body axes to the frame
         (`body_to_frame`), or from the frame to body axes (`frame_to_body`).
     """
 
     scalar: Literal["first", "last"]
-    turns: Literal["body_to_frame", "frame_to_body"]
+    direction: Literal["body_to_frame", "frame_to_body"]
 
 
 class ConventionsSpec(Spec):
@@ -505,9 +505,9 @@ class MeasuredTestSpec(FixedTestSpec):
         if isinstance(value, Mapping):
             here = [key for key in ("conventions", "passes") if value.get(key) is not None]
             if ("data" in value) == bool(here) or len(here) == 1:
-                found = names_text([*(["data"] if "data" in value else []), *here]) or "none of them"
+                actual = names_text([*(["data"] if "data" in value else []), *here]) or "none of them"
                 allowed = "`data: DIR`, or `conventions:` and `passes:`"
-                raise Problem("the measurements must be given in exactly one way", found, allowed, within=("data",))
+                raise Problem("the measurements must be given in exactly one way", actual, allowed, within=("data",))
         return value
 
 

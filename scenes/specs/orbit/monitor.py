@@ -263,20 +263,20 @@ class ReadingsSpec(Spec):
     ----------
     begin : float
         Time of the first reading from the orbit's epoch, in seconds.
-    every : float
+    interval : float
         Interval between readings, in seconds.
     count : int
         Number of readings.
     """
 
     begin: Moment = 0.0
-    every: Interval
+    interval: Interval
     count: Annotated[Whole, Field(ge=2, le=1000)]
 
     @property
     def times(self) -> tuple[float, ...]:
         """Times of the readings from the orbit's epoch, in seconds."""
-        return tuple(self.begin + self.every * k for k in range(self.count))
+        return tuple(self.begin + self.interval * k for k in range(self.count))
 
 
 class LoopImagesSpec(Spec):
@@ -297,7 +297,7 @@ class LoopImagesSpec(Spec):
     times: Annotated[tuple[Moment, ...], Field(min_length=1, max_length=20)]
     side: Annotated[Side, Field(le=2000)] = 400
     ground: SceneGroundSpec = SceneGroundSpec()
-    points: ImagePointsSpec = ImagePointsSpec.model_validate({"control": 0, "tie": 60, "reach": 16})
+    points: ImagePointsSpec = ImagePointsSpec.model_validate({"control": 0, "tie": 60, "search_radius": 16})
 
     @model_validator(mode="after")
     def _has_ties(self) -> "LoopImagesSpec":
@@ -410,8 +410,8 @@ class OrbitMonitorSpec(TitledSpec):
     @model_validator(mode="after")
     def _times_fit(self) -> "OrbitMonitorSpec":
         if self.cameras is not None and (len(self.cameras) != 2 or len(set(self.cameras)) != 2):
-            found = ", ".join(self.cameras) or "none"
-            raise Problem("not a pair of cameras", found, "two different cameras", within=("cameras",))
+            value = ", ".join(self.cameras) or "none"
+            raise Problem("not a pair of cameras", value, "two different cameras", within=("cameras",))
         self._require_keys()
         if self.course is not None:
             self._check_course(self.course)
@@ -421,7 +421,7 @@ class OrbitMonitorSpec(TitledSpec):
         if self.mechanisms is None:
             if index_of_value(self.reference_time, self.times) is None:
                 raise no_such_time(self.reference_time, self.times, "one of course.times").below("reference")
-            self._check_interval(self.every, ("interval",))
+            self._check_interval(self.cadence, ("interval",))
             for k, interval in enumerate(self.intervals or ()):
                 self._check_interval(interval, ("intervals", k))
         elif self.mechanisms.images is not None:
@@ -447,9 +447,9 @@ class OrbitMonitorSpec(TitledSpec):
             problem = "a perturbation needs a course: random motions start from the nominal instrument"
             raise Problem(problem, None, "perturb with a course", within=("perturb",))
         if (self.course is None) is (loop.readings is None):
-            found = "neither" if loop.readings is None else "both"
-            allowed = "readings: {every: 4 min, count: 25}, or the file's course"
-            raise Problem("the readings' times must be given once", found, allowed, within=("mechanisms",))
+            value = "neither" if loop.readings is None else "both"
+            allowed = "readings: {interval: 4 min, count: 25}, or the file's course"
+            raise Problem("the readings' times must be given once", value, allowed, within=("mechanisms",))
 
     def _check_course(self, course: CourseSpec) -> None:
         """Raise `Problem` unless the times are evenly spaced and all motions are in the test's `motion`."""
@@ -460,8 +460,8 @@ class OrbitMonitorSpec(TitledSpec):
         steps = [b - a for a, b in pairwise(course.times)]
         for k, step in enumerate(steps):
             if abs(step - steps[0]) > _EVEN:
-                found = f"{moment(course.times[k])} to {moment(course.times[k + 1])} after steps of {moment(steps[0])}"
-                raise Problem("the times are not evenly spaced", found, "equal steps", None, ("course", "times", k + 1))
+                value = f"{moment(course.times[k])} to {moment(course.times[k + 1])} after steps of {moment(steps[0])}"
+                raise Problem("the times are not evenly spaced", value, "equal steps", None, ("course", "times", k + 1))
 
     def _check_interval(self, interval: float, key: KeyPath) -> None:
         """Raise `Problem` unless the interval is a multiple of the step and not longer than the course."""
@@ -497,7 +497,7 @@ class OrbitMonitorSpec(TitledSpec):
         return self.times[1] - self.times[0]
 
     @property
-    def every(self) -> float:
+    def cadence(self) -> float:
         """Interval between measurements of the monitor, in seconds."""
         assert self.interval is not None
         return self.interval

@@ -149,14 +149,14 @@ class RationalAdjustSpec(RationalTestSpec):
     def _passes_fit(self) -> None:
         """Raise Problem for images of a pass that are not there, that another pass has, or that lack a shared term."""
         taken: set[str] = set()
-        for name, one in self.passes.items():
-            for k, image in enumerate(one.images):
+        for name, group in self.passes.items():
+            for k, image in enumerate(group.images):
                 where = ("passes", name, "images", k)
                 if image not in self.images:
                     raise unknown("no such image in the block", image, tuple(self.images), where)
                 if image in taken:
                     raise Problem("an image of two passes", image, "each image in one pass, once", within=where)
-                lacking = one.errors.sigma.keys() - (self.images[image].errors or self.errors).sigma.keys()
+                lacking = group.errors.sigma.keys() - (self.images[image].errors or self.errors).sigma.keys()
                 if lacking:
                     term = sorted(lacking)[0]
                     raise Problem(f"{image} has no {term} of its own", None, f"`{term}` in its errors", within=where)
@@ -175,7 +175,7 @@ class RationalPointsSpec(Spec):
     ----------
     tie : int
         Number of points that are chosen in each image and matched in the others.
-    reach : int
+    search_radius : int
         Search radius about a predicted position, in pixels: the largest error of the polynomials of two images.
     template : int
         Side of a template, in pixels.
@@ -191,7 +191,7 @@ class RationalPointsSpec(Spec):
     """
 
     tie: Annotated[Whole, Field(ge=1, le=20_000)] = 200
-    reach: Annotated[Whole, Field(ge=2, le=100)] = 10
+    search_radius: Annotated[Whole, Field(ge=2, le=100)] = 10
     template: Annotated[Whole, Field(ge=LEAST_TEMPLATE, le=101), AfterValidator(_is_odd)] = 25
     least_correlation: Annotated[Number, Field(gt=0.0, lt=1.0)] = 0.6
     largest_sigma: Annotated[Number, Field(gt=0.0, le=2.0)] = 0.2

@@ -103,8 +103,8 @@ class LineImageSpec(Spec):
     def _spectrum_rises(self) -> "LineImageSpec":
         first, last = self.spectrum
         if not first < last:
-            found = f"[{format_quantity(first, LENGTH)}, {format_quantity(last, LENGTH)}]"
-            raise Problem("the spectrum is empty", found, "[shortest, longest]", within=("spectrum",))
+            value = f"[{format_quantity(first, LENGTH)}, {format_quantity(last, LENGTH)}]"
+            raise Problem("the spectrum is empty", value, "[shortest, longest]", within=("spectrum",))
         return self
 
 
@@ -292,7 +292,7 @@ class ImagePointsSpec(Spec):
         Number of further points of the orthophoto, which only test the result.
     tie : int
         Number of tie points: points of the nadir line's image that are matched in the others.
-    reach : int
+    search_radius : int
         Search radius about the predicted position, in pixels and lines.
     template : int
         Side of a template, in pixels.
@@ -312,7 +312,7 @@ class ImagePointsSpec(Spec):
     control: Annotated[Whole, Field(ge=0, le=2000)] = 60
     check: Annotated[Whole, Field(ge=0, le=2000)] = 0
     tie: Annotated[Whole, Field(ge=0, le=2000)] = 0
-    reach: Annotated[Whole, Field(ge=2, le=200)] = 40
+    search_radius: Annotated[Whole, Field(ge=2, le=200)] = 40
     template: Annotated[Whole, Field(ge=LEAST_TEMPLATE, le=101), AfterValidator(_is_odd)] = 31
     least_correlation: Annotated[Number, Field(gt=0.0, lt=1.0)] = 0.6
     largest_sigma: Annotated[Number, Field(gt=0.0, le=2.0)] = 0.2

@@ -121,8 +121,8 @@ class AngleSetup(ExperimentSetup[OrbitAngleSpec]):
     def checked(self) -> Self:
         """Return the set-up with default angles, after a check that angles, changes and strips fit the lines."""
         if (self.camera is None) == (self.instrument is None):
-            found = "neither" if self.camera is None else "both"
-            raise self.error("one camera is needed", ("camera",), found=found, allowed="`camera:` or `instrument:`")
+            value = "neither" if self.camera is None else "both"
+            raise self.error("one camera is needed", ("camera",), value=value, allowed="`camera:` or `instrument:`")
         for name, mounted in self.instrument.cameras.items() if self.instrument is not None else ():
             if mounted.camera not in self.cameras:
                 problem = f"camera {mounted.camera!r} of the instrument's {name} is missing"
@@ -131,12 +131,12 @@ class AngleSetup(ExperimentSetup[OrbitAngleSpec]):
         has = f"{names_text(lines)} in {self.camera_name}"
         if len(lines) < 2:
             allowed = "a camera with two lines or more"
-            raise test.error("an angle needs two lines", ("camera",), found=has, allowed=allowed)
+            raise test.error("an angle needs two lines", ("camera",), value=has, allowed=allowed)
         angles = test.angles or usual_angles(lines)
         if angles is None:
             problem = "the lines of the angles are missing"
             allowed = "`angles:` with a name and two lines for each, as alpha: [forward, nadir]"
-            raise test.error(problem, ("camera",), found=has, allowed=allowed)
+            raise test.error(problem, ("camera",), value=has, allowed=allowed)
         for name, pair in angles.items():
             for k, line in enumerate(pair):
                 if line not in lines:
@@ -189,9 +189,9 @@ class CalibrationSetup(PayloadSetup[OrbitCalibrationSpec]):
         """Check that the camera has the three lines, and that points and changes lie on them; return the set-up."""
         test, camera = self.test, self.camera
         if missing := [name for name in LINES if name not in camera.lines]:
-            found = f"{names_text(tuple(camera.lines))} in {camera.name}"
+            value = f"{names_text(tuple(camera.lines))} in {camera.name}"
             problem = f"the camera has no {' and no '.join(missing)} line"
-            raise test.error(problem, ("camera",), found=found, allowed=_THREE_LINES)
+            raise test.error(problem, ("camera",), value=value, allowed=_THREE_LINES)
         _require_known("line", test, ("perturb",), test.perturb, LINES)
         _require_known("line", test, ("drift",), test.drift, LINES)
         _require_movable(test, (*test.perturb, *test.drift), camera)
@@ -482,7 +482,7 @@ def data_of(test: measurements.MeasuredTestSpec) -> measurements.OrbitDataSpec:
         if (wrong := no_file(file)) is not None:
             allowed = f"a folder with a {DATA_FILE}, or the path of such a file"
             problem = "no such measurements" if wrong == MISSING else f"no measurements: {wrong}"
-            raise test.error(problem, ("data",), found=str(path), allowed=allowed)
+            raise test.error(problem, ("data",), value=str(path), allowed=allowed)
         data = validate(measurements.OrbitDataSpec, read_yaml(file))
     tables = any(not isinstance(item.platform, measurements.PlatformFilesSpec) for item in data.passes.values())
     for key in ("quaternion", "body_axes"):
@@ -543,7 +543,7 @@ def _require_rotations(test: OrbitAngleSpec, lines: tuple[str, ...]) -> None:
                 raise test.error(problem, key, allowed=allowed)
         if change.pivot != DEFAULT_PIVOT:
             problem = "a payload's line has no pivots"
-            raise test.error(problem, ("perturb", name, "pivot"), found=change.pivot, allowed="no pivot")
+            raise test.error(problem, ("perturb", name, "pivot"), value=change.pivot, allowed="no pivot")
 
 
 def _require_mechanisms(setup: MonitorSetup, loop: MechanismsSpec) -> None:
@@ -572,9 +572,9 @@ def _require_pair(test: OrbitMonitorSpec, instrument: InstrumentSpec, cameras: P
         if mounted not in cameras:
             raise test.error(f"camera {mounted!r} of the instrument is missing", ("instrument",))
     if test.cameras is None and len(names) != 2:
-        found = f"{names_text(names)} in {instrument.name}"
+        value = f"{names_text(names)} in {instrument.name}"
         allowed = "two cameras for a stereo pair; of more than two, name them as cameras: [first, second]"
-        raise test.error("the instrument is not a stereo pair", ("instrument",), found=found, allowed=allowed)
+        raise test.error("the instrument is not a stereo pair", ("instrument",), value=value, allowed=allowed)
     pair = test.cameras or names
     for name in pair:
         if name not in names:
@@ -582,8 +582,8 @@ def _require_pair(test: OrbitMonitorSpec, instrument: InstrumentSpec, cameras: P
             raise test.error(unknown("no camera with a monitor", name, names, allowed=allowed), ("cameras",))
     looks = [instrument.cameras[name].look for name in pair]
     if abs(looks[0] - looks[1]) < _LEAST_ANGLE:
-        found = " and ".join(format_quantity(look, ANGLE) for look in looks)
-        raise test.error("equal look angles of the cameras", ("cameras",), found=found, allowed="1 deg apart or more")
+        value = " and ".join(format_quantity(look, ANGLE) for look in looks)
+        raise test.error("equal look angles of the cameras", ("cameras",), value=value, allowed="1 deg apart or more")
     pixels = cameras[instrument.cameras[pair[1]].camera].line.pixels
     _require_ends(test, "ground", (test.ground.first, test.ground.last), pixels, f"the line of {pair[1]}")
 
@@ -600,8 +600,8 @@ def _require_several(test: Spec, named: tuple[str, ...] | None, camera: ThreeLin
             allowed = f"{names_text(names)}, the lines of {camera.name}"
             raise test.error(unknown("no such line", name, names, allowed=allowed), ("lines", k))
     if len(named or names) < 2:
-        found = f"{names_text(names)} in {camera.name}"
-        raise test.error("a search for jitter needs two lines", ("camera",), found=found, allowed="a camera with two")
+        value = f"{names_text(names)} in {camera.name}"
+        raise test.error("a search for jitter needs two lines", ("camera",), value=value, allowed="a camera with two")
 
 
 _THREE_LINES = "a camera with lines forward, nadir and backward"
@@ -620,7 +620,7 @@ def _require_images_of(test: Spec, lines: Iterable[str], camera: ThreeLineCamera
     for name in lines:
         if camera.image_of(name) is None:
             problem = f"{camera.name} does not describe the image formation of its line {name}"
-            raise test.error(problem, ("camera",), found=camera.name, allowed="a payload with a section `image`")
+            raise test.error(problem, ("camera",), value=camera.name, allowed="a payload with a section `image`")
 
 
 def _require_detectors(
@@ -648,4 +648,4 @@ def _require_pixel(test: Spec, key: KeyPath, pixel: float, pixels: int, line: st
     last = pixels - 0.5
     if not -0.5 <= pixel <= last:
         allowed = f"-0.5 to {last:g}, the ends of {line}"
-        raise test.error("outside the line", key, found=f"pixel {pixel:g}", allowed=allowed)
+        raise test.error("outside the line", key, value=f"pixel {pixel:g}", allowed=allowed)

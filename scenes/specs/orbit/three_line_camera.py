@@ -156,15 +156,15 @@ class ThreeLineCameraSpec(TitledSpec):
             following = 0
             for k, ccd in enumerate(line.ccds):
                 if ccd.first != following:
-                    found = f"pixel {ccd.first} where {following} is the next"
+                    value = f"pixel {ccd.first} where {following} is the next"
                     allowed = "each pixel of the line on one CCD, in order"
                     key = ("lines", name, "ccds", k, "first")
-                    raise Problem("CCDs leave a gap or overlap", found, allowed, within=key)
+                    raise Problem("CCDs leave a gap or overlap", value, allowed, within=key)
                 following = ccd.last + 1
             if line.ccds and following != self.pixels_of(name):
-                found = f"{following} pixels of {self.pixels_of(name)}"
+                value = f"{following} pixels of {self.pixels_of(name)}"
                 allowed = "each pixel on one CCD"
-                raise Problem("CCDs do not make up the line", found, allowed, within=("lines", name, "ccds"))
+                raise Problem("CCDs do not make up the line", value, allowed, within=("lines", name, "ccds"))
         return self
 
     def pixels_of(self, line: str) -> int:

@@ -160,7 +160,7 @@ def experiment(folder: Path, fixture: Fixture) -> Read:
     def read(path: Path) -> object:
         resolved = resolve(path)
         experiment = MonitorExperiment(resolved, backend)
-        return experiment.state(resolved.job), experiment.stated
+        return experiment.state(resolved.job), experiment.prior
 
     return read
 

@@ -104,7 +104,7 @@ def traced_model(
         The instrument lacks a body of the plan, or the body cannot move or be warmed as specified.
     """
     plan = setup.operation
-    disturbances, motions = experiment.disturbances, experiment.stated
+    disturbances, motions = experiment.disturbances, experiment.prior
     assert disturbances is not None  # a plan states what moves
     assert motions is not None
     stepping = {cause for causes in plan.events.values() for cause in causes}
@@ -139,16 +139,16 @@ def focus_model(setup: OperationSetup, experiment: MonitorExperiment) -> Operati
     InputError
         The plan's disturbances have another motion.
     """
-    plan, stated = setup.operation, experiment.stated
+    plan, prior = setup.operation, experiment.prior
     assert plan.focus is not None
-    assert stated is not None  # a plan requires disturbances
-    names = [component.name for component in stated.components]
+    assert prior is not None  # a plan requires disturbances
+    names = [component.name for component in prior.components]
     if set(names) != {plan.focus.motion}:
         other = next((name for name in names if name != plan.focus.motion), "no motion")
         problem = "the readings of focus are amounts of another motion than the disturbances have"
-        raise plan.error(problem, ("focus", "motion"), found=plan.focus.motion, allowed=f"{other}, and no other motion")
+        raise plan.error(problem, ("focus", "motion"), value=plan.focus.motion, allowed=f"{other}, and no other motion")
     effect = np.ones((1, len(names)))
-    disturbances = linear_disturbances(stated, effect, effect)
+    disturbances = linear_disturbances(prior, effect, effect)
     stepping = {cause for causes in plan.events.values() for cause in causes}
     series_filter = SeriesFilter(
         disturbances,
@@ -227,7 +227,7 @@ def read_plan(path: Path, history: History) -> OperationSetup:
     operation, digest = setup.operation, digest_of_job(setup.model)
     if digest != history.sha256:
         problem = f"a plan of another instrument than the record's ({digest[:12]}, not {history.sha256[:12]})"
-        raise operation.error(problem, ("instrument",), found=operation.instrument, allowed=history.name)
+        raise operation.error(problem, ("instrument",), value=operation.instrument, allowed=history.name)
     names = quantity_names(setup.model.instrument)
     if operation.focus is not None:
         names = (f"{operation.focus.camera} {FOCUS.key}",)

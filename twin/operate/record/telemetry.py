@@ -208,7 +208,7 @@ def read_telemetry(path: Path, history: History) -> TelemetrySpec:
     digest = digest_of_job(resolve_on(spec, spec.instrument))
     if digest != history.sha256:
         problem = f"tables of another instrument than the record's ({digest[:12]}, not {history.sha256[:12]})"
-        raise spec.error(problem, ("instrument",), found=spec.instrument, allowed=history.name)
+        raise spec.error(problem, ("instrument",), value=spec.instrument, allowed=history.name)
     for k, table in enumerate(spec.readings):
         known = {"temperature": history.bodies["warm"], "focus": history.bodies["cameras"]}.get(table.kind)
         for subject in table.columns if known is not None else ():
@@ -231,7 +231,7 @@ def tables_of(spec: TelemetrySpec, table: ReadingTableSpec) -> list[Path]:
         return sorted(path.absolute() for path in folder.glob(table.files) if path.is_file())
     except (ValueError, NotImplementedError):
         problem, allowed = "not the name of files", "a path relative to this file, with * and ? for any letters"
-        raise table.error(problem, ("files",), found=table.files, allowed=allowed) from None
+        raise table.error(problem, ("files",), value=table.files, allowed=allowed) from None
 
 
 def read_table_file(table: ReadingTableSpec, path: Path, history: History) -> FileContent:

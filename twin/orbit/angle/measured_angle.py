@@ -116,7 +116,7 @@ def _measured_angles(setup: MeasuredAngleSetup, measured: PassMeasurements) -> P
         allowed = (
             f"a moment within the readings of {measured.name}, {path.first:.9g} s to {path.last:.9g} s, and in no gap"
         )
-        raise test.error("no orbit or attitude at this time", ("time",), found=f"{moment:g} s", allowed=allowed)
+        raise test.error("no orbit or attitude at this time", ("time",), value=f"{moment:g} s", allowed=allowed)
     removed = LightEffects.of(test.effects) if test.effects.corrected else NO_EFFECTS
     pixel = FrozenMap({name: points[name].pixel for name in used})
     laboratory = LineAngles(FrozenMap(line_cameras(setup.camera)), FrozenMap(pairs), pixel)
@@ -142,12 +142,12 @@ def _pairs(
     has = f"{seen} {LEAST_POINTS} points or more in {measured.name}"
     if pairs is None:
         allowed = "`angles:` with a name and two lines for each, as alpha: [forward, nadir]"
-        raise test.error("the lines of the angles are not stated", ("angles",), found=has, allowed=allowed)
+        raise test.error("the lines of the angles are not stated", ("angles",), value=has, allowed=allowed)
     for angle, pair in pairs.items():
         for k, line in enumerate(pair):
             if line not in enough:
                 key, meant = ("angles", angle, k), nearest(line, enough)
-                raise test.error("this line has no points", key, found=line, allowed=has, suggestion=meant)
+                raise test.error("this line has no points", key, value=line, allowed=has, suggestion=meant)
     return pairs
 
 
@@ -251,7 +251,7 @@ def angle_exported(run: AngleRun) -> dict[str, str]:
         raise test.error(text, ("data",), allowed="the file of a simulated test")
     if run.setup.camera is None:
         text = "the lines of an instrument are traced; no payload file has the directions of their pixels"
-        raise test.error(text, ("camera",), found=str(test.camera), allowed="a payload to export measurements of")
+        raise test.error(text, ("camera",), value=str(test.camera), allowed="a payload to export measurements of")
     spec = run.flight.spec
     plain = spec.plain()
     return tested_files(

@@ -127,7 +127,7 @@ def _image_points(
         if name is None:
             assert spec.ground is not None
             problem = unknown("no such image in the block", image, (*rows, *files))
-            raise InputError(Issue(problem.problem, spec.ground.file, None, (), problem.found, problem.allowed))
+            raise InputError(Issue(problem.problem, spec.ground.file, None, (), problem.value, problem.allowed))
         for number, line, sample, line_sigma, sample_sigma in measured.tolist():
             point = ids.setdefault(str(ground.points.ids[int(number)]), len(ids))  # type: ignore[union-attr]
             rows[name].append((point, line, sample, line_sigma, sample_sigma, 0.0))

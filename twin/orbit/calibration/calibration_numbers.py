@@ -227,7 +227,7 @@ SIGMAS: Record[CalibrationRun] = Record(
     "Conditions under which the sigmas hold.",
     Quantity("sigma", _conditions),
     Quantity("sigma_with_gauge", lambda run: "with the launch sigmas of the held unknowns, propagated to all others"),
-    Quantity("held_start_m_sigma", lambda run: run.setup.test.launch.interior, "sigma of held unknowns after a launch"),
+    Quantity("fixed_start_m_sigma", lambda run: run.setup.test.launch.interior, "sigma of fixed unknowns after launch"),
     Quantity("fields", lambda run: "for each field by itself: without the drift of the biases during the pass"),
 )
 

@@ -178,7 +178,7 @@ def _measured_facts(setup: MeasuredCalibrationSetup, run: CalibrationRun) -> tup
     lengths = ", ".join(format_quantity(v, LENGTH) for v in gps.noise)
     quaternion = "as declared in the platform's files"
     if conventions.quaternion is not None and conventions.body_axes is not None:
-        direction = conventions.quaternion.turns.replace("_", " ")
+        direction = conventions.quaternion.direction.replace("_", " ")
         quaternion = f"scalar {conventions.quaternion.scalar}, {direction}, body {', '.join(conventions.body_axes)}"
     paths = {flight.measured.interpolation for flight in run.campaign.passes}
     joined = {"spline": "cubic splines", "lagrange": "Lagrange polynomials of ten readings"}

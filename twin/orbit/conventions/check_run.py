@@ -220,7 +220,7 @@ def _bench(
     total = sum(len(raw.line) for raw in images.values())
     if total < 3:
         file = setup.test.image_points.file
-        raise InputError(Issue("too few image points for a check", file, found=str(total), allowed="three or more"))
+        raise InputError(Issue("too few image points for a check", file, value=str(total), allowed="three or more"))
     epoch = epoch_before(next(iter(readings.lines.values())).clock.instants("TAI"))
     part, effects = replace(readings, images=images), LightEffects.of(setup.test.effects)
     return pass_readings.PassBench(part, specified, cameras, setup.test.uncertainty, effects, epoch)

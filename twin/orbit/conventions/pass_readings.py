@@ -201,9 +201,9 @@ def _scene_lines(spec: LineTimesFileSpec, cameras: tuple[str, ...], folder: Path
     """Return the line times of a DIMAP file, which has a single line camera; its lines count from 0."""
     if len(cameras) != 1:
         allowed = "a camera of one line, or a table"
-        raise spec.error("a scene has the times of one line", ("file",), found=names_text(cameras), allowed=allowed)
+        raise spec.error("a scene has the times of one line", ("file",), value=names_text(cameras), allowed=allowed)
     if spec.time_scale != "UTC":
-        raise spec.error("a scene's times are in UTC", ("time_scale",), found=spec.time_scale, allowed="UTC")
+        raise spec.error("a scene's times are in UTC", ("time_scale",), value=spec.time_scale, allowed="UTC")
     read = read_dimap(folder / spec.file)
     last = max(read.lines - 1, 1)
     second = read.first_line.second[0] + np.array([0.0, last * read.line_time])
@@ -243,13 +243,13 @@ def _gcp_points(
     file = spec.image_points.file
     if (folder / file) != (folder / spec.ground.file):
         allowed = "the file of `ground`, or a table"
-        raise spec.image_points.error("image points of another .gcp file", ("file",), found=file, allowed=allowed)
+        raise spec.image_points.error("image points of another .gcp file", ("file",), value=file, allowed=allowed)
     points = {}
     for image, rows in ground.images.items():
         camera = Path(image).stem
         if camera not in lines:
             problem, allowed = ("an image of none of the camera's lines", names_text(f"{name}.tif" for name in lines))
-            raise spec.image_points.error(problem, ("file",), found=shown(image), allowed=allowed)
+            raise spec.image_points.error(problem, ("file",), value=shown(image), allowed=allowed)
         covariance = rows[:, 3:, None] ** 2 * np.eye(2)
         points[camera] = ImagePoints.of(rows[:, 0].astype(np.intp), rows[:, 1], rows[:, 2], covariance)
     if not points:

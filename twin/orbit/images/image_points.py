@@ -250,7 +250,7 @@ _RISE = 10.0
 Kind = Literal["map", "tie"]
 
 
-POINTS_REMEDY = "a larger patch, a smaller reach or template, or more points"
+POINTS_REMEDY = "a larger patch, a smaller search_radius or template, or more points"
 """Advice to the user at the end of messages of a PointsError."""
 
 
@@ -443,7 +443,7 @@ def map_points(patch: ImagedGround, spec: ImagePointsSpec) -> MatchedPoints:
         A frame is too small for template and search range, there are no distinct points that every line sees, or there
         are too few matches.
     """
-    border = spec.template // 2 + spec.reach
+    border = spec.template // 2 + spec.search_radius
     _require_room(patch, spec)
     heights = ReferenceHeights.of(patch.control.dem)
     wanted = spec.control + spec.check
@@ -487,7 +487,7 @@ def tie_points(
         A frame is too small for template and search range, there are no distinct points that every line sees, or there
         are too few matches.
     """
-    border = spec.template // 2 + spec.reach
+    border = spec.template // 2 + spec.search_radius
     _require_room(patch, spec)
     heights = ReferenceHeights.of(patch.control.dem)
     image = patch.images[source]
@@ -516,13 +516,13 @@ def tie_points(
 
 def _require_room(patch: ImagedGround, spec: ImagePointsSpec) -> None:
     """Raise PointsError if an image is too small for template and search range."""
-    least = 2 * (spec.template // 2 + spec.reach) + 1
+    least = 2 * (spec.template // 2 + spec.search_radius) + 1
     for name, image in patch.images.items():
         if min(image.frame.shape) <= least:
             size = " x ".join(str(n) for n in image.frame.shape)
             raise PointsError(
                 f"the image of {name}, {size} pixels, has no room for a template of {spec.template} pixels that is "
-                f"searched {spec.reach} pixels to each side; more than {least} pixels are needed"
+                f"searched {spec.search_radius} pixels to each side; more than {least} pixels are needed"
             )
 
 
@@ -596,7 +596,7 @@ def _matched(
 ) -> MatchedLine:
     """Match templates in one line's frame, and reject matches that contradict their neighbours."""
     options = MatchOptions(least_correlation=spec.least_correlation, largest_sigma=spec.largest_sigma)
-    match = match_windows(image.frame, patterns, at, search_radius=spec.reach, options=options)
+    match = match_windows(image.frame, patterns, at, search_radius=spec.search_radius, options=options)
     status = match.reason.astype(np.int64)
     good = match.accepted
     # the smooth displacement field has at least four matches per term

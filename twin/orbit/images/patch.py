@@ -212,8 +212,8 @@ def fly_patch(
 class _Size:
     """Source of error messages about the size of a patch, for callers that know no input file."""
 
-    def error(self, problem: str, key: KeyPath, *, found: object, allowed: str) -> PatchError:
-        return PatchError(f"{problem}; {found} lines or pixels, allowed: {allowed}", "size")
+    def error(self, problem: str, key: KeyPath, *, value: object, allowed: str) -> PatchError:
+        return PatchError(f"{problem}; {value} lines or pixels, allowed: {allowed}", "size")
 
 
 def _require_memory(count: int, size: tuple[int, int], extent: Extent, spacing: float) -> None:

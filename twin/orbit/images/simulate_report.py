@@ -89,8 +89,8 @@ def how_measured(spec: ImagePointsSpec, known: str) -> str:
     return (
         "Distinct points of the orthophoto, with heights of the elevation model, and distinct points of one line's "
         f"image are transformed to each line's geometry by {known}. Templates of {spec.template} pixels are searched "
-        f"{spec.reach} pixels to each side and fitted by least squares. Points are rejected that fail a threshold of "
-        "the matching or do not follow the smooth displacement of their neighbours."
+        f"{spec.search_radius} pixels to each side and fitted by least squares. Points are rejected that fail a "
+        "threshold of the matching or do not follow the smooth displacement of their neighbours."
     )
 
 

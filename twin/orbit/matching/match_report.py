@@ -90,11 +90,11 @@ def _images(run: Match) -> Section:
 
 def _warnings(run: Match) -> tuple[str, ...]:
     """Return warnings on displacements near the search range and on the accuracy of the maps' datum."""
-    texts, reach = [], run.setup.test.points.reach
+    texts, reach = [], run.setup.test.points.search_radius
     for group in run.points.sorts.values():
         for name, line in group.lines.items():
             if group.kind == "map" and line.accepted.any() and np.max(np.abs(line.median_shift)) > _FAR * reach:
-                texts.append(f"points of {name} lie near the search limit; a larger `points.reach` may find more")
+                texts.append(f"points of {name} lie at the search limit; a larger `points.search_radius` may find more")
     if run.accuracy is None or run.accuracy < 0.0:
         texts.append("the accuracy of the datum transformation of the maps to WGS 84 is not stated by its authority")
     elif run.accuracy > 0.1:

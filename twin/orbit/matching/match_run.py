@@ -197,11 +197,11 @@ def _image(spec: LineImageFileSpec, name: str, sensor: Sensor, folder: Path, cou
         allowed = (
             f"{sensor.camera.pixels} pixels of {name}; `first_pixel` of the image's first column, and its `window`"
         )
-        raise spec.error("an image wider than its line", ("first_pixel",), found=found, allowed=allowed)
+        raise spec.error("an image wider than its line", ("first_pixel",), value=found, allowed=allowed)
     if first_line + rows > sensor.lines + 1:
         found = f"lines to {first_line + rows - 1}"
         allowed = f"lines to {sensor.lines - 1}, of which the table has times; or a `window`"
-        raise spec.error("an image longer than its line times", ("first_line",), found=found, allowed=allowed)
+        raise spec.error("an image longer than its line times", ("first_line",), value=found, allowed=allowed)
     return LineFrame(frame, Window(first_line, first_pixel, rows, columns), sensor, (1.0, 1.0))
 
 
@@ -209,7 +209,7 @@ def _extent(
     spec: OrbitMatchSpec, images: Mapping[str, LineFrame], heights: tuple[float, float]
 ) -> tuple[GroundFrame, tuple[float, float, float, float]]:
     """Return plane coordinates of the ground, and the images' bounds west, east, south and north, in metres."""
-    seen, reach = [], spec.points.reach + spec.points.template
+    seen, reach = [], spec.points.search_radius + spec.points.template
     for name, image in images.items():
         window = image.window
         side = [np.linspace(-reach, n - 1.0 + reach, _BORDER) for n in (window.lines, window.pixels)]

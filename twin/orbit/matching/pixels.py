@@ -43,7 +43,7 @@ def read_pixels(
         from rasterio.windows import Window as Part
 
         if not 1 <= spec.band <= source.count:
-            raise spec.error("no such band", ("band",), found=spec.band, allowed=f"1 to {source.count}")
+            raise spec.error("no such band", ("band",), value=spec.band, allowed=f"1 to {source.count}")
         shape = (source.height, source.width)
         row, column, rows, columns = (
             (0, 0, *shape) if part is None else (part.row, part.column, part.rows, part.columns)
@@ -53,13 +53,13 @@ def read_pixels(
             raise spec.error("a window outside of the image", ("window",), allowed=allowed)
         if rows * columns > LARGEST_PART:
             found, allowed = f"{rows} x {columns} pixels", f"a `window:` of at most {LARGEST_PART:.0e} pixels"
-            raise spec.error("too large an image to be matched at once", ("window",), found=found, allowed=allowed)
+            raise spec.error("too large an image to be matched at once", ("window",), value=found, allowed=allowed)
         key = ("file",) if part is None else ("window", "rows")
         unit = "rows in a `window`" if part is None else "rows"
         require_memory(Lowered(spec, key, rows, unit, lambda n: n * columns * count * _PIXEL, 32))
         values = np.asarray(source.read(spec.band, window=Part(column, row, columns, rows)))
     if values.dtype.kind not in "uif":
-        raise InputError(Issue("not grey values", file, found=str(values.dtype), allowed="real numbers"))
+        raise InputError(Issue("not grey values", file, value=str(values.dtype), allowed="real numbers"))
     if not np.all(np.isfinite(values)):
         raise InputError(Issue("grey values that are not finite", file, allowed="images without gaps, or a `window:`"))
     return values if values.dtype == np.uint16 else values.astype(np.float32)

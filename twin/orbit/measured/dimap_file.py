@@ -341,7 +341,7 @@ def _moment(element: Element) -> Readings:
         return readings(element.file, [element.text], [element.line])
     except InputError as error:
         issue = error.issues[0]
-        element.wrong(issue.problem, issue.found, issue.allowed)
+        element.wrong(issue.problem, issue.value, issue.allowed)
 
 
 def _times(time: Element, lines: int) -> tuple[Readings, float]:

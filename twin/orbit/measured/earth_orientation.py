@@ -229,7 +229,7 @@ def single_reading(text: str) -> Readings:
     try:
         return Readings.of_texts([text.strip()])
     except Problem as problem:
-        raise Problem(problem.problem, problem.found, problem.allowed) from None
+        raise Problem(problem.problem, problem.value, problem.allowed) from None
 
 
 def known_scale(name: str) -> str:
@@ -274,7 +274,7 @@ def readings(file: str, texts: Sequence[str], lines: Sequence[int]) -> Readings:
     except Problem as problem:
         (row,) = problem.within
         raise InputError(
-            Issue(problem.problem, file, lines[int(row)], ("time",), problem.found, problem.allowed)
+            Issue(problem.problem, file, lines[int(row)], ("time",), problem.value, problem.allowed)
         ) from None
 
 

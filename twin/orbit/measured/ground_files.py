@@ -104,7 +104,7 @@ def read_ground_points(spec: GroundFileSpec, folder: Path) -> GroundFile:
         itrs = datum.itrs(*rows.coordinates.T)
     except Problem as problem:
         line = rows.lines[int(problem.within[0])] if problem.within else None
-        raise InputError(Issue(problem.problem, file, line, (), problem.found, problem.allowed)) from None
+        raise InputError(Issue(problem.problem, file, line, (), problem.value, problem.allowed)) from None
     height = Earth().geodetic(itrs)[2]
     for row in np.flatnonzero(~((height > -1000.0) & (height < 10000.0)))[:1]:
         found = f"{height[row]:.6g} m above the ellipsoid"
@@ -275,13 +275,13 @@ def _of_header(spec: GroundFileSpec, header: str) -> str:
         # Ensembles, datums and their axes are spelt in many ways, so the coordinates are compared.
         same = spec.crs is None or _alike(pyproj.CRS(spec.crs), crs)
     except pyproj.exceptions.CRSError:
-        raise spec.error("the header # WKT: of the file cannot be read", ("file",), found=shown(header)) from None
+        raise spec.error("the header # WKT: of the file cannot be read", ("file",), value=shown(header)) from None
     if not crs.is_geographic:
         problem, allowed = "the header names a projected system", "a geographic system: latitude, longitude, height"
-        raise spec.error(problem, ("file",), found=crs.name, allowed=allowed)
+        raise spec.error(problem, ("file",), value=crs.name, allowed=allowed)
     if not same:
         problem, allowed = f"the file's header names {crs.name}, not the specified system", f"{crs.name}, or no key crs"
-        raise spec.error(problem, ("crs",), found=spec.crs, allowed=allowed)
+        raise spec.error(problem, ("crs",), value=spec.crs, allowed=allowed)
     return spec.crs or header
 
 

@@ -519,7 +519,7 @@ class UserMap:
         low, high = float(values.min()), float(values.max())
         if max(-low, high) > MOST_HEIGHT:
             found, allowed = f"{low:.6g} to {high:.6g} m", f"up to {MOST_HEIGHT:g} m; empty pixels as nodata"
-            raise InputError(Issue("values are not ground heights", self.raster.file, found=found, allowed=allowed))
+            raise InputError(Issue("values are not ground heights", self.raster.file, value=found, allowed=allowed))
         return low, high
 
     def part(self, frame: GroundFrame, ends: tuple[float, float, float, float], heights: bool = False) -> MapPart:

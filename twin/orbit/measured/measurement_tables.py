@@ -138,7 +138,7 @@ def read_pass(
     if len(images) < 2:
         found = f"of {names_text(tuple(images)) or 'none'}"
         allowed = "image points of two line cameras or more"
-        raise InputError(Issue("too few line cameras", pixels.file, found=found, allowed=allowed))
+        raise InputError(Issue("too few line cameras", pixels.file, value=found, allowed=allowed))
     return PassMeasurements(name, platform, {line: times[line] for line in images}, ground, images)
 
 
@@ -388,7 +388,7 @@ def _once(table: Table, column: str) -> None:
 
 CONVENTIONS: Mapping[str, Any] = {
     "frame": "itrs",
-    "quaternion": {"scalar": "last", "turns": "body_to_frame"},
+    "quaternion": {"scalar": "last", "direction": "body_to_frame"},
     "body_axes": ["forward", "right", "down"],
     "time_scale": "utc",
     "line_moment": "middle",
@@ -400,7 +400,7 @@ CONVENTIONS: Mapping[str, Any] = {
 CAMERA_FILE = "camera.yaml"
 TEST_FILE = "calibrate.yaml"
 LINES_SEE_POINTS = (
-    "an attitude whose lines see the points: `scalar` first or last, `turns`, `body_axes`, frame and times of the"
+    "an attitude whose lines see the points: `scalar` first or last, `direction`, `body_axes`, frame and times of the"
     " attitude file (`twin.orbit check` finds which agree with the ground points); names, images and coordinates that"
     " belong together"
 )
@@ -571,7 +571,7 @@ def platform_of(epoch: str, orbit: Table, attitude: Table, conventions: measurem
         missing = [name for name in ("vx", "vy", "vz") if name not in orbit]
         if missing:
             raise InputError(
-                Issue(f"no column {missing[0]!r}", orbit.file, found=names_text(columns), allowed="all three or none")
+                Issue(f"no column {missing[0]!r}", orbit.file, value=names_text(columns), allowed="all three or none")
             )
         speed = orbit.stacked("vx", "vy", "vz")[order]
         _check_velocity(orbit, order, time, position, speed)
@@ -600,7 +600,7 @@ def _quaternions_of(numbers: Array, conventions: measurements.ConventionsSpec) -
     assert convention is not None
     assert conventions.body_axes is not None
     xyzw = numbers if convention.scalar == "last" else np.roll(numbers, -1, axis=1)
-    if convention.turns == "frame_to_body":
+    if convention.direction == "frame_to_body":
         xyzw = xyzw * np.array([-1.0, -1.0, -1.0, 1.0])
     axes = np.array(measurements.body_axes_matrix(conventions.body_axes), np.float64)
     if np.array_equal(axes, np.eye(3)):

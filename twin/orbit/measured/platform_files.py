@@ -135,7 +135,7 @@ def read_platform(spec: PlatformFilesSpec, folder: Path) -> tuple[PlatformReadin
         _of_file_or_test(spec_of, "scalar", spec_of.scalar, attitude.scalar, "the position of the scalar")
         if quaternions
         else "last",
-        _of_file_or_test(spec_of, "turns", spec_of.turns, attitude.turns, "the direction of the rotation")
+        _of_file_or_test(spec_of, "direction", spec_of.direction, attitude.turns, "the direction of the rotation")
         if quaternions
         else "body_to_frame",
         spec_of.body_axes,
@@ -293,7 +293,7 @@ def _of_file_or_test(spec: Any, key: str, in_spec: str | None, in_file: str | No
     if in_spec is None and in_file is None:
         raise spec.error(f"{what} is not specified, neither by the file nor here", (key,), allowed=f"`{key}:` here")
     if in_spec is not None and in_file is not None and in_spec != in_file:
-        raise spec.error(f"{what} differs from the file", (key,), found=in_spec, allowed=f"{in_file}, as the file says")
+        raise spec.error(f"{what} differs from the file", (key,), value=in_spec, allowed=f"{in_file}, as the file says")
     return str(in_spec or in_file)
 
 
@@ -380,8 +380,8 @@ def clock_of(table: Table, spec: OrbitFileSpec | AttitudeFileSpec | LineTimesFil
     except Problem as problem:
         if problem.within:
             row = int(problem.within[0])
-            raise table.error(row, "date_time", problem.problem, problem.found, problem.allowed) from None
-        raise spec.error(problem.problem, ("epoch",), found=problem.found, allowed=problem.allowed) from None
+            raise table.error(row, "date_time", problem.problem, problem.value, problem.allowed) from None
+        raise spec.error(problem.problem, ("epoch",), value=problem.value, allowed=problem.allowed) from None
 
 
 def _clock(table: Table, spec: OrbitFileSpec | AttitudeFileSpec) -> tuple[earth_orientation.Readings, str | None]:

@@ -58,7 +58,7 @@ def numbers(file: str, cells: Sequence[Sequence[str]], lines: Sequence[int], hea
     uneven = next((k for k, row in enumerate(cells) if len(row) != width), None)
     if uneven is not None:
         found = f"{len(cells[uneven])} numbers"
-        raise InputError(Issue("wrong number of columns", file, lines[uneven], found=found, allowed=", ".join(heads)))
+        raise InputError(Issue("wrong number of columns", file, lines[uneven], value=found, allowed=", ".join(heads)))
     try:
         values = np.array([list(map(float, row)) for row in cells], dtype=np.float64).reshape(len(cells), width)
     except ValueError:
@@ -190,7 +190,7 @@ class Element:
         try:
             return numbers(self.file, [cells], [self.line], [self.tag] * len(cells))[0]
         except InputError as error:
-            self.wrong(error.issues[0].problem, error.issues[0].found, error.issues[0].allowed)
+            self.wrong(error.issues[0].problem, error.issues[0].value, error.issues[0].allowed)
 
     def number(
         self, *tags: str, least: float = -np.inf, most: float = np.inf, unit: Mapping[str, float] | None = None

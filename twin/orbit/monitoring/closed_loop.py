@@ -210,7 +210,7 @@ def loop_model(setup: MonitorSetup, experiment: MonitorExperiment) -> LoopModel:
     AimError, BeamMissedError
         Light is lost.
     """
-    prior, motions = experiment.disturbances, experiment.stated
+    prior, motions = experiment.disturbances, experiment.prior
     assert prior is not None  # the set-up states them
     assert motions is not None
     test, cameras, corrections = setup.test, tuple(experiment.instrument.cameras), setup.test.loop.corrections
@@ -364,7 +364,7 @@ def drifting_states(spec: OrbitMonitorSpec, experiment: MonitorExperiment, seed:
     spec.check_nodes(experiment.instrument.nodes)
     if spec.course is not None:
         return states_of(experiment, spec)
-    prior, times = experiment.stated, np.array(spec.times)
+    prior, times = experiment.prior, np.array(spec.times)
     assert prior is not None
     amounts = drawn_motions(prior, times - times[0], lambda number: np.random.default_rng(stream(seed, _DRAWN, number)))
     bodies = {body.path: body for body in experiment.instrument.assembly.tree.bodies}

@@ -138,7 +138,7 @@ SMOOTHED: Record[tuple[MonitorRun, float, Smoothing]] = Record(
 
 
 def _readings(run: MonitorRun) -> dict[str, Any]:
-    readings = run.together[run.spec.every].readings
+    readings = run.together[run.spec.cadence].readings
     return {name: readings[name].to_dict() for name in run.pair}
 
 
@@ -189,7 +189,7 @@ def _sensitivity(run: MonitorRun) -> dict[str, Array]:
 MONITOR: Record[MonitorRun] = Record(
     "Content of monitor.json; errors at the top level are those with the file's interval.",
     Quantity("seed", lambda run: run.seed, "seed of all random numbers"),
-    Quantity("interval_s", lambda run: run.spec.every, "time between measurements in the file"),
+    Quantity("interval_s", lambda run: run.spec.cadence, "time between measurements in the file"),
     Quantity("height_rms_m", lambda run: run.cases["interval"].height_rms, "RMS error in height"),
     Quantity("height_worst_m", lambda run: run.cases["interval"].worst, "RMS error in height at the worst time"),
     Quantity("height_camera_rms_m", lambda run: run.cases["interval"].camera_height_rms, "in height by the cameras"),
@@ -197,7 +197,7 @@ MONITOR: Record[MonitorRun] = Record(
     Quantity("height_m_per_arcsec", lambda run: run.conversion.of_angle, "height by the angle", converted=False),
     Quantity("times_s", lambda run: run.times, "times of the course"),
     Quantity("reference_time_s", lambda run: run.spec.reference_time, "when cameras and monitor are calibrated"),
-    Quantity("monitored_times_s", lambda run: run.times[run.spec.measured(run.spec.every)], "times of measurements"),
+    Quantity("monitored_times_s", lambda run: run.times[run.spec.measured(run.spec.cadence)], "times of measurements"),
     Quantity("cameras", lambda run: {name: (run, name) for name in run.pair}, record=CAMERA),
     Quantity("intersection_angle", lambda run: run, record=ANGLE),
     Quantity("cases", lambda run: run.cases, "errors by correction of the cameras", record=CASE),
@@ -335,7 +335,7 @@ CORRECTION: Record[tuple[loop_run.LoopRun, str, loop_run.LoopAnalysis]] = Record
     Quantity("cycle_steps", lambda of: of[2].cycle and of[2].cycle.steps, "of the limit cycle, peak to peak", "cycle"),
     Quantity("unit", lambda of: of[2].corrector.unit[0], "unit of positions"),
     Quantity("positions", lambda of: positions(of[0], of[1]), "when images are taken", converted=False),
-    Quantity("held_s", lambda o: [float(o[0].closed.course.times[k]) for k in o[2].ends], "times at its range's end"),
+    Quantity("saturated_s", lambda o: [float(o[0].closed.course.times[k]) for k in o[2].ends], "at its range's end"),
 )
 
 

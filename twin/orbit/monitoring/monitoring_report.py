@@ -96,7 +96,7 @@ def _height_figure(run: MonitorRun) -> Figure:
     figure, (above, below) = _panels(5.2, 2)
     for name, colour, style, label in (
         ("none", svg.VERMILION, "o-", "without monitoring"),
-        ("interval", svg.GREEN, "s--", f"monitored every {run.spec.every / 60.0:g} min, linear between"),
+        ("interval", svg.GREEN, "s--", f"monitored every {run.spec.cadence / 60.0:g} min, linear between"),
         ("monitored", svg.BLUE, "o-", "monitored at every time"),
     ):
         above.plot(minutes, cases[name].camera, style, color=colour, ms=3.5, lw=1.2, label=label)
@@ -118,7 +118,7 @@ def _smoothed_figure(run: MonitorRun) -> Figure:
         _band(axes, minutes, 0.0, many * chosen.sigma, svg.SKY, alpha=alpha, label=label)
     axes.plot(minutes, run.cases["interval"].camera, "s--", color=svg.GREEN, ms=3.5, lw=1.0, label="linear between")
     axes.plot(minutes, chosen.case.camera, "o-", color=svg.PURPLE, ms=3.5, lw=1.2, label="smoothed")
-    at = spec.measured(spec.every)
+    at = spec.measured(spec.cadence)
     low = axes.get_ylim()[0]
     axes.plot(minutes[at], np.full(len(at), low), "|", color=svg.INK, ms=9, mew=1.4, label="measurements")
     axes.set_ylim(bottom=low)
@@ -286,7 +286,7 @@ def _verdict(run: MonitorRun) -> tuple[str, tuple[str, ...]]:
     others = floor.height_rms**2 > 0.5 * chosen.height_rms**2
     limit = "images, orbit and attitude" if others else _largest_part(run)
     return answer(
-        f"Monitoring every {moment(spec.every)} changes the height error from {none.height_rms:.2f} m to "
+        f"Monitoring every {moment(spec.cadence)} changes the height error from {none.height_rms:.2f} m to "
         f"{chosen.height_rms:.2f} m RMS{'' if gain > 0.0 else ', which is no gain'}",
         f"with the true cameras {floor.height_rms:.2f} m would remain: most of the error comes from {limit}",
         _gain(run),
@@ -315,7 +315,7 @@ def _table(run: MonitorRun) -> Table:
     spec = run.spec
     names = {
         "none": "as calibrated, no monitoring",
-        "interval": f"monitored every {moment(spec.every)}",
+        "interval": f"monitored every {moment(spec.cadence)}",
         "smoothed": "the same measurements, smoothed",
         "monitored": "monitored at every time",
         "parameters": "true four parameters (bound)",
@@ -473,7 +473,7 @@ def _noise(run: MonitorRun) -> Section:
 
 def _warnings(run: MonitorRun) -> tuple[str, ...]:
     warnings = [*coarse_warnings(run.setup), *run.doubts]
-    together = run.together.get(run.spec.every)
+    together = run.together.get(run.spec.cadence)
     warnings += [jump_text(jump) for jump in (together.jumps if together is not None else None) or ()]
     warnings += numbers.MONITOR.warnings(run)
     if run.cases["monitored"].camera_height_rms > run.cases["none"].camera_height_rms:

@@ -289,7 +289,7 @@ class MonitorRun(pair_flight.PairFlight):
         cases = {
             "none": self.case({name: np.zeros((len(self.times), 4)) for name in self.pair}),
             "monitored": self.case(self.applied(self.monitored)),
-            "interval": self._interpolated(self.spec.every),
+            "interval": self._interpolated(self.spec.cadence),
         }
         if self.smoothing:
             cases["smoothed"] = self.smoothed.case
@@ -330,7 +330,7 @@ class MonitorRun(pair_flight.PairFlight):
     @property
     def smoothed(self) -> Smoothing:
         """Height errors with readings smoothed from the measurements at the file's interval; requires a prior."""
-        return self.smoothing[self.spec.every]
+        return self.smoothing[self.spec.cadence]
 
     def _smoothing(self, interval: float) -> Smoothing:
         smoothed, mask = self.together[interval], self.mask
@@ -496,7 +496,7 @@ def simulate_monitoring(setup: MonitorSetup, backend: Backend, seed: int, advanc
     advance("monitor", 6, parts)
     axes, smoothed = experiment.sight.axes, {}
     if experiment.disturbances is not None:
-        smoothed = {interval: monitor.smoothed(used, interval) for interval in {spec.every, *spec.compared}}
+        smoothed = {interval: monitor.smoothed(used, interval) for interval in {spec.cadence, *spec.compared}}
     return MonitorRun(
         pair,
         np.array(spec.times),

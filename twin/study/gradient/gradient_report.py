@@ -161,7 +161,7 @@ def _factor_rows(gradient: Gradient) -> Table:
     """Return the table of the factors: value in the base job, spread, and step of the finite differences."""
     rows: list[list[Cell]] = []
     for k, factor in enumerate(gradient.factors):
-        keys = [*factor.spec.places, *(scale.key for scale in factor.spec.scales)]
+        keys = [*factor.spec.key_paths, *(scale.key for scale in factor.spec.scales)]
         where = key_text(keys[0]) + (f" and {len(keys) - 1} more" if len(keys) > 1 else "")
         exact = bool(np.any(gradient.method[:, k] == AD))
         steps = sorted({significant(float(step), 3, floor=0.0) for step in gradient.step[:, k]})

@@ -364,7 +364,7 @@ class GradientFactor:
             A value that scales with the factor cannot be computed.
         """
         cell = with_unit(value, self.unit) if self.unit else value
-        out: dict[KeyPath, Any] = dict.fromkeys(self.spec.places, cell)
+        out: dict[KeyPath, Any] = dict.fromkeys(self.spec.key_paths, cell)
         if self.spec.scales:
             tree = self.setup.base
             try:
@@ -378,13 +378,13 @@ class GradientFactor:
 def _in_base(setup: StudySetup, name: str, factor: FactorSpec, unit: str) -> float:
     """Return the factor's value in the base job, in its own unit; 1 for a factor that only scales other values."""
     numbers: list[float] = []
-    for k, key in enumerate(factor.places):
+    for k, key in enumerate(factor.key_paths):
         try:
             numbers.append(number_at(setup.base, key, unit))
             # values that are written in several units agree to rounding
             if abs(numbers[k] - numbers[0]) > 1e-12 * abs(numbers[0]):
                 text = "the places of the factor have different values in the base"
-                raise Problem(text, shown(leaf(setup.base, key)), shown(leaf(setup.base, factor.places[0])))
+                raise Problem(text, shown(leaf(setup.base, key)), shown(leaf(setup.base, factor.key_paths[0])))
         except Problem as problem:
             raise setup.error(problem, ("factors", name, *factor.key_of(k))) from None
     return numbers[0] if numbers else 1.0
@@ -805,5 +805,5 @@ def _refused(setup: StudySetup, factor: GradientFactor, step: float, error: Inpu
     issue = error.issues[0]
     at = f"{factor.value:g} ± {abs(step):g} {factor.unit}".strip()
     text = f"the base does not allow values beside its own, {at}, which finite differences need: {issue.problem}"
-    problem = Problem(text, issue.found, issue.allowed, issue.suggestion)
+    problem = Problem(text, issue.value, issue.allowed, issue.suggestion)
     return setup.error(problem, ("factors", factor.name, factor.spec.kind))

@@ -118,7 +118,7 @@ def _factor_table(runs: StudyRuns) -> Table:
     """Return the table of factors: name, key in the base job, distribution, and the values of the runs."""
     rows: list[list[Cell]] = []
     for factor in runs.factors:
-        positions = [key_text(key) for key in factor.spec.places]
+        positions = [key_text(key) for key in factor.spec.key_paths]
         positions += [f"{key_text(scale.key)} (power {scale.power:g})" for scale in factor.spec.scales]
         rows.append([factor.name, typeset(factor.unit), "; ".join(positions), _source(factor.spec), _values(factor)])
     heads = ("factor", "unit", "in the base", "distribution", "values run")

@@ -459,7 +459,7 @@ def impossible_noise(runs: StudyRuns) -> InputError | None:
             f"the reported noise variance is {times} times the variance of all runs: not the noise of {share.response}"
         )
         remedy = "the standard deviation by noise alone, for readings the key that ends in _sigma_noise"
-        error = study.error(text, ("responses", share.response, "noise"), found=key_text(key), allowed=remedy)
+        error = study.error(text, ("responses", share.response, "noise"), value=key_text(key), allowed=remedy)
         issues += error.issues
     return InputError(*issues) if issues else None
 

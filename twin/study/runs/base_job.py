@@ -423,7 +423,7 @@ def _number(outcome: Mapping[str, Any], key: Any, name: str) -> float:
     try:
         value = leaf(outcome, key)
     except Problem as problem:
-        raise Problem(f"the results have no response {name!r}: {problem.problem}, {problem.found}") from None
+        raise Problem(f"the results have no response {name!r}: {problem.problem}, {problem.value}") from None
     if value is None:
         return math.nan
     if not isinstance(value, int | float):

@@ -360,7 +360,7 @@ def check_responses(setup: StudySetup, sample: Any) -> None:
             except Problem as problem:
                 key_path: KeyPath = ("responses", name, key)
                 text = f"the results of {setup.study.base.command!r} do not have this: {problem.problem}"
-                restated = Problem(text, problem.found, problem.allowed, problem.suggestion, problem.within)
+                restated = Problem(text, problem.value, problem.allowed, problem.suggestion, problem.within)
                 raise setup.error(restated, key_path) from None
             if key == "noise":
                 _check_noise(setup, sample, name, path)

@@ -221,9 +221,9 @@ def ratios(factor: FactorSpec, tree: Tree, values: np.ndarray, unit: str) -> dic
 
 def _nominal(factor: FactorSpec, tree: Tree, unit: str) -> float:
     """Return the factor's value in the base job, in its own unit; 1 for a factor that is itself a multiplier."""
-    if not factor.places:
+    if not factor.key_paths:
         return 1.0
-    number = number_at(tree, factor.places[0], unit)
+    number = number_at(tree, factor.key_paths[0], unit)
     if number == 0.0:
         raise Problem("a ratio to zero is not defined", "zero in the base", "scales in a factor without a key")
     return number
@@ -404,7 +404,7 @@ class Plan:
     def run(self, number: int) -> Run:
         """Return one run: its number, its values for the base job, and its seed."""
         factors = self.setup.study.factors
-        values = {key: c.cell(number) for c in self.columns for key in factors[c.name].places}
+        values = {key: c.cell(number) for c in self.columns for key in factors[c.name].key_paths}
         self.scaling.apply(values, number)
         return Run(number, tuple(values.items()), None if self.seeds is None else int(self.seeds[number]))
 
@@ -425,7 +425,7 @@ class Plan:
                 cell = with_unit(value, column.unit) if column.unit else value
                 multipliers = self._ratios(column, np.array([value]))
                 follow = [(key, scaled(self.scaling.base[key], float(ratio[0]))) for key, ratio in multipliers.items()]
-                self._check_value(column.name, [*((key, cell) for key in factor.places), *follow])
+                self._check_value(column.name, [*((key, cell) for key in factor.key_paths), *follow])
 
     def _check_value(self, name: str, values: list[tuple[Any, Any]]) -> None:
         tree = with_values(self.setup.tree, values)
@@ -433,7 +433,7 @@ class Plan:
             validate(self.setup.job.model, YamlFile("", tree, {}))
         except InputError as error:
             factor, issue = self.setup.study.factors[name], error.issues[0]
-            problem = Problem(issue.problem, issue.found, issue.allowed, issue.suggestion)
+            problem = Problem(issue.problem, issue.value, issue.allowed, issue.suggestion)
             raise self.setup.error(problem, ("factors", name, factor.kind)) from None
 
 
@@ -459,7 +459,7 @@ def _column(setup: StudySetup, name: str, sampled: np.ndarray) -> Column:
 def _like(setup: StudySetup, name: str, sampled: np.ndarray) -> np.ndarray:
     """Return a factor's pure numbers as integers if all are whole and the base job has an integer there."""
     factor = setup.study.factors[name]
-    node = leaf(setup.tree, factor.places[0]) if factor.places else None
+    node = leaf(setup.tree, factor.key_paths[0]) if factor.key_paths else None
     whole = isinstance(node, int) and not isinstance(node, bool) and factor.unit is None
     return sampled.astype(np.int64) if whole and np.all(sampled == np.rint(sampled)) else sampled
 

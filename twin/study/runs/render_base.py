@@ -169,7 +169,7 @@ class RenderBase:
         experiment = self._experiment(resolved, backend)[1]
         checked_nodes(resolved.job, experiment.instrument.nodes)
         if experiment.monitored:
-            experiment.stated  # noqa: B018 - raises where the instrument does not have what is stated
+            experiment.prior  # noqa: B018 - raises where the instrument does not have what is stated
 
     def evaluate(self, tree: Tree, runs: Sequence[Run], backend: Backend) -> list[Outcome]:
         """Return the results of every run: ``truth`` and ``recovered``, and further results on request.

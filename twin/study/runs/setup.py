@@ -92,7 +92,7 @@ class StudySetup:
         """Return an InputError whose position is ``key`` in the study's file."""
         if isinstance(problem, str):
             return self.study.error(problem, key, allowed=allowed)
-        issue = Issue(problem.problem, "", None, (), problem.found, problem.allowed, problem.suggestion)
+        issue = Issue(problem.problem, "", None, (), problem.value, problem.allowed, problem.suggestion)
         return InputError(self._placed(issue, (*key, *problem.within)))
 
     def _placed(self, issue: Issue, key: KeyPath) -> Issue:
@@ -104,7 +104,7 @@ class StudySetup:
         """Return name and key of the factor that sets the base job's value at ``key``, or above or below it."""
         for name, factor in self.study.factors.items():
             scaled = [(scale.key, ("scales", k)) for k, scale in enumerate(factor.scales)]
-            for changed, where in (*((p, factor.key_of(k)) for k, p in enumerate(factor.places)), *scaled):
+            for changed, where in (*((p, factor.key_of(k)) for k, p in enumerate(factor.key_paths)), *scaled):
                 n = min(len(changed), len(key))
                 if changed[:n] == tuple(key)[:n]:
                     return name, ("factors", name, *where)
@@ -208,7 +208,7 @@ def _placed(study: StudySpec, tree: Tree) -> StudySetup:
     model = setup.job.model
     changed: list[tuple[KeyPath, KeyPath, bool]] = []
     for name, factor in study.factors.items():
-        changed += [(key, ("factors", name, *factor.key_of(k)), True) for k, key in enumerate(factor.places)]
+        changed += [(key, ("factors", name, *factor.key_of(k)), True) for k, key in enumerate(factor.key_paths)]
     for name, factor in study.factors.items():
         changed += [(s.key, ("factors", name, "scales", k, "key"), False) for k, s in enumerate(factor.scales)]
     for key, at, is_set in changed:
@@ -252,7 +252,7 @@ def _refuse_names(study: StudySpec, key: KeyPath) -> None:
 def _unset(tree: Tree, factor: FactorSpec) -> list[KeyPath]:
     """Return the key paths of a factor that have no value in the base job yet."""
     out = []
-    for key in factor.places:
+    for key in factor.key_paths:
         node: Any = tree
         for part in key:
             node = node[part]
@@ -321,7 +321,7 @@ def _read_table(study: StudySpec, path: Path, key: KeyPath, named: Mapping[str, 
         if heads and (missing := [column for column in named if column not in heads]):
             text, allowed, meant = "no such column", names_text(heads), nearest(missing[0], heads)
             key_path = (*named[missing[0]], "column")
-            raise study.error(text, key_path, found=missing[0], allowed=allowed, suggestion=meant)
+            raise study.error(text, key_path, value=missing[0], allowed=allowed, suggestion=meant)
         checked(1, heads)
         # of columns of one name the last
         column_of = {head: k for k, head in enumerate(heads) if head in named}

@@ -532,7 +532,7 @@ def chief_rays(setup: DistortionSetup, backend: Backend) -> Callable[[Array], Ar
 
     def positions(angle: Array) -> Array:
         light = rotation_matrix(np.append(angle, 0.0)[:, None] * axis) @ middle
-        along = path.places({}, light)[:, 0]
+        along = path.positions({}, light)[:, 0]
         return np.asarray(along[:-1] - along[-1])
 
     return positions
@@ -544,12 +544,12 @@ def run_equations(context: Context) -> Iterator[CheckResult]:
     setup = DistortionSetup.read(TEST)
     positions = chief_rays(setup, context.backend)
     band, test = setup.camera.bands[setup.test.band], setup.test
-    half = 0.5 * test.reach * band.pixels * band.pitch
+    half = 0.5 * test.extent * band.pixels * band.pitch
     rough = float(positions(np.array([1e-3]))[0]) / 1e-3
     edge = float(np.arctan(half / rough))
     yield from _solutions(context, positions, edge)
     yield _ignored(context, positions, edge * np.linspace(-1.0, 1.0, test.points), band.pitch)
-    end, most = 0.5 * band.pixels * band.pitch, 1.02 * edge / test.reach
+    end, most = 0.5 * band.pixels * band.pitch, 1.02 * edge / test.extent
     whole = _angle_to(positions, end, most) - _angle_to(positions, -end, most)
     yield context.row("004.turntable.range", np.degrees(whole), band=band)
 

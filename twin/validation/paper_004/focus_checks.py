@@ -129,7 +129,7 @@ class Plan:
         state = self.alignment.states[0]
         where, sigma = measured_defocus(state)
         # the plane wants how far best focus lies downstream of the CCD
-        return fit_focal_plane(self.alignment.places, -where, sigma, estimate_extra=True).correction(state.level)
+        return fit_focal_plane(self.alignment.positions, -where, sigma, estimate_extra=True).correction(state.level)
 
     @cached_property
     def shims(self) -> ShimPlan:
@@ -378,7 +378,7 @@ def _second_round(alignment: SimulatedFocus) -> float:
     """Return the largest change of a shim that the last measurement would still require, metres."""
     state = alignment.states[-1]
     where, sigma = measured_defocus(state)
-    motion = fit_focal_plane(alignment.places, -where, sigma, estimate_extra=True).correction()
+    motion = fit_focal_plane(alignment.positions, -where, sigma, estimate_extra=True).correction()
     present = alignment.shimmings[-1].plan.thickness
     return float(np.max(np.abs(shim_plan(motion, mount_of(alignment.test), present).change)))
 
