@@ -259,7 +259,7 @@ def require_consistency(bench: AsBuiltBench, state: StateEstimate) -> None:
         f"the measurements contradict each other: their residuals are {ratio:.0f} standard deviations on average, and "
         "this one fits worst",
         key,
-        allowed="its true standard deviation, fields, sign and orientation; `camtwin asbuilt-check` tries orientations",
+        allowed="its true standard deviation, fields, sign and orientation (of wavefronts: `camtwin asbuilt check`)",
     )
 
 
