@@ -84,6 +84,7 @@ def test_a_cut_out_too_large_for_the_pupil_is_refused():
         StarImage(pupil, 4, (600, 600), 7e-6).irradiance(np.zeros(15))
 
 
+@pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize(("blur", "border"), [(3e-6, False), (None, False), (None, True)])
 def test_fit_finds_position_flux_background_and_seeing(blur, border):
     """Of an image without noise, to 1e-4 px; a saturated pixel is not used, nor a border without values."""
