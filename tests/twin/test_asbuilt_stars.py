@@ -21,7 +21,7 @@ from scenes.yaml.errors import InputError
 from scenes.yaml.yaml_file import dump_yaml
 from tests.twin.star_bench import PRIOR, TWO, independent_share, judged, measured, star_bench
 from twin.asbuilt.asbuilt_bench import AsBuiltBench
-from twin.asbuilt.asbuilt_run import probabilities, run_asbuilt
+from twin.asbuilt.asbuilt_run import _mode_warnings, probabilities, run_asbuilt
 from twin.asbuilt.built_instrument import built_motions, instrument_text, unknown
 from twin.asbuilt.star_readings import StarFit, StarReading
 from twin.validation.real.stars import FILE, RIGID, star_file, star_images
@@ -369,3 +369,13 @@ def test_edges_out_of_focus_determine_the_focus_with_its_sign(backend, tmp_path)
         sigma = np.std(exact.predict(found.draw(rng, 100)), axis=0)
         assert np.max(np.abs(apart) / sigma) < 4.0
         assert np.max(sigma) < 15e-6
+    # at a high frequency a wrong focus has nearly this MTF: one start ended 0.1 mm away, with a sigma of 0.02 mm
+    fine = bench_of({"mtf": {"page": {"fields": fields, "sigma": 0.005, "defocus": "0.15 mm"}}})
+    rng = np.random.default_rng(6)
+    true = fine.draw(rng, "normal")
+    found = fine.estimate(fine.measured(true, rng))
+    apart = exact.predict(found.mean[None]) - exact.predict(true[None])
+    assert np.max(np.abs(apart)) < 15e-6
+    assert not found.excluded
+    other = replace(found, unit=found.unit + 9.0 * found.root[0])
+    assert any("another focus, explains" in text for text in _mode_warnings((found, other)))
