@@ -283,7 +283,7 @@ def test_tiles_fit_into_the_memory(landscape: Landscape, monkeypatch: pytest.Mon
     """Tables of all displacements of all pixels grow with tiles and with the range of heights."""
     frames = {name: (np.zeros((SIDE, SIDE)), landscape.images[name]) for name in ("first", "third")}
     monkeypatch.setenv("TWIN_MEMORY", "300 MB")
-    with pytest.raises(BenchError, match="matching between -800 and 1600 m needs .* GB of memory") as error:
+    with pytest.raises(BenchError, match=r"matching between -800 and 1600 m needs .* GB of memory") as error:
         surface(frames, (-800.0, 1600.0), GRID)
     assert error.value.key == ("heights",)
     views = [_View(*frame, "EPSG:32631") for frame in frames.values()]

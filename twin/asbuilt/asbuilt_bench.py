@@ -76,8 +76,7 @@ _ANOTHER = 3.0
 """Distance of two estimates in posterior standard deviations from which they are different states."""
 
 _TRIED, _FOLLOWED = 500, 12
-"""Number of states of the prior that are compared with values of MTF, and of the best ones from which an estimate starts.
-"""
+"""Number of states of the prior that are compared with values of MTF, and of the best ones, where estimates start."""
 
 _SHARE = 1e-2
 """Step of the numerical derivatives with respect to an actuator, as a fraction of the actuator's range."""
