@@ -75,8 +75,10 @@ _REACHED = 0.5
 _ANOTHER = 3.0
 """Distance of two estimates in posterior standard deviations from which they are different states."""
 
-_TRIED, _FOLLOWED = 500, 12
-"""Number of states of the prior that are compared with values of MTF, and of the best ones, where estimates start."""
+_TRIED, _FOLLOWED, _KNOWN = 500, 12, 4
+"""Number of states of the prior that are compared with values of MTF, of the best ones, where estimates start, and of
+starts that find nothing new one after the other, which end the search.
+"""
 
 _SHARE = 1e-2
 """Step of the numerical derivatives with respect to an actuator, as a fraction of the actuator's range."""
@@ -314,11 +316,13 @@ class AsBuiltBench(Site):
         for kind, values, first, last in zip(kinds, data, ends[:-1], ends[1:], strict=True):
             white = kind.group(values).whitener()
             costs += np.sum((white @ (values - predicted[:, first:last]).T) ** 2, axis=0)
-        modes = [state] if state.converged else []
+        modes, known = [state] if state.converged else [], 0
         for start in states[np.argsort(costs)[:_FOLLOWED]]:
             other = self._estimate(kinds, data, start)
-            if other.converged and all(_apart(other, mode) for mode in modes):
-                modes.append(other)
+            new = other.converged and all(_apart(other, mode) for mode in modes)
+            modes, known = ([*modes, other], 0) if new else (modes, known + 1)
+            if known == _KNOWN:
+                break
         # a state that excludes more readings has a smaller chi-square for this alone
         fewest = min((len(mode.excluded) for mode in modes), default=0)
         modes = [mode for mode in modes if len(mode.excluded) == fewest]
