@@ -21,7 +21,7 @@ from tests.twin.rational_bench import HALF, LOOKS, SIDE, Bench, bench, polynomia
 from twin.framework.artefact import Table
 from twin.framework.data_files import FrameFacts, tiff
 from twin.framework.procedure import BenchError
-from twin.orbit.export.rational_polynomial import PolynomialImage, read_rpc
+from twin.orbit.export.rational_polynomial import PolynomialImage, is_rpc, read_rpc
 
 ADJUST = PROCEDURES["orbit adjust"]
 SIGMA = {"shift": 5.0, "drift": 0.5, "affine": 0.5}
@@ -179,6 +179,17 @@ def test_the_report_states_the_residuals_once_and_has_nothing_empty(tmp_path: Pa
     assert "Weakly observable combinations" not in [section.title for section in report.sections]
 
 
+def test_ground_points_without_image_points_are_named(tmp_path: Path) -> None:
+    one = bench({"shift": 5.0}, points=1)
+    file = one.write(tmp_path, {"shift": [5.0, 5.0]}, 1)
+    table = tmp_path / "ground.csv"
+    table.write_text(table.read_text().replace("p0", "P0"))
+    with pytest.raises(InputError, match="no image point of these ground points; found 'P0'"):
+        adjusted(file)
+    report = ADJUST.report(adjusted(one.write(tmp_path, {"shift": [5.0, 5.0]})))
+    assert not any("Relative to the mean" in text for text in (report.verdict, *report.lead))
+
+
 def test_the_terminal_names_what_it_exported(tmp_path: Path) -> None:
     file = bench({"shift": 5.0}).write(tmp_path, {"shift": [5.0, 5.0]}, 3)
     result = invoke(command.app, "adjust", file, "--out", tmp_path / "run", "--export", tmp_path / "out")
@@ -254,6 +265,7 @@ def rpb(model: RationalPolynomial) -> str:
 def test_polynomials_of_a_file_rpb(tmp_path: Path) -> None:
     model, path = polynomial((0.1, 0.2)), tmp_path / "a.RPB"
     path.write_text(rpb(model))
+    assert is_rpc(path)
     found = read_rpc(path)
     for name in ("offset", "scale", "line_numerator", "line_denominator", "sample_numerator", "sample_denominator"):
         assert np.array_equal(getattr(found, name), getattr(model, name)), name

@@ -25,7 +25,7 @@ from twin.orbit.block.rational_block import IMAGE_POINTS
 from twin.orbit.export.rational_polynomial import PolynomialImage
 from twin.orbit.flight.earth import Earth
 from twin.orbit.images.simulate_run import MATCHED
-from twin.orbit.matching.surface import Surface, _displacements, _fused, _ranges, surface
+from twin.orbit.matching.surface import Surface, _displacements, _frame, _fused, _ranges, _side, _View, surface
 
 MATCH, ADJUST = PROCEDURES["orbit match"], PROCEDURES["orbit adjust"]
 SIDE = 360
@@ -277,6 +277,25 @@ def test_sigmas_hold_at_steps_and_in_weak_texture(landscape: Landscape, monkeypa
     # the middle image looks down and the other aslant: tiles reach as far as either sees
     inner = tiled.height[20 : shape[0] - 20, 20 : shape[1] - 20]
     assert np.isfinite(inner).mean() > 0.9
+
+
+def test_tiles_fit_into_the_memory(landscape: Landscape, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Tables of all displacements of all pixels grow with tiles and with the range of heights."""
+    frames = {name: (np.zeros((SIDE, SIDE)), landscape.images[name]) for name in ("first", "third")}
+    monkeypatch.setenv("TWIN_MEMORY", "300 MB")
+    with pytest.raises(BenchError, match=r"matching between -800 and 1600 m needs .* GB of memory") as error:
+        surface(frames, (-800.0, 1600.0), GRID)
+    assert error.value.key == ("heights",)
+    views = [_View(*frame, "EPSG:32631") for frame in frames.values()]
+    middle = views[0].ground(np.full(2, 0.5 * SIDE), 400.0)
+    monkeypatch.setenv("TWIN_MEMORY", "20 GB")
+    for spacing, heights in ((0.5, (380.0, 420.0)), (8.0, (380.0, 420.0)), (0.5, (-100.0, 900.0))):
+        spec = SurfaceSpec.model_validate({"spacing": f"{spacing} m"})
+        side = _side(views[0], views[1], np.stack([middle, middle]), heights, spec)
+        assert (side == 800) == (spacing < 1.0 and heights[0] > 0.0)
+        frame = _frame(views[0], views[1], middle, np.full(2, side * spacing), heights)
+        assert 4.0 * frame.rows * frame.columns * 2.0 * frame.most < 4.5e9
+        assert side * spacing > 60.0
 
 
 def test_contradicting_pairs_have_no_height_and_shared_images_count_once() -> None:

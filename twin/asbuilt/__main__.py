@@ -17,9 +17,9 @@ app = program(cls=unnamed(lambda args: "estimate"), no_args_is_help=True)
 def main() -> None:
     """Estimate the as-built state of an instrument from all measurements on it.
 
-    The measurements are wavefronts, foci, distortion, MTF, monitor spots, lines of sight, temperatures and positions.
-    The state is the position, shape and temperature of its bodies against the drawing. The report predicts the image
-    quality and the actuator move that would improve it.
+    The measurements are wavefronts, images of stars, foci, distortion, MTF, monitor spots, lines of sight, temperatures
+    and positions. The state is the position, shape and temperature of its bodies against the drawing, and terms of the
+    wavefront. The report predicts the image quality and the actuator move that would improve it.
 
     `python -m twin.asbuilt FILE` is `python -m twin.asbuilt estimate FILE`.
 

@@ -75,6 +75,11 @@ _REACHED = 0.5
 _ANOTHER = 3.0
 """Distance of two estimates in posterior standard deviations from which they are different states."""
 
+_TRIED, _FOLLOWED, _KNOWN = 500, 12, 4
+"""Number of states of the prior that are compared with values of MTF, of the best ones, where estimates start, and of
+starts that find nothing new one after the other, which end the search.
+"""
+
 _SHARE = 1e-2
 """Step of the numerical derivatives with respect to an actuator, as a fraction of the actuator's range."""
 
@@ -271,7 +276,8 @@ class AsBuiltBench(Site):
         """Estimate the parameters as ``estimate`` does, and other states that explain the readings, the best first.
 
         Images of stars in one focus hardly depend on the sign of even aberrations. A second estimate therefore starts
-        at the state whose even aberrations are reversed; it is returned where it converges to another state.
+        at the state whose even aberrations are reversed; it is returned where it converges to another state. Values of
+        MTF are the same at several foci, so that estimates start from many states.
         """
         kinds = tuple(kind.about(values) for kind, values in zip(self.kinds, data, strict=True))
         if start is None and any(isinstance(kind, ImageReadings) for kind in kinds):
@@ -279,7 +285,8 @@ class AsBuiltBench(Site):
         state = self._estimate(kinds, data, start)
         expecting = [kind.expecting(self.view(state.mean[None], after)) for kind, after in self._pairs(kinds)]
         if not any(expecting):
-            return (state,)
+            search = start is None and any(isinstance(kind, MtfReadings) for kind in kinds)
+            return self._modes(kinds, data, state) if search else (state,)
         # the noise of light that is expected, in place of that of the light that was recorded
         kinds = tuple(other or kind for kind, other in zip(kinds, expecting, strict=True))
         state = self._estimate(kinds, data, state.mean)
@@ -290,9 +297,36 @@ class AsBuiltBench(Site):
             other = self._estimate(kinds, data, mirrored)
         except InputError:
             return (state,)
-        if not other.converged or np.linalg.norm(np.linalg.solve(state.root, other.unit - state.unit)) < _ANOTHER:
+        if not other.converged or not _apart(other, state):
             return (state,)
         return tuple(sorted((state, other), key=lambda mode: -mode.log_evidence))
+
+    def _modes(
+        self, kinds: Sequence[MeasuredKind], data: Sequence[np.ndarray], state: StateEstimate
+    ) -> tuple[StateEstimate, ...]:
+        """Return an estimate and others from starts all over the prior, each state once, the most probable first.
+
+        An MTF is the same at several foci, so that an estimate from one start may end in a wrong one.
+        """
+        prior = self.parameters.prior
+        unit = np.random.default_rng(0).standard_normal((_TRIED, prior.root.shape[1]))
+        states = prior.mean + unit @ prior.root.T
+        predicted, ends = self._predicted(states, kinds, self.afters), np.cumsum([0, *map(len, data)])
+        costs = np.zeros(_TRIED)
+        for kind, values, first, last in zip(kinds, data, ends[:-1], ends[1:], strict=True):
+            white = kind.group(values).whitener()
+            costs += np.sum((white @ (values - predicted[:, first:last]).T) ** 2, axis=0)
+        modes, known = [state] if state.converged else [], 0
+        for start in states[np.argsort(costs)[:_FOLLOWED]]:
+            other = self._estimate(kinds, data, start)
+            new = other.converged and all(_apart(other, mode) for mode in modes)
+            modes, known = ([*modes, other], 0) if new else (modes, known + 1)
+            if known == _KNOWN:
+                break
+        # a state that excludes more readings has a smaller chi-square for this alone
+        fewest = min((len(mode.excluded) for mode in modes), default=0)
+        modes = [mode for mode in modes if len(mode.excluded) == fewest]
+        return tuple(sorted(modes, key=lambda mode: -mode.log_evidence)) or (state,)
 
     def star_images(self, data: Sequence[np.ndarray], state: StateEstimate) -> tuple[StarResidual, ...]:
         """Return measured and predicted images of all stars in an estimated state."""
@@ -480,6 +514,10 @@ class AsBuiltBench(Site):
     def actuator_steps(self) -> np.ndarray:
         """Steps of the numerical derivatives with respect to C actuators, (C,), SI units."""
         return _SHARE * np.array([spec.range_si or 1.0 for spec in self.test.actuators.values()])
+
+
+def _apart(first: StateEstimate, second: StateEstimate) -> bool:
+    return bool(np.linalg.norm(np.linalg.solve(second.root, first.unit - second.unit)) > _ANOTHER)
 
 
 def nan_where_lost(

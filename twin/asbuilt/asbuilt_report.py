@@ -10,7 +10,6 @@ from matplotlib.figure import Figure
 from optics.numerics.number_tree import FrozenMap
 from twin.asbuilt.asbuilt_run import ALONG, AsBuiltRun, MeritPrediction, motions, moves_plain, responses
 from twin.asbuilt.built_instrument import CORRELATION, POSTERIOR, instrument_text, posterior_files
-from twin.asbuilt.measured_kinds import field_text
 from twin.asbuilt.star_images import STAR, StarResidual
 from twin.framework.artefact import (
     CameraFile,
@@ -285,7 +284,7 @@ def _image_sections(run: AsBuiltRun) -> tuple[Section, ...]:
     shown = [image for image in run.images if image in images]
     with look("asbuilt"):
         figure = to_svg(_image_figure(shown))
-    stars = {f"{image.measurement} {field_text(image.field)}": STAR(image) for image in run.images}
+    stars = {image.name: STAR(image) for image in run.images}
     caption = "Outside: light beyond the cut-out; seeing: full width at half maximum; p: as for the measurements."
     table = STAR.table("star_images", "Stars", caption, stars, STAR.headed, "star")
     text = "Images of stars, the prediction in the estimated state, and their difference in standard deviations."

@@ -226,11 +226,12 @@ def drawn_states(modes: Sequence[StateEstimate], rng: np.random.Generator, count
 def _mode_warnings(modes: Sequence[StateEstimate]) -> list[str]:
     if len(modes) == 1 or probabilities(modes)[1] < FALSE_ALARM:
         return []
+    first, second = (mode.whole.chi_square for mode in modes[:2])
     return [
-        "images do not determine the sign of even aberrations: a state with the opposite sign explains them as well "
-        f"(chi-square {modes[1].whole.chi_square:.0f} instead of {modes[0].whole.chi_square:.0f}, p = "
-        f"{probabilities(modes)[1]:.2g}). Merits include both; motions, move and files are those of the more "
-        "probable state. Images in a second focus decide"
+        "another state, such as one with the opposite sign of even aberrations or another focus, explains the "
+        f"measurements as well (chi-square {second:.0f} instead of {first:.0f}, p = {probabilities(modes)[1]:.2g}). "
+        "Merits include all such states; motions, move and files are those of the most probable one. Measurements in a "
+        "second focus decide"
     ]
 
 
@@ -259,7 +260,7 @@ def require_consistency(bench: AsBuiltBench, state: StateEstimate) -> None:
         f"the measurements contradict each other: their residuals are {ratio:.0f} standard deviations on average, and "
         "this one fits worst",
         key,
-        allowed="its true standard deviation, fields, sign and orientation; `camtwin asbuilt-check` tries orientations",
+        allowed="its true standard deviation, fields, sign and orientation (of wavefronts: `camtwin asbuilt check`)",
     )
 
 

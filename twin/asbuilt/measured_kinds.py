@@ -228,6 +228,14 @@ def field_text(field: tuple[float, float]) -> str:
     return f"({field[0]:g}, {field[1]:g})"
 
 
+def field_texts(fields: Sequence[tuple[float, float]]) -> tuple[str, ...]:
+    """Return field points as different texts; those of a field that was measured several times are numbered."""
+    texts = [field_text(field) for field in fields]
+    return tuple(
+        text if texts.count(text) == 1 else f"{text} no. {texts[: k + 1].count(text)}" for k, text in enumerate(texts)
+    )
+
+
 class WavefrontReadings(MeasuredKind):
     """Measured Zernike terms of wavefronts at field points, metres rms, orthonormal over the illuminated pupil."""
 
@@ -240,8 +248,8 @@ class WavefrontReadings(MeasuredKind):
         self.beams = self.site.beams(spec.fields)
         terms = spec.numbers
         self.rows = self.beams.zernike_rows(terms[-1])[:, terms[0] - 1 :]
-        self.labels = tuple(f"{field_text(field)} Z{j}" for field in spec.fields for j in terms)
-        self.blocks = tuple(f"field {field_text(field)}" for field in spec.fields for _ in terms)
+        self.labels = tuple(f"{text} Z{j}" for text in field_texts(spec.fields) for j in terms)
+        self.blocks = tuple(f"field {text}" for text in field_texts(spec.fields) for _ in terms)
 
     def predict(self, view: View) -> np.ndarray:
         """Return the Zernike terms of every state, field after field, metres rms."""
@@ -289,7 +297,7 @@ class FocusReadings(MeasuredKind):
         self.fields = self.spec.fields if self.spec.fields is not None else self._from_file[0]
         self.beams = self.site.beams(self.fields)
         self.rows = self.beams.focus_rows()
-        self.labels = tuple(field_text(field) for field in self.fields)
+        self.labels = field_texts(self.fields)
         self.blocks = tuple(f"field {text}" for text in self.labels)
 
     def predict(self, view: View) -> np.ndarray:
@@ -333,10 +341,9 @@ class MtfReadings(MeasuredKind):
         asked = MeritSpec(kind="mtf", fields=spec.fields, frequency=spec.frequency, at_least=0.0)
         self.tried = self.site.bench({self.name: asked})
         self.plane = focal_plane_body(f"{BASE}/{self.site.camera}")
-        self.labels = tuple(
-            f"{field_text(field)} {direction}" for field in spec.fields for direction in ("line", "track")
-        )
-        self.blocks = tuple(f"field {field_text(field)}" for field in spec.fields for _ in range(2))
+        texts = field_texts(spec.fields)
+        self.labels = tuple(f"{text} {direction}" for text in texts for direction in ("line", "track"))
+        self.blocks = tuple(f"field {text}" for text in texts for _ in range(2))
 
     def predict(self, view: View) -> np.ndarray:
         """Return the MTF of each field and direction in every state."""

@@ -18,7 +18,7 @@ from optics.waves.edge_shadow import IlluminatedStop
 from optics.waves.pupil_terms import orders, products, slopes
 from optics.waves.star_image import StarImage, StarPupil
 from scenes.specs import asbuilt as specs
-from twin.asbuilt.measured_kinds import MeasuredKind, View, field_text
+from twin.asbuilt.measured_kinds import MeasuredKind, View, field_texts
 from twin.asbuilt.star_readings import FWHM, StarFit, StarReading, centroid
 from twin.camera.varied_beams import BeamLight, VariedBeams
 from twin.framework.record import Quantity, Record
@@ -92,10 +92,9 @@ class ImageReadings(MeasuredKind):
         self.along = [matrix @ self.beams.solve for matrix in slopes(self.beams.nodes, self.beams.degree)]
         self.stars = tuple(self._expected(number, typical) for number in range(len(self.pupils)))
         rows, columns = self.shape
-        self.labels = tuple(
-            f"{field_text(field)} pixel {r} {c}" for field in spec.fields for r in range(rows) for c in range(columns)
-        )
-        self.blocks = tuple(f"star {field_text(field)}" for field in spec.fields for _ in range(rows * columns))
+        texts = field_texts(spec.fields)
+        self.labels = tuple(f"{text} pixel {r} {c}" for text in texts for r in range(rows) for c in range(columns))
+        self.blocks = tuple(f"star {text}" for text in texts for _ in range(rows * columns))
 
     def _expected(self, number: int, blur: float) -> StarReading:
         """Return the image of a star before the measurement, as the nominal camera makes it."""
@@ -215,6 +214,9 @@ class ImageReadings(MeasuredKind):
             raise self.wrong(text, "file", "one page for each field, in their order", str(path))
         limit = header.full_scale if spec.saturation is None else spec.saturation
         linear = np.where(pages >= limit, np.nan, pages.astype(np.float64)) * spec.gain
+        for k, page in enumerate(linear):
+            if len(np.unique(page[np.isfinite(page)])) < 2:
+                raise self.wrong("a page without a star", "file", "different values below saturation", f"page {k}")
         return np.stack([orientation.values(page) for page in linear])
 
     def read(self) -> np.ndarray:
@@ -223,8 +225,8 @@ class ImageReadings(MeasuredKind):
 
     def residuals(self, view: View) -> list[StarResidual]:
         """Return measured and predicted images of all stars in the estimated state."""
-        triples = zip(self.spec.fields, self.stars, self.fits(view), strict=True)
-        return [StarResidual(self.name, field, star, fit) for field, star, fit in triples]
+        stars = zip(field_texts(self.spec.fields), self.spec.fields, self.stars, self.fits(view), strict=True)
+        return [StarResidual(f"{self.name} {text}", self.name, *star) for text, *star in stars]
 
 
 @dataclass(frozen=True, eq=False)
@@ -233,6 +235,8 @@ class StarResidual:
 
     Attributes
     ----------
+    name : str
+        Name of the measurement and field of the star, different for each star.
     measurement : str
         Name of the measurement.
     field : tuple of float
@@ -243,6 +247,7 @@ class StarResidual:
         Prediction.
     """
 
+    name: str
     measurement: str
     field: tuple[float, float]
     star: StarReading
@@ -278,7 +283,7 @@ class StarResidual:
 
     def warnings(self) -> list[str]:
         """Return warnings on a star that fits badly, is cut or is saturated."""
-        out, name = [], f"{self.measurement}: the star at {field_text(self.field)}"
+        out, name = [], f"{self.measurement}: the star at {self.name.removeprefix(f'{self.measurement} ')}"
         if not self.test.passes():
             ratio = f"chi-square {self.chi_square_per_degree:.2f} per degree of freedom"
             out.append(f"{name} does not have the predicted image: {ratio}")
@@ -289,7 +294,7 @@ class StarResidual:
             out.append(f"{name} lies at the edge of its cut-out")
         lost = int(np.sum(~np.isfinite(self.star.variance)))
         if lost:
-            out.append(f"{name} has {lost} saturated pixels, which are not used")
+            out.append(f"{name} has {lost} pixels at saturation or without a value, which are not used")
         return out
 
 

@@ -135,10 +135,11 @@ class StarReading:
         """Return the position at which the model's centroid is that of the recorded light, (2,), pixels."""
         assert self.counts is not None
         used = np.isfinite(self.variance)
-        border = np.ones_like(used)
+        border = used.copy()
         border[1:-1, 1:-1] = False
-        light = self.counts - np.median(self.counts[border & used])
-        light = np.where(used & (light > _FAINT * np.sqrt(np.median(self.variance[border & used]))), light, 0.0)
+        border = border if np.any(border) else used
+        light = self.counts - np.median(self.counts[border])
+        light = np.where(used & (light > _FAINT * np.sqrt(np.median(self.variance[border]))), light, 0.0)
         position = np.asarray(self.first.position, np.float64)
         model = self.image.pixels(irradiance, position, blur)
         return position + centroid(light) - centroid(np.maximum(model, 0.0))

@@ -56,14 +56,16 @@ def _verdict(run: BlockRun) -> tuple[str, tuple[str, ...]]:
         largest = max(observed.ce90 / predicted.ce90, observed.le90 / predicted.le90)
         if largest < _FAR_BELOW:
             checked += f", at most {largest:.1g} of the prediction, which covers errors common to all points"
-    relative = float(np.median(run.relative_height_sigma))
+    relative = run.relative_height_sigma
     control = "with" if "control" in run.used else "without"
     return answer(
         f"{control} ground control, predicted 90% errors at {where} are {predicted.ce90:.2f} m in plan and"
         f" {predicted.le90:.2f} m in height{checked}",
         contribution,
-        f"relative to the mean height of all points, σ of a height is {relative:.2g} m in the median: errors that all"
-        " points share do not count",
+        f"relative to the mean height of all points, σ of a height is {np.median(relative):.2g} m in the median: errors"
+        " that all points share do not count"
+        if len(relative) > 1
+        else "",
         _residuals_text(run.adjustment),
     )
 

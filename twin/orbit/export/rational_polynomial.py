@@ -139,7 +139,7 @@ def read_rpc(path: str | Path) -> RationalPolynomial:
 
 
 def is_rpc(path: Path) -> bool:
-    """Return True if a file holds rational polynomials alone: NAME_RPC.TXT, a GeoTIFF, or the RPC file of DIMAP.
+    """Return True if a file holds rational polynomials alone: NAME_RPC.TXT, NAME.RPB, GeoTIFF, RPC file of DIMAP.
 
     Raises
     ------
@@ -147,7 +147,7 @@ def is_rpc(path: Path) -> bool:
         The file is XML that cannot be read.
     """
     match path.suffix.lower():
-        case ".tif" | ".tiff" | ".txt":
+        case ".tif" | ".tiff" | ".txt" | ".rpb":
             return True
         case ".xml":
             return bool(read_xml(path, _WHAT).all("Rational_Function_Model"))

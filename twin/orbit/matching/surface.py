@@ -19,19 +19,21 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import combinations
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from twin.framework.memory import amount_text, free_memory, largest
 from twin.framework.procedure import Advance, BenchError, silent
 from twin.orbit.export.rational_polynomial import PolynomialImage
 
 if TYPE_CHECKING:
     from scenes.specs.orbit.rational import SurfaceSpec
 
-_TILE = 800
-"""Side of a tile in cells of the grid, which limits the memory."""
+_TILE, _MEMORY = 800, 2e9
+"""Largest side of a tile in cells of the grid, and memory of its matching in bytes, where a range of heights allows it.
+"""
 _MOST_CELLS = 1e8
 """Largest number of cells of a grid."""
 _LEAST_PARALLAX = 0.02
@@ -221,11 +223,12 @@ def surface(
     if shape[0] * shape[1] > _MOST_CELLS:
         problem = f"a grid of {shape[0]} x {shape[1]} cells is too large"
         raise BenchError(problem, ("surface", "spacing"), f"at most {_MOST_CELLS:.0e} cells: a larger spacing")
+    sides = {(a, b): _side(views[a], views[b], np.array(ends), heights, spec) for (a, b), ends in pairs.items()}
     grids, sigmas, steps = {}, {}, {}
     for k, (a, b) in enumerate(pairs):
         advance("surface", k, len(pairs))
         grid, step, variance, count = np.full(shape, np.nan), np.full(shape, np.nan), 0.0, 0
-        for rows, columns in _tiles(shape):
+        for rows, columns in _tiles(shape, sides[a, b]):
             box = np.array(
                 [
                     [west + columns.start * spec.spacing, north - rows.stop * spec.spacing],
@@ -259,11 +262,64 @@ def _border(shape: tuple[int, ...]) -> np.ndarray:
     return np.stack(np.meshgrid(lines, samples, indexing="ij"), axis=-1).reshape(-1, 2)
 
 
-def _tiles(shape: tuple[int, int]) -> Iterator[tuple[slice, slice]]:
+def _tiles(shape: tuple[int, int], side: int) -> Iterator[tuple[slice, slice]]:
     """Yield rows and columns of the tiles of a grid."""
-    for row in range(0, shape[0], _TILE):
-        for column in range(0, shape[1], _TILE):
-            yield slice(row, min(row + _TILE, shape[0])), slice(column, min(column + _TILE, shape[1]))
+    for row in range(0, shape[0], side):
+        for column in range(0, shape[1], side):
+            yield slice(row, min(row + side, shape[0])), slice(column, min(column + side, shape[1]))
+
+
+def _side(first: _View, second: _View, box: np.ndarray, heights: tuple[float, float], spec: SurfaceSpec) -> int:
+    """Return the side of a pair's tiles, in cells; raise BenchError where the memory does not suffice for its heights.
+
+    The matcher has two tables of 16 bits with all displacements of each pixel, and of columns as wide as these.
+    """
+
+    def memory(cells: int) -> float:
+        frame = _frame(first, second, box.mean(axis=0), np.full(2, cells * spec.spacing), heights)
+        assert frame is not None
+        span = _span(frame.most)
+        return 4.0 * frame.rows * (frame.columns + span) * span
+
+    # wide ranges of heights need much for tiles of any size
+    allowed = max(_MEMORY, 1.5 * memory(0))
+    side = largest(lambda cells: memory(cells) <= allowed, _TILE + 1, 1)
+    if memory(side) > free_memory():
+        problem = f"matching between {heights[0]:g} and {heights[1]:g} m needs {amount_text(memory(side))} of memory"
+        raise BenchError(problem, ("heights",), f"{amount_text(free_memory())} are free: a narrower range of heights")
+    return side
+
+
+class _Frame(NamedTuple):
+    """Plane coordinates of a tile: axes (2, 2) along and across the parallax, and numbers of their pixels.
+
+    `ratio` is that of parallax and height, `pixel` in metres, and `most` the largest displacement in pixels.
+    """
+
+    axes: np.ndarray
+    ratio: float
+    pixel: float
+    columns: int
+    rows: int
+    most: int
+
+
+def _frame(
+    first: _View, second: _View, centre: np.ndarray, size: np.ndarray, heights: tuple[float, float]
+) -> _Frame | None:
+    """Return the frame of a tile about a point, of a size east and north (2,), in metres; None without parallax."""
+    middle, half = 0.5 * (heights[0] + heights[1]), 0.5 * (heights[1] - heights[0])
+    slope = _parallax(first, second, centre, middle)
+    ratio = float(np.hypot(*slope))
+    if not ratio > _LEAST_PARALLAX:
+        return None
+    along = slope / ratio
+    axes = np.stack([along, [-along[1], along[0]]])
+    pixel = _pixel(first, centre, middle)
+    # the images see ground at the ends of the range of heights this far from where it lies
+    lean = half * max(float(np.hypot(*_lean(view, centre, middle))) for view in (first, second))
+    columns, rows = np.ceil((np.abs(axes) @ size + 2.0 * lean + 2.0 * _BLOCK * pixel) / pixel).astype(int).tolist()
+    return _Frame(axes, ratio, pixel, columns, rows, int(np.ceil(ratio * half / pixel)) + 1)
 
 
 def _parallax(first: _View, second: _View, place: np.ndarray, height: float) -> np.ndarray:
@@ -293,25 +349,16 @@ def _tile(
     spec : SurfaceSpec
         Grid and accuracy of the matching.
     """
-    middle, half = 0.5 * (heights[0] + heights[1]), 0.5 * (heights[1] - heights[0])
-    centre = box.mean(axis=0)
-    slope = _parallax(first, second, centre, middle)
-    ratio = float(np.hypot(*slope))
-    if not ratio > _LEAST_PARALLAX:
+    middle, centre = 0.5 * (heights[0] + heights[1]), box.mean(axis=0)
+    frame = _frame(first, second, centre, box[1] - box[0], heights)
+    if frame is None:
         return None
-    along = slope / ratio
-    axes = np.stack([along, [-along[1], along[0]]])
-    pixel = _pixel(first, centre, middle)
-    # the images see ground at the ends of the range of heights this far from where it lies
-    lean = half * max(float(np.hypot(*_lean(view, centre, middle))) for view in (first, second))
-    size = np.abs(axes) @ (box[1] - box[0]) + 2.0 * lean + 2.0 * _BLOCK * pixel
-    columns, rows = np.ceil(size / pixel).astype(int).tolist()
+    axes, ratio, pixel, columns, rows, most = frame
     x, y = (pixel * (np.arange(n) - 0.5 * (n - 1)) for n in (columns, rows))
     place = centre + np.stack(np.meshgrid(x, y), axis=-1) @ axes
     left, right = (view.resampled(place, middle) for view in (first, second))
     if not (np.isfinite(left).any() and np.isfinite(right).any()):
         return None
-    most = int(np.ceil(ratio * half / pixel)) + 1
     displacement = _displacements(left, right, most)
     to_height, to_place = _geometry(first, second, centre, axes, x, y, heights)
     where = np.argwhere(np.isfinite(displacement))
@@ -348,7 +395,7 @@ def _displacements(first: np.ndarray, second: np.ndarray, most: int) -> np.ndarr
     from scipy.ndimage import minimum_filter
 
     seen = [_eight_bits(one) for one in (first, second)]
-    span = 16 * int(np.ceil((2 * most + 1) / 16))
+    span = _span(most)
     found = []
     for left, right in (seen, [one[:, ::-1] for one in seen[::-1]]):
         # columns beyond the image, so that its border has all displacements
@@ -374,6 +421,11 @@ def _displacements(first: np.ndarray, second: np.ndarray, most: int) -> np.ndarr
     whole, whole_second = (minimum_filter(np.isfinite(one), _CORRELATED, mode="constant") for one in (first, second))
     alike = _correlation(first, second[rows, at]) >= _LEAST_CORRELATION
     return np.where(agrees & whole & whole_second[rows, at] & alike, there, np.nan)
+
+
+def _span(most: int) -> int:
+    """Return the number of displacements that OpenCV tries: a multiple of 16."""
+    return 16 * int(np.ceil((2 * most + 1) / 16))
 
 
 def _correlation(first: np.ndarray, second: np.ndarray) -> np.ndarray:
