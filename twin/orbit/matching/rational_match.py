@@ -14,6 +14,7 @@ from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from pyproj import CRS
 from pyproj.exceptions import CRSError
 
 from analysis.matching.correlation import MatchOptions, Reason, distinct_points, resampled, search
@@ -31,7 +32,7 @@ from twin.orbit.matching.surface import Surface, surface
 from twin.orbit.measured.measurement_tables import csv_text
 
 if TYPE_CHECKING:
-    from scenes.specs.orbit.rational import RationalPointsSpec
+    from scenes.specs.orbit.rational import RationalPointsSpec, SurfaceSpec
     from scenes.specs.orbit.setup import RationalMatchSetup
 
 _ITERATIONS = 3
@@ -112,6 +113,8 @@ def run_rational_match(setup: RationalMatchSetup, advance: Advance = silent) -> 
         No two images have common points.
     """
     spec = setup.test
+    if spec.surface is not None and spec.surface.crs is not None:
+        _require_metres(spec.surface)
     frames = {}
     for name, image in spec.images.items():
         frames[name] = Frame(read_pixels(image, None, len(spec.images)), read_image(image))
@@ -130,11 +133,19 @@ def run_rational_match(setup: RationalMatchSetup, advance: Advance = silent) -> 
     grid = None
     if spec.surface is not None:
         images = {name: (frame.values, frame.image) for name, frame in frames.items()}
-        try:
-            grid = surface(images, spec.heights, spec.surface, advance)
-        except CRSError as error:
-            raise spec.surface.error("not a coordinate reference system", ("crs",), found=spec.surface.crs) from error
+        grid = surface(images, spec.heights, spec.surface, advance)
     return RationalMatch(setup, FrozenMap(points), grid)
+
+
+def _require_metres(spec: SurfaceSpec) -> None:
+    """Raise InputError if the system of a grid is unknown, or its coordinates are not metres in a plane."""
+    try:
+        crs = CRS(spec.crs)
+    except CRSError as error:
+        raise spec.error("not a coordinate reference system", ("crs",), found=spec.crs) from error
+    if not crs.is_projected or any(axis.unit_conversion_factor != 1.0 for axis in crs.axis_info[:2]):
+        allowed = "a projected coordinate reference system in metres, such as EPSG:32631"
+        raise spec.error("coordinates that are not metres", ("crs",), found=spec.crs, allowed=allowed)
 
 
 def _points_of(
