@@ -328,6 +328,13 @@ def test_a_grid_of_another_system_is_refused(tmp_path: Path) -> None:
             MATCH.resolve(file)
 
 
+@pytest.mark.parametrize("crs", ["EPSG:4326", "EPSG:2263", "EPSG:1"])
+def test_a_grid_that_is_not_in_metres_is_refused(folder: Path, crs: str) -> None:
+    """Degrees and feet would count as metres of `spacing`."""
+    with pytest.raises(InputError, match=r"not metres|not a coordinate reference system"):
+        run(MATCH, folder, heights=["360 m", "440 m"], surface={"spacing": "1 m", "crs": crs})
+
+
 @pytest.mark.second
 def test_the_command_exports_and_shows_the_surface(folder: Path) -> None:
     """These polynomials are wrong by pixels: the run says so, and what to do."""

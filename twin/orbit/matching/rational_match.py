@@ -14,6 +14,7 @@ from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from pyproj import CRS
 from pyproj.exceptions import CRSError
 
 from analysis.matching.correlation import MatchOptions, Reason, distinct_points, resampled, search
@@ -31,7 +32,7 @@ from twin.orbit.matching.surface import Surface, surface
 from twin.orbit.measured.measurement_tables import csv_text
 
 if TYPE_CHECKING:
-    from scenes.specs.orbit.rational import RationalPointsSpec
+    from scenes.specs.orbit.rational import RationalPointsSpec, SurfaceSpec
     from scenes.specs.orbit.setup import RationalMatchSetup
 
 _ITERATIONS = 3
@@ -112,6 +113,8 @@ def run_rational_match(setup: RationalMatchSetup, advance: Advance = silent) -> 
         No two images have common points.
     """
     spec = setup.test
+    if spec.surface is not None and spec.surface.crs is not None:
+        _require_metres(spec.surface)
     frames = {}
     for name, image in spec.images.items():
         frames[name] = Frame(read_pixels(image, None, len(spec.images)), read_image(image))
@@ -126,15 +129,23 @@ def run_rational_match(setup: RationalMatchSetup, advance: Advance = silent) -> 
         remedy = (
             "heights of the ground that they show (this range probably does not contain it), images of the same ground"
         )
-        raise BenchError(problem, ("heights",), f"{remedy}, or a larger points.search_radius")
+        raise BenchError(problem, ("heights",), f"{remedy}, or a larger points.reach")
     grid = None
     if spec.surface is not None:
         images = {name: (frame.values, frame.image) for name, frame in frames.items()}
-        try:
-            grid = surface(images, spec.heights, spec.surface, advance)
-        except CRSError as error:
-            raise spec.surface.error("not a coordinate reference system", ("crs",), value=spec.surface.crs) from error
+        grid = surface(images, spec.heights, spec.surface, advance)
     return RationalMatch(setup, FrozenMap(points), grid)
+
+
+def _require_metres(spec: SurfaceSpec) -> None:
+    """Raise InputError if the system of a grid is unknown, or its coordinates are not metres in a plane."""
+    try:
+        crs = CRS(spec.crs)
+    except CRSError as error:
+        raise spec.error("not a coordinate reference system", ("crs",), value=spec.crs) from error
+    if not crs.is_projected or any(axis.unit_conversion_factor != 1.0 for axis in crs.axis_info[:2]):
+        allowed = "a projected coordinate reference system in metres, such as EPSG:32631"
+        raise spec.error("coordinates that are not metres", ("crs",), value=spec.crs, allowed=allowed)
 
 
 def _points_of(
@@ -142,11 +153,11 @@ def _points_of(
 ) -> MatchedPoints:
     """Return distinct points of an image, matched in every other image that shows enough of them."""
     frame = frames[source]
-    border = spec.template // 2 + spec.search_radius
+    border = spec.template // 2 + spec.reach
     if min(frame.values.shape) <= 2 * border + 1:
         shape = " x ".join(str(n) for n in frame.values.shape)
         problem = f"{source}: {shape} pixels have no room for a template of {spec.template} pixels and its search"
-        raise BenchError(problem, ("points",), "a larger image, or a smaller search_radius or template")
+        raise BenchError(problem, ("points",), "a larger image, or a smaller reach or template")
     place = distinct_points(frame.values, spec.tie, spacing=max(0.5 * spec.template, 1.0), border=border)
     count = len(place)
     lines, levels = {source: MatchedLine.chosen(place)}, np.full((len(frames), count), np.nan)
@@ -169,13 +180,13 @@ def _searched(
     middle = np.full(len(place), 0.5 * sum(heights))
     _, rise = _seen(frame, other, place, middle)
     length = np.nanmax(np.linalg.norm(rise, axis=1), initial=0.0)
-    steps = int(np.ceil((heights[1] - heights[0]) * length / spec.search_radius)) + 1
+    steps = int(np.ceil((heights[1] - heights[0]) * length / spec.reach)) + 1
     templates = _templates(frame, other, place, middle, spec.template)
     levels = np.linspace(*heights, steps) if steps > 1 else middle[:1]
     positions, values = np.full((len(levels), len(place), 2), np.nan), np.full((len(levels), len(place)), -1.0)
     for k, level in enumerate(levels.tolist()):
         expected, _ = other.image.seen(frame.image.ground(place, level))
-        peaks = search(other.values, templates, expected, spec.search_radius)
+        peaks = search(other.values, templates, expected, spec.reach)
         found = peaks.reason == Reason.ACCEPTED
         positions[k], values[k] = peaks.position, np.where(found, peaks.value, -1.0)
     best = np.argmax(values, axis=0)
