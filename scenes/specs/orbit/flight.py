@@ -212,7 +212,7 @@ class ElementsSpec(Spec):
     @model_validator(mode="after")
     def _is_complete(self) -> "ElementsSpec":
         if not 0.0 <= self.eccentricity <= 0.1:
-            raise Problem("outside the limits", str(self.eccentricity), "0 to 0.1", within=("eccentricity",))
+            raise Problem("outside the limits", f"{self.eccentricity}", "from 0 to 0.1", None, ("eccentricity",))
         if (self.node is None) == (self.node_local_time is None):
             raise Problem("the node must be given in exactly one way", None, "either node or node_local_time")
         return self
