@@ -148,6 +148,21 @@ def test_energy_of_a_square_is_the_sum_of_its_samples() -> None:
         optics.ensquared_energy(image, step, 30.0)
 
 
+@pytest.mark.parametrize("step", [0.5, 0.3])
+def test_ensquared_energy_of_an_airy_pattern_is_its_integral(step: float) -> None:
+    """Gauss-Legendre's rule over (2 J1(v) / v)^2; an F/100 paraboloid's working F-number differs by 6e-6."""
+    camera = optics.Camera([optics.OpticalSurface(-40.0, -20.0, -1.0, "mirror", diameter=0.2)], 500e-9)
+    unit, halves = 500e-9 * camera.f_number, np.array([0.25, 0.5, 1.0, 2.0, 4.0])
+    node, weight = np.polynomial.legendre.leggauss(100)
+    expected = []
+    for half in halves:
+        x, w = 0.5 * half * (node + 1.0), 0.5 * half * weight
+        v = np.pi * np.hypot(x, x[:, None])
+        expected.append(float(4.0 * w @ (np.pi / 4.0 * (2.0 * j1(v) / v) ** 2) @ w))
+    found = optics.ensquared_energy(optics.psf(camera, step * unit, 65), step * unit, halves * unit)
+    np.testing.assert_allclose(found, expected, atol=1e-5)
+
+
 def test_point_images_of_a_camera_have_the_energy_of_its_pupil(gf7: CameraOptics) -> None:
     images = point_images(gf7)
     assert [psf.field for psf in images.psfs] == list(IMAGE_FIELDS)
