@@ -25,7 +25,7 @@ from twin.camera.camera_optics import CameraOptics
 from twin.camera.camera_plots import images_figure
 from twin.camera.camera_report import first_order_table
 from twin.camera.camera_run import FAN_FIELDS, run_camera
-from twin.camera.camera_view import layout_figure
+from twin.camera.camera_view import layout_figure, section_lines
 from twin.camera.first_order_data import FIRST_ORDER
 
 
@@ -223,3 +223,13 @@ def test_ghosts_of_a_camera_file_are_those_of_its_numbers(backend, gf7: CameraOp
 def test_a_mirror_has_no_reflectance() -> None:
     with pytest.raises(InputError, match="a reflectance is that of a face of a lens"):
         windowed(", reflectance: 98 percent")
+
+
+def test_the_hole_of_a_mirror_is_drawn_open(backend) -> None:
+    """Within its blocking circle of 60 mm no point is drawn; without `holes` the whole section is."""
+    model = CameraOptics.alone(load_camera("ritchey_chretien"), backend).model
+    (hole,) = [edge.shape.radius for edge in model.edges["M1"] if edge.blocks]
+    whole, drawn = (section_lines(model, 1, 401, holes)["M1"] for holes in (False, True))
+    assert np.all(np.isfinite(whole))
+    assert np.array_equal(np.isnan(drawn).any(axis=1), np.abs(whole[:, 1]) < hole)
+    assert np.all(np.isfinite(section_lines(model, 1, 401, True)["M2"]))
