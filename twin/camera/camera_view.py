@@ -570,7 +570,9 @@ def section_lines(model: CameraModel, axis: int, points: int = 80, holes: bool =
         bored = holes and name != IMAGE and not model.spec.mirrors[name].light
         for cut in model.edges.get(name, ()) if bored else ():
             if cut.blocks and isinstance(cut.shape, Circle) and not cut.shape.inner:
-                sag = np.where(np.hypot(x - cut.shape.centre[0], y - cut.shape.centre[1]) < cut.shape.radius, np.nan, sag)
+                sag = np.where(
+                    np.hypot(x - cut.shape.centre[0], y - cut.shape.centre[1]) < cut.shape.radius, np.nan, sag
+                )
         lines[name] = pose.apply(np.stack([x, y, sag], axis=-1))
     return lines
 

@@ -184,8 +184,13 @@ def changed_camera(spec: CameraSpec, values: Mapping[str, float]) -> CameraSpec:
     mirrors, moved, heading = {}, 0.0, 1.0
     for k, (name, mirror) in enumerate(spec.mirrors.items()):
         radius, conic, longer = (values.get(f"{DESIGN}/{name} {key}", 0.0) for key in QUANTITIES)
-        numbers = {"z": mirror.z + moved, "radius": mirror.radius * (1.0 + 0.01 * radius), "conic": mirror.conic + conic}
-        update = {key: float(f"{number:.14g}") for key, number in numbers.items()}  # -950.114 mm, not -950.1139999999999
+        numbers = {
+            "z": mirror.z + moved,
+            "radius": mirror.radius * (1.0 + 0.01 * radius),
+            "conic": mirror.conic + conic,
+        }
+        # -950.114 mm, not -950.1139999999999
+        update = {key: float(f"{number:.14g}") for key, number in numbers.items()}
         mirrors[name] = mirror.model_copy(update=update)
         heading = heading if mirror.light else -heading
         gap = places[k + 1] - places[k]
