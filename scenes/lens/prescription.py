@@ -562,7 +562,7 @@ def first_camera(
         f"stop: {_surface(camera, what.stop)}",
         f"mirrors:                           # {'faces of lenses, ' * what.lenses}in the order of the light",
         *_mirrors(camera, half, bias, aperture),
-        f"image: {{z: {1e3 * camera.vertices[-1]:.15g} mm}}",
+        f"image: {{z: {1e3 * camera.vertices[-1]:.13g} mm}}",
         f"line: {{pixels: {max(pixels, 2)}, pitch: {1e6 * pitch:.6g} um}}",
     ]
     return "\n".join(lines) + "\n"
@@ -598,23 +598,26 @@ def _mirrors(camera: Camera, half: float, bias: float, aperture: float) -> list[
             f"  shadow: {{z: {1e3 * (z[1] - 0.02 * aperture):.10g} mm, radius: flat, light: passes, "
             f"edges: [{{blocks: circle, radius: {1e3 * MARGIN * radius:.5g} mm}}]}}   # of M2 and its mount"
         )
-    hole = _hole(camera, half, aperture) if len(camera.surfaces) == 2 else 0.0
+    hole = _hole(camera, half, bias, aperture) if centred else 0.0
     for k, surface in enumerate(camera.surfaces):
         behind = f"light: refracts, {'glass' if isinstance(surface.material, str) else 'index'}: {surface.material}"
         last = f"conic: {surface.conic:.12g}" if surface.material == MIRROR else behind
         out.append(
-            f"  {_surface(camera, k)}: {{z: {1e3 * z[k]:.15g} mm, radius: {1e3 * surface.radius:.15g} mm, {last}"
+            f"  {_surface(camera, k)}: {{z: {1e3 * z[k]:.13g} mm, radius: {1e3 * surface.radius:.13g} mm, {last}"
             + (f", edges: [{{blocks: circle, radius: {1e3 * hole:.5g} mm}}]}}   # its hole" if hole and not k else "}")
         )
     return out
 
 
-def _hole(camera: Camera, half: float, aperture: float) -> float:
-    """Return the radius of the hole in the first of two mirrors that passes the beams of the field, metres.
+def _hole(camera: Camera, half: float, bias: float, aperture: float) -> float:
+    """Return the radius of the hole in the first mirror that passes the beams of the field from the second, metres.
 
     The chief ray of the field's corner meets the second mirror at the distance times the angle from the axis.
     """
-    focal, (_, second, image) = camera.focal_length, camera.vertices
-    share = -second / (image - second)
-    corner = np.hypot(1.0, FIELD_RATIO) * np.tan(half)
-    return float(MARGIN * (corner * ((1.0 - share) * -second + share * focal) + 0.5 * aperture * image / focal))
+    first, second, gap = camera.surfaces[0], camera.surfaces[1], -camera.vertices[1]
+    before = -0.5 * first.radius - gap  # distance of the first mirror's focus behind the second
+    after = 1.0 / (1.0 / before + 2.0 / second.radius)
+    focal, share = -0.5 * first.radius * after / before, gap / after
+    corner = np.hypot(np.tan(half), np.tan(bias + FIELD_RATIO * half))
+    marginal = 0.5 * aperture * (after - gap) / focal
+    return float(MARGIN * (corner * ((1.0 - share) * gap + share * focal) + marginal))

@@ -19,7 +19,7 @@ from scenes.specs.course import noll
 from scenes.yaml.errors import InputError, Issue, KeyPath, Problem, names_text, nearest, shown, unknown
 from scenes.yaml.spec import ZERO_IS_NONE, Name, Paths, Spec
 from scenes.yaml.unit_fields import Quantity
-from scenes.yaml.units import LENGTH, SCALE, parse_quantity, split_quantity
+from scenes.yaml.units import ANGLE, LENGTH, SCALE, format_quantity, parse_quantity, split_quantity
 
 AXES = {"x": 0, "y": 1, "z": 2}
 KINDS = {
@@ -360,7 +360,11 @@ def _sum(key: str, first: Any, other: Any) -> Any:
         return FrozenMap({**first, **{name: _sum(key, first.get(name), value) for name, value in other.items()}})
     if isinstance(first, tuple):
         return tuple(_sum(key, *pair) for pair in zip(first, other, strict=True))
-    return float(f"{first + other:.15g}")  # 20 um + 3 um are 23 um, without the rounding of floats
+    total, rounding = first + other, 1e-15 * (abs(first) + abs(other))  # 3 + 0.1 arcsec are 3.1 arcsec
+    if abs(total) <= rounding:
+        return 0.0
+    kind = {"shift": LENGTH, "figure": LENGTH, "rotate": ANGLE}.get(key)
+    return parse_quantity(format_quantity(total, kind, rounding), kind) if kind else float(f"{total:.15g}")
 
 
 def _in_words(value: Any) -> Any:

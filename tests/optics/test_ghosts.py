@@ -58,6 +58,48 @@ def test_a_thin_lens_makes_the_ghost_of_its_formula() -> None:
     assert ghost.focus == pytest.approx((n - 1.0) / (3.0 * n - 1.0) * f - f, rel=1e-5)
 
 
+def by_matrices(camera: Camera, back: int, forward: int, detector: float) -> tuple[float, float]:
+    """Return focus from the image plane and strength of a path with two bounces: paraxial (y, n u) and Fresnel.
+
+    Light toward -z has a negative index; a reflection at vertex curvature c has the power -2 n c.
+    """
+    last, image = len(camera.surfaces), camera.vertices[-1]
+    power = [0.0 if np.isinf(s.radius) else 1.0 / s.radius for s in camera.surfaces] + [0.0]
+    index = [1.0, *camera.indices]  # before surface k, and behind the last
+    share = [fresnel(index[k + 1], index[k]) for k in range(last)] + [detector]
+    ray, here, strength, n = np.array([1.0, 0.0]), camera.vertices[0], 1.0, 1.0
+    there_and_back = [*range(back), back, *range(back - 1, forward, -1), forward, *range(forward + 1, last)]
+    passed: set[int] = set()
+    for step, k in enumerate(there_and_back):
+        ray = np.array([ray[0] + (camera.vertices[k] - here) / n * ray[1], ray[1]])
+        here, turns = camera.vertices[k], step in (back, 2 * back - forward)
+        if turns:
+            after, strength = -n, strength * share[k]
+        else:
+            after = index[k + 1] if n > 0.0 else -index[k]
+            strength *= 1.0 - share[k] if k in passed else 1.0  # the image's light passes it once as well
+            passed.add(k)
+        ray, n = np.array([ray[0], ray[1] - (after - n) * power[k] * ray[0]]), after
+    return float(here - n * ray[0] / ray[1] - image), strength
+
+
+def test_every_pair_of_a_singlet_and_a_window_has_the_focus_and_strength_of_its_matrices() -> None:
+    """Four surfaces and the detector, at F/100, where Fresnel's formulas at the rays' angles differ by 1e-4."""
+    lens = [OpticalSurface(0.6, 0.006, material=1.5168, diameter=0.005), OpticalSurface(-0.5, 0.3)]
+    window = [OpticalSurface(thickness=0.004, material=1.7), OpticalSurface(thickness=0.05)]
+    camera = Camera([*lens, *window], WAVE).refocused()
+    found = {(g.back, g.forward): g for g in optics.ghosts(camera, detector=0.2)}
+    last, compared = len(camera.surfaces), 0
+    for forward, back in combinations(range(last + 1), 2):
+        ghost = found["image" if back == last else f"s{back}", f"s{forward}"]
+        focus, strength = by_matrices(camera, back, forward, 0.2)
+        assert ghost.focus == pytest.approx(focus, rel=1e-6)
+        if forward:  # the lens's front, the stop, cuts what comes back to it
+            assert ghost.energy == pytest.approx(strength, rel=1e-3)
+            compared += 1
+    assert compared == 6
+
+
 def test_strength_of_coatings_and_of_the_detector() -> None:
     """By hand: two reflections, and two more passes through every face between them."""
     window = [OpticalSurface(thickness=-0.006, material=1.5), OpticalSurface(thickness=-0.2)]

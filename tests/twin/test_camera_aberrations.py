@@ -25,7 +25,7 @@ from twin.camera.camera_optics import CameraOptics
 from twin.camera.camera_plots import images_figure
 from twin.camera.camera_report import first_order_table
 from twin.camera.camera_run import FAN_FIELDS, run_camera
-from twin.camera.camera_view import layout_figure
+from twin.camera.camera_view import layout_figure, section_lines
 from twin.camera.first_order_data import FIRST_ORDER
 
 
@@ -148,6 +148,21 @@ def test_energy_of_a_square_is_the_sum_of_its_samples() -> None:
         optics.ensquared_energy(image, step, 30.0)
 
 
+@pytest.mark.parametrize("step", [0.5, 0.3])
+def test_ensquared_energy_of_an_airy_pattern_is_its_integral(step: float) -> None:
+    """Gauss-Legendre's rule over (2 J1(v) / v)^2; an F/100 paraboloid's working F-number differs by 6e-6."""
+    camera = optics.Camera([optics.OpticalSurface(-40.0, -20.0, -1.0, "mirror", diameter=0.2)], 500e-9)
+    unit, halves = 500e-9 * camera.f_number, np.array([0.25, 0.5, 1.0, 2.0, 4.0])
+    node, weight = np.polynomial.legendre.leggauss(100)
+    expected = []
+    for half in halves:
+        x, w = 0.5 * half * (node + 1.0), 0.5 * half * weight
+        v = np.pi * np.hypot(x, x[:, None])
+        expected.append(float(4.0 * w @ (np.pi / 4.0 * (2.0 * j1(v) / v) ** 2) @ w))
+    found = optics.ensquared_energy(optics.psf(camera, step * unit, 65), step * unit, halves * unit)
+    np.testing.assert_allclose(found, expected, atol=1e-5)
+
+
 def test_point_images_of_a_camera_have_the_energy_of_its_pupil(gf7: CameraOptics) -> None:
     images = point_images(gf7)
     assert [psf.field for psf in images.psfs] == list(IMAGE_FIELDS)
@@ -208,3 +223,13 @@ def test_ghosts_of_a_camera_file_are_those_of_its_numbers(backend, gf7: CameraOp
 def test_a_mirror_has_no_reflectance() -> None:
     with pytest.raises(InputError, match="a reflectance is that of a face of a lens"):
         windowed(", reflectance: 98 percent")
+
+
+def test_the_hole_of_a_mirror_is_drawn_open(backend) -> None:
+    """Within its blocking circle of 60 mm no point is drawn; without `holes` the whole section is."""
+    model = CameraOptics.alone(load_camera("ritchey_chretien"), backend).model
+    (hole,) = [edge.shape.radius for edge in model.edges["M1"] if edge.blocks]
+    whole, drawn = (section_lines(model, 1, 401, holes)["M1"] for holes in (False, True))
+    assert np.all(np.isfinite(whole))
+    assert np.array_equal(np.isnan(drawn).any(axis=1), np.abs(whole[:, 1]) < hole)
+    assert np.all(np.isfinite(section_lines(model, 1, 401, True)["M2"]))

@@ -198,3 +198,10 @@ def test_pictures_quality_and_files_follow_the_design():
     message = answers.handle("state", (asked(KNOBS), None))
     head = json.loads(message[4 : 4 + int.from_bytes(message[:4], "little")])
     assert set(head["images"]) == {"wavefront", "psf", "before"}
+
+
+def test_a_changed_camera_has_numbers_without_float_noise(vignetted: LiveBench) -> None:
+    """-3 m (1 + 0.012 / 100) is -3.00036 m, and the float beside it without rounding."""
+    spec = load_camera("ritchey_chretien")
+    changed = changed_camera(spec, {"design/M1 radius": 0.012, "design/M1 thickness": 0.3})
+    assert (changed.mirrors["M1"].radius, changed.mirrors["M2"].z, changed.image.z) == (-3.00036, -1.0503, 0.44961)

@@ -121,6 +121,11 @@ def test_a_further_perturbation_adds_to_those_before(pair: twin.InstrumentTwin) 
     assert first.with_perturbations({"forward/M2": {"shift": "9 0 0 um"}, "base": {}}).perturbed_by == (
         "base/forward/M2 shift x 9 um"
     )
+    # sums that no float has exactly: 3.0999999999999967 arcsec, and 1.7e-21 m where nothing is left
+    small = pair.perturbed("forward/M2 rotate x 3 arcsec", "forward/M2 shift x 0.3 um")
+    small = small.perturbed("forward/M2 rotate x 0.1 arcsec", "forward/M2 shift x -0.1 um")
+    small = small.perturbed("forward/M2 shift x -0.2 um")
+    assert small.perturbed_by == "base/forward/M2 rotate x 3.1 arcsec"
     turned = pair.perturbed("forward/focal_plane rotate x 2 arcsec about rear_node")
     assert turned.perturbed("forward/focal_plane shift z 3 um").perturbed_by.startswith(
         "base/forward/focal_plane rotate x 2 arcsec about rear_node; base/forward/focal_plane shift z 3 um"

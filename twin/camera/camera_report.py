@@ -81,7 +81,7 @@ def _first_order_text(run: CameraRun) -> str:
     return (
         f"f {n['focal_length_m']:.4g} m, F/{n['f_number']:.3g}, field {n['field_deg'][0]:.3g} by "
         f"{n['field_deg'][1]:.3g} deg; principal distance along the line {d.line_distance:.6g} m, "
-        f"distortion at most {1e6 * d.line_largest:.3g} µm there; "
+        f"distortion at most {round(1e6 * d.line_largest, 6):.3g} µm there; "
         + (f"its edges block {100.0 * _blocked(run):.1f} % of the light; " if run.optics.model.edges else "")
         + (f"{obscuration}: {blocked}." if blocked else f"no {obscuration}.")
         + "".join(f" {text}." for text in (unmodelled, detector_beyond_field(run.first_order)) if text)

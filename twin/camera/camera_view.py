@@ -517,9 +517,8 @@ def _view(axes: Axes, model: CameraModel, backend: Backend, axis: int, first: fl
             style = (0, (5, 2)) if ray == 0 else "-"
             axes.plot(line[:, 2], line[:, axis], color=colour, lw=width, ls=style, alpha=0.9)
     edges = obstacles(model)
-    lines = section_lines(model, axis)
-    _label(axes, model, lines, axis, scale)
-    for name, drawn in lines.items():
+    _label(axes, model, section_lines(model, axis), axis, scale)
+    for name, drawn in section_lines(model, axis, 401, holes=True).items():
         if name not in edges and name != IMAGE and model.spec.mirrors[name].light == "passes":  # no body is there
             axes.plot(drawn[:, 2], drawn[:, axis], color=GREY, lw=0.8, ls=(0, (1, 2)), zorder=3)
         else:
@@ -554,8 +553,11 @@ def _title(name: str) -> str:
     return "focal plane" if name == IMAGE else name
 
 
-def section_lines(model: CameraModel, axis: int, points: int = 80) -> dict[str, np.ndarray]:
-    """Return surface, or ``IMAGE`` -> its section along ``axis`` (0: line, 1: track), (points, 3) points in metres."""
+def section_lines(model: CameraModel, axis: int, points: int = 80, holes: bool = False) -> dict[str, np.ndarray]:
+    """Return surface, or ``IMAGE`` -> its section along ``axis`` (0: line, 1: track), (points, 3) points in metres.
+
+    With ``holes`` points of a mirror within a circle that blocks are nan.
+    """
     edges, lines = obstacles(model), {}
     for name in (*model.mirrors, IMAGE):
         edge = edges.get(name, model.apertures.get(name))
@@ -565,6 +567,12 @@ def section_lines(model: CameraModel, axis: int, points: int = 80) -> dict[str, 
         x, y = (across, other) if axis == 0 else (other, across)
         pose = model.image_body if name == IMAGE else model.mirror_pose(name)
         sag = np.zeros(points) if name == IMAGE else model.surfaces[name].sag(x, y)
+        bored = holes and name != IMAGE and not model.spec.mirrors[name].light
+        for cut in model.edges.get(name, ()) if bored else ():
+            if cut.blocks and isinstance(cut.shape, Circle) and not cut.shape.inner:
+                sag = np.where(
+                    np.hypot(x - cut.shape.centre[0], y - cut.shape.centre[1]) < cut.shape.radius, np.nan, sag
+                )
         lines[name] = pose.apply(np.stack([x, y, sag], axis=-1))
     return lines
 

@@ -184,7 +184,13 @@ def changed_camera(spec: CameraSpec, values: Mapping[str, float]) -> CameraSpec:
     mirrors, moved, heading = {}, 0.0, 1.0
     for k, (name, mirror) in enumerate(spec.mirrors.items()):
         radius, conic, longer = (values.get(f"{DESIGN}/{name} {key}", 0.0) for key in QUANTITIES)
-        update = {"z": mirror.z + moved, "radius": mirror.radius * (1.0 + 0.01 * radius), "conic": mirror.conic + conic}
+        numbers = {
+            "z": mirror.z + moved,
+            "radius": mirror.radius * (1.0 + 0.01 * radius),
+            "conic": mirror.conic + conic,
+        }
+        # -950.114 mm, not -950.1139999999999
+        update = {key: float(f"{number:.14g}") for key, number in numbers.items()}
         mirrors[name] = mirror.model_copy(update=update)
         heading = heading if mirror.light else -heading
         gap = places[k + 1] - places[k]
@@ -192,7 +198,7 @@ def changed_camera(spec: CameraSpec, values: Mapping[str, float]) -> CameraSpec:
             problem = f"{names[k + 1]} would be on the other side of {name}"
             raise InputError(Issue(problem, value=f"{longer:g} mm", allowed=f"{-1e3 * abs(gap):.6g} mm or more"))
         moved += math.copysign(1e-3 * longer, longer * (gap or heading))
-    image = spec.image.model_copy(update={"z": spec.image.z + moved})
+    image = spec.image.model_copy(update={"z": float(f"{spec.image.z + moved:.14g}")})
     # without the file that it came from, whose lines have other numbers
     return CameraSpec.model_construct(**{**dict(spec), "mirrors": FrozenMap(mirrors), "image": image})
 

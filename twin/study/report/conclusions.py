@@ -95,8 +95,8 @@ def indices_texts(analysis: StudyAnalysis) -> list[str]:
 def _model_text(name: str, part: Indices) -> str:
     assert part.held_out is not None
     text = (
-        f"{name}: degree {part.degree}, {plural(part.terms, 'term')}, R² of held-out runs {part.held_out:.4f}, "
-        f"{percent(part.rest)} of the variance not explained"
+        f"{name}: polynomial of degree {part.degree}, {plural(part.terms, 'term')}, R² of its predictions of held-out "
+        f"runs {part.held_out:.4f}, {percent(part.rest)} of the variance not explained"
     ).replace("-", "\N{MINUS SIGN}" if part.held_out < 0 else "-")
     if part.noise is not None:
         text += f" (reported noise: {percent(part.noise)})"
@@ -254,7 +254,7 @@ def _contributors(analysis: StudyAnalysis, response: study_statistics.Response) 
     sure = [e for e in model.effects if _sure(e.swing.interval)]
     share = max(model.adjusted, 0.0)
     if share < LINEAR and about.count >= study_statistics.LEAST:
-        return f"{text} It is hardly linear in the factors (R² {percent(share, 0)}): see its response curves."
+        return f"{text} It is hardly linear in the factors (adjusted R² {percent(share, 0)}): see its response curves."
     if not sure:
         text += " No linear effect of a factor exceeds the scatter."
     else:

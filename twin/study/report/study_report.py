@@ -279,7 +279,7 @@ def _influences(analysis: StudyAnalysis) -> Section | None:
         model = analysis.linear[r.name]
         if model is None:
             continue
-        texts.append(f"{r.name} {words.percent(model.r2)}")
+        texts.append(f"{r.name} {words.percent(max(model.adjusted, 0.0))}")
         for e in model.effects:
             ends = " … ".join(end if isinstance(end, str) else words.number(end, 3) for end in e.span)
             swing = words.with_limits(e.swing) if sampled else words.number(e.swing.value)
@@ -297,7 +297,7 @@ def _influences(analysis: StudyAnalysis) -> Section | None:
     )
     models = [model for r in responses if (model := analysis.linear[r.name]) is not None]
     not_separable = sorted({name for model in models for name in model.not_separable})
-    remarks = [f"R² of the linear model: {', '.join(texts)}."] if texts else []
+    remarks = [f"Adjusted R² of the linear model (for its number of terms): {', '.join(texts)}."] if texts else []
     if not_separable:
         remarks.append(f"Not separable from the other factors and excluded from the model: {', '.join(not_separable)}.")
     return Section("Effects of the factors", tuple(remarks), (figure, table) if rows else (figure,))
