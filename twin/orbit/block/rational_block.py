@@ -80,7 +80,7 @@ def rational_block(setup: RationalAdjustSetup, advance: Advance = silent) -> tup
     ground = None if spec.ground is None else read_ground_points(spec.ground, Path())
     ids, places = _image_points(spec, ground)
     if ground is not None and not (known := set(map(str, ground.points.ids))) & ids.keys():
-        raise spec.error("no image point of these ground points", ("ground",), found=names_text(sorted(known)[:3]))
+        raise spec.error("no image point of these ground points", ("ground",), value=names_text(sorted(known)[:3]))
     points, given = _points(ids, places, images, ground)
     scenes = tuple(
         model.ModelScene(name, image, FrozenMap((spec.images[name].errors or spec.errors).sigma), places[name])

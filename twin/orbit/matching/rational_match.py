@@ -129,7 +129,7 @@ def run_rational_match(setup: RationalMatchSetup, advance: Advance = silent) -> 
         remedy = (
             "heights of the ground that they show (this range probably does not contain it), images of the same ground"
         )
-        raise BenchError(problem, ("heights",), f"{remedy}, or a larger points.reach")
+        raise BenchError(problem, ("heights",), f"{remedy}, or a larger points.search_radius")
     grid = None
     if spec.surface is not None:
         images = {name: (frame.values, frame.image) for name, frame in frames.items()}
@@ -153,7 +153,7 @@ def _points_of(
 ) -> MatchedPoints:
     """Return distinct points of an image, matched in every other image that shows enough of them."""
     frame = frames[source]
-    border = spec.template // 2 + spec.reach
+    border = spec.template // 2 + spec.search_radius
     if min(frame.values.shape) <= 2 * border + 1:
         shape = " x ".join(str(n) for n in frame.values.shape)
         problem = f"{source}: {shape} pixels have no room for a template of {spec.template} pixels and its search"
@@ -180,13 +180,13 @@ def _searched(
     middle = np.full(len(place), 0.5 * sum(heights))
     _, rise = _seen(frame, other, place, middle)
     length = np.nanmax(np.linalg.norm(rise, axis=1), initial=0.0)
-    steps = int(np.ceil((heights[1] - heights[0]) * length / spec.reach)) + 1
+    steps = int(np.ceil((heights[1] - heights[0]) * length / spec.search_radius)) + 1
     templates = _templates(frame, other, place, middle, spec.template)
     levels = np.linspace(*heights, steps) if steps > 1 else middle[:1]
     positions, values = np.full((len(levels), len(place), 2), np.nan), np.full((len(levels), len(place)), -1.0)
     for k, level in enumerate(levels.tolist()):
         expected, _ = other.image.seen(frame.image.ground(place, level))
-        peaks = search(other.values, templates, expected, spec.reach)
+        peaks = search(other.values, templates, expected, spec.search_radius)
         found = peaks.reason == Reason.ACCEPTED
         positions[k], values[k] = peaks.position, np.where(found, peaks.value, -1.0)
     best = np.argmax(values, axis=0)
