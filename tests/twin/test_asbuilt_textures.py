@@ -1,0 +1,104 @@
+"""Focus from two images of one unknown textured scene: images by exact rays, a path that shares nothing with the fit."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import tifffile
+
+from analysis.mtf.mtf_ratio import mtf_ratio
+from analysis.spots.noise import NoiseModel
+from optics.geometry.tree import State
+from optics.numerics.quadrature import PupilNodes
+from optics.raytrace.system import assemble
+from optics.waves.diffraction import Grid, image
+from optics.waves.edge_shadow import IlluminatedStop
+from optics.waves.imaging import imaging_rays, pupil_field
+from scenes.specs.asbuilt import AsBuiltSetup
+from scenes.yaml.errors import InputError
+from scenes.yaml.yaml_file import dump_yaml
+from tests.twin.star_bench import PRIOR, RINGS, SHADOW
+from twin.asbuilt.asbuilt_bench import AsBuiltBench
+from twin.asbuilt.mtf_readings import MtfReadings
+
+THREE = [[-0.9, 0], [0, 0], [0.9, 0]]
+FREQUENCY, PITCH, DEFOCUS = 12.0, 7e-6, (-0.4e-3, 0.4e-3)
+NOISE = NoiseModel(dark_noise_e=20.0)
+FINE, KERNEL, MARGIN = 2, 64, 32
+"""Samples along a pixel of the scene, pixels along the image of a point, and pixels of the scene beside an image."""
+PAIR = {"frequency": FREQUENCY, "reference_defocus": "-0.4 mm", "defocus": "0.4 mm"}
+
+
+def bench_of(backend, folder: Path, measurements: dict, prior: dict) -> AsBuiltBench:
+    """gf7 with some measurements at three fields."""
+    (folder / "plane.yaml").write_text(dump_yaml(prior))
+    data = {"instrument": "gf7", "prior": "./plane.yaml", "merits": {"w": {"kind": "wavefront", "at_most": 0.07}}}
+    data["measurements"] = {kind: {"name": {"fields": THREE, **spec}} for kind, spec in measurements.items()}
+    if not any("pair" in spec for spec in measurements.values()):
+        data["simulate"] = {}
+    (folder / "textures.yaml").write_text(dump_yaml(data))
+    return AsBuiltBench(AsBuiltSetup.read(folder / "textures.yaml"), backend)
+
+
+PLANE = {**PRIOR, "causes": {"plane": PRIOR["causes"]["plane"]}}
+
+
+def scene(rng: np.random.Generator, pixels: int) -> np.ndarray:
+    """Random scene of power 1/f^2 with a mean of 1 and a contrast of 0.2 rms, fine samples."""
+    side = FINE * (pixels + 2 * MARGIN)
+    f = np.hypot(*np.meshgrid(np.fft.fftfreq(side), np.fft.rfftfreq(side), indexing="ij"))
+    f[0, 0] = np.inf
+    texture = np.fft.irfft2(np.fft.rfft2(rng.standard_normal((side, side))) / f, (side, side))
+    return np.maximum(1.0 + 0.2 * texture / np.std(texture), 0.0)
+
+
+def kernel(beams, number: int, state: State, defocus: float) -> np.ndarray:
+    """Image of a point on fine samples, summed plane waves of exact rays, (k, k)."""
+    path = beams.optics.path
+    stop = IlluminatedStop.of(beams.pieces[number : number + 1], RINGS, SHADOW)
+    nodes = PupilNodes(*(np.concatenate([[0.0], part[0]]) for part in (stop.x, stop.y, stop.weight)))
+    systems = [assemble(path.assembly, [f"{path.name}/{part}"], [state]) for part in ("imaging", "to_stop")]
+    rays = imaging_rays(beams.backend, *systems, beams.directions[number], beams.start[number], path.stop, nodes)
+    field = pupil_field(rays, beams.wavelength, rays.position[0, 0] + defocus * rays.direction[0, 0])
+    step, count = PITCH / FINE, KERNEL * FINE
+    return image(field, Grid(-(count // 2) * step, step, count), Grid(-(count // 2) * step, step, count))[0].T
+
+
+def imaged(fine: np.ndarray, point: np.ndarray, rng: np.random.Generator, electrons: float = 1e4) -> np.ndarray:
+    """Image of a scene with pixels of full area, shot noise and read noise."""
+    side, middle = len(fine), len(point) // 2
+    padded = np.zeros((side, side))
+    padded[: len(point), : len(point)] = point / np.sum(point)
+    axis = np.sinc(FINE * np.fft.fftfreq(side))
+    transfer = np.fft.fft2(np.roll(padded, (-middle, -middle), (0, 1))) * np.outer(axis, axis)
+    light = np.fft.ifft2(np.fft.fft2(fine) * transfer).real[::FINE, ::FINE][MARGIN:-MARGIN, MARGIN:-MARGIN]
+    return rng.poisson(np.maximum(electrons * light, 0.0)) + rng.normal(0.0, NOISE.dark_noise_e, light.shape)
+
+
+def pairs(bench: AsBuiltBench, true: np.ndarray, rng: np.random.Generator, pixels: int, scenes=scene) -> list:
+    """Two images of another scene at each of three fields, of a camera in a true state."""
+    beams = bench.beams(bench.kinds[0].spec.fields, planes=True)
+    (state,) = bench.parameters.states(true[None], None)
+    out = []
+    for number in range(len(THREE)):
+        fine = scenes(rng, pixels)
+        out.append([imaged(fine, kernel(beams, number, state, defocus), rng) for defocus in DEFOCUS])
+    return out
+
+
+def drawn(bench: AsBuiltBench, exact: AsBuiltBench, rng: np.random.Generator, pixels: int, scenes=scene) -> tuple:
+    """Errors of the foci of a drawn camera over their sigmas, errors, sigmas, and whitened errors of the readings."""
+    (kind,) = bench.kinds
+    assert isinstance(kind, MtfReadings)
+    true = bench.draw(rng, "normal")
+    images = pairs(bench, true, rng, pixels, scenes)
+    ratios = [mtf_ratio(*pair, FREQUENCY * 1e3 * PITCH, noise=NOISE) for pair in images]
+    kind.__dict__["_ratios"] = ratios
+    data = kind.read()
+    found = bench.estimate([data])
+    errors = exact.predict(found.mean[None])[0] - exact.predict(true[None])[0]
+    sigmas = np.std(exact.predict(found.draw(rng, 200)), axis=0)
+    white = np.linalg.solve(np.linalg.cholesky(kind.covariance()), data - bench.predict(true[None])[0])
+    return errors / sigmas, errors, sigmas, white
