@@ -2,12 +2,12 @@
 
 The spectrum of an image is that of the scene times the transfer function, so that the scene cancels in the ratio of two
 images. Spectra are those of patches with Hann windows that overlap by half (Welch, IEEE Trans. Audio Electroacoust. 15,
-70, 1967). The ratio is the square root of that of the power spectra without their noise. It does not depend on the
-scene's position; cross-spectra only show whether both images have the same scene, and the sign of the ratio.
+70, 1967). The ratio is that of the modulus of the cross-spectrum to the power of the sharper image without its
+noise, which is small. It does not depend on the scene's position; the coherence shows whether the scene is the same.
 
 A window mixes neighbouring frequencies in the proportion of the scene's power there. To the first order the ratio is
 therefore that at the mean frequency of the power in a bin, which the product of the spectrum with that of the window's
-derivative gives exactly. The logarithms of all bins of a ring about the frequency are fitted by a smooth function of
+derivative gives exactly; the second order, for an even power, is removed as well. The logarithms of all bins of a ring about the frequency are fitted by a smooth function of
 frequency and direction, whose values along rows and columns are the result.
 """
 
@@ -20,8 +20,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from analysis.arrays import Array, UndeterminedError
-from analysis.matching.correlation import checked_image, distinct_points
-from analysis.matching.matches import match_windows
+from analysis.matching.correlation import Reason, checked_image, search
 from analysis.spots.noise import NoiseModel
 from analysis.statistics import robust_sigma
 
@@ -30,6 +29,8 @@ _CYCLES, _LEAST_SIDE = 10.0, 32
 _WIDTH, _LEAST_WIDTH = 0.15, 1.5
 """Half width of the ring of frequencies, as a share of the frequency and in bins; the larger of both is used."""
 _LEAST_PATCHES = 16
+_HANN_BINS = 3.0**-0.5
+"""Standard deviation of the frequencies that a Hann window mixes, in bins: weights 1, 1/4 and 1/4 of their power."""
 _OVERLAP = 1.11
 """Variance of a mean over patches that overlap by half, relative to that of independent ones.
 
@@ -44,10 +45,14 @@ _EVEN = 0.01
 """Variance of the logarithm of a bin's ratio, relative to one of no coherence, that is assumed besides its noise."""
 _COHERENT, _SAME = 0.5, 0.8
 """Least coherence of both images, and least coherence of what is left without the stated noise."""
-_TEMPLATE, _RADIUS, _POINTS, _LEAST_POINTS = 31, 24, 36, 6
-"""Side of the windows that are matched, largest displacement of the scene, and number of windows."""
-_SCATTER = 0.5
+_TEMPLATE, _RADIUS, _POINTS, _LEAST_POINTS = 63, 24, 6, 5
+"""Side of the windows that are matched, largest displacement of the scene, windows a side, and least number of them."""
+_ALIKE, _UNIQUE = 0.5, 0.9
+"""Least correlation of a window, and least ratio of the second best peak to the best one at which it is ambiguous."""
+_SCATTER = 1.5
 """Largest robust scatter of the windows' displacements, pixels."""
+_CLIPPED, _MOST_SATURATED = 1e-3, 0.3
+"""Share of equal largest values that are taken for saturation, and largest share of saturated pixels."""
 _SAME_SIGN = 0.5
 """Least real part of the cross-spectrum, relative to its modulus."""
 
@@ -133,20 +138,34 @@ def mtf_ratio(
     frequencies = np.atleast_1d(np.asarray(frequency, np.float64))
     if frequencies.ndim != 1 or not np.all((frequencies >= 0.03) & (frequencies <= 0.25)):
         raise ValueError(f"MTF ratio: frequencies must be 0.03 to 0.25 cycles/pixel, found {frequency}")
-    images = []
-    for image, name in ((reference, "reference"), (other, "other image")):
-        grey = np.asarray(checked_image(image, f"MTF ratio, {name}"), np.float64)
-        images.append(grey if noise is None else np.where(grey < noise.saturation_dn, grey, np.nan))
-    if images[0].shape != images[1].shape:
-        raise ValueError(f"MTF ratio: the images have different sizes, {images[0].shape} and {images[1].shape} px")
+    pair = [checked_image(image, "MTF ratio") for image in (reference, other)]
+    if pair[0].shape != pair[1].shape:
+        raise ValueError(f"MTF ratio: the images have different sizes, {pair[0].shape} and {pair[1].shape} px")
+    saturation = math.inf if noise is None else noise.saturation_dn
+    images = [_unsaturated(image.astype(np.float64), saturation) for image in pair]
     displacement = _displacement(*images)
     first, second = _overlapping(images, np.rint(displacement).astype(int))
     rest = displacement - np.rint(displacement)
-    parts = [_Ring.of(first, second, float(f), noise).result(float(f), rest) for f in frequencies]
+    parts = [_measured(first, second, f, noise, rest) for f in frequencies.tolist()]
     ratios, covariances, coherences, lights, counts = zip(*parts, strict=True)
     return MtfRatio(
         frequencies, np.stack(ratios), np.stack(covariances), np.array(coherences), displacement, lights[0], counts[0]
     )
+
+
+def _unsaturated(grey: Array, saturation: float) -> Array:
+    """Return an image with NaN in saturated pixels, and where many have the largest value without a stated one."""
+    bad = ~(grey < saturation)
+    largest = grey == np.max(grey, initial=-math.inf, where=~bad)
+    if _CLIPPED < np.mean(largest) < _MOST_SATURATED:
+        bad |= largest
+    grey = np.where(bad, np.nan, grey)
+    share = float(np.mean(np.isnan(grey)))
+    if share > _MOST_SATURATED:
+        raise UndeterminedError(
+            f"MTF ratio: {100 * share:.0f} % of the pixels of an image are saturated or not finite; expose it shorter"
+        )
+    return grey
 
 
 def _displacement(reference: Array, other: Array) -> Array:
@@ -155,19 +174,18 @@ def _displacement(reference: Array, other: Array) -> Array:
     radius = min(_RADIUS, (min(reference.shape) - _TEMPLATE) // 2 - half)
     if radius < 2:
         raise ValueError(f"MTF ratio: images of {reference.shape} px are too small; give 200 x 200 px or more")
-    points = distinct_points(reference, _POINTS, spacing=half, border=half + radius + 1).astype(int)
-    if len(points) < _LEAST_POINTS:
-        raise UndeterminedError(
-            "MTF ratio: the scene has no contrast beyond the noise; give images of a textured scene"
-        )
+    axes = [np.linspace(half + radius, size - 1 - half - radius, _POINTS).astype(int) for size in reference.shape]
+    points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2)
     templates = np.stack([reference[r - half : r + half + 1, c - half : c + half + 1] for r, c in points])
-    matches = match_windows(other, templates, points, search_radius=radius)
-    moved = (matches.position - points)[matches.accepted]
+    peaks = search(other, templates, points, radius)
+    alike = (peaks.reason == Reason.ACCEPTED) & (peaks.value > _ALIKE) & (peaks.ratio < _UNIQUE)
+    moved = (peaks.position - points)[alike]
     middle = np.median(moved, axis=0) if len(moved) else np.zeros(2)
     if len(moved) < _LEAST_POINTS or robust_sigma(moved - middle) > _SCATTER:
         raise UndeterminedError(
-            f"MTF ratio: the images do not show one scene displaced by at most {radius} px: {matches.text}; give two"
-            " images of the same scene that does not repeat itself"
+            f"MTF ratio: the images do not show one scene displaced by at most {radius} px ({len(moved)} of"
+            f" {len(points)} windows are found again): give two images of the same scene, which has contrast and does"
+            " not repeat itself"
         )
     return np.asarray(middle)
 
@@ -179,6 +197,21 @@ def _overlapping(images: list[Array], move: Array) -> tuple[Array, Array]:
     first = images[0][behind[0] : size[0] - ahead[0], behind[1] : size[1] - ahead[1]]
     second = images[1][ahead[0] : size[0] - behind[0], ahead[1] : size[1] - behind[1]]
     return first, second
+
+
+_Result = tuple[Array, Array, float, float, int]
+"""Both ratios, the covariance of their logarithms, the coherence, the ratio of light, and the number of patches."""
+
+
+def _measured(first: Array, second: Array, frequency: float, noise: NoiseModel | None, shift: Array) -> _Result:
+    """Return the ratio of two images of one scene displaced by a fraction of a pixel, at one frequency."""
+    ring = _Ring.of(first, second, frequency, noise)
+    if not np.all(ring.light.sum(axis=1) > 0.0):
+        raise UndeterminedError("MTF ratio: an image has no light above its black level; check the black level")
+    if ring.first_is_sharper:
+        return ring.result(frequency, shift)
+    ratio, covariance, coherence, light, patches = _Ring.of(second, first, frequency, noise).result(frequency, -shift)
+    return 1.0 / ratio, covariance, coherence, 1.0 / light, patches
 
 
 @dataclass(frozen=True, eq=False)
@@ -199,6 +232,8 @@ class _Ring:
         Products of the reference's power with the distance of its mean frequency from the bin's.
     light : (2, P) ndarray
         Mean light of both images.
+    blur : float
+        Standard deviation of the frequencies that the window mixes, along each axis, cycles/pixel.
     """
 
     frequency: Array
@@ -207,6 +242,7 @@ class _Ring:
     noise: Array
     mixed: Array
     light: Array
+    blur: float
 
     @classmethod
     def of(cls, first: Array, second: Array, frequency: float, noise: NoiseModel | None) -> _Ring:
@@ -243,10 +279,16 @@ class _Ring:
                 f" needed at {frequency:g} cycles/pixel; give larger images"
             )
         power, cross, stated, mixed, light = (np.stack(part) for part in zip(*columns, strict=True))
-        return cls(grid[ring], np.moveaxis(power, 1, 0), cross, stated.T, mixed, light.T)
+        return cls(grid[ring], np.moveaxis(power, 1, 0), cross, stated.T, mixed, light.T, _HANN_BINS / side)
 
-    def result(self, frequency: float, shift: Array) -> tuple[Array, Array, float, float, int]:
-        """Return both ratios, the covariance of their logarithms, the coherence, the ratio of light, and the patches.
+    @property
+    def first_is_sharper(self) -> bool:
+        """True if the first image has at least the modulation of the second one."""
+        modulation = self.power.sum(axis=(1, 2)) / self.light.sum(axis=1) ** 2
+        return bool(modulation[0] >= modulation[1])
+
+    def result(self, frequency: float, shift: Array) -> _Result:
+        """Return the ratio of the second image to the first one, the sharper.
 
         Parameters
         ----------
@@ -257,8 +299,6 @@ class _Ring:
         """
         patches = len(self.cross)
         power, cross, light = self.power.sum(axis=1), self.cross.sum(axis=0), self.light.sum(axis=1)
-        if not np.all(light > 0.0):
-            raise UndeterminedError("MTF ratio: an image has no light above its black level; check the black level")
         coherence = _share(np.abs(cross) ** 2, power[0] * power[1])
         stated = bool(np.all(np.isfinite(self.noise)))
         noise = self.noise.sum(axis=1) if stated else _uncorrelated(power, cross, light)
@@ -278,16 +318,15 @@ class _Ring:
             )
         self._require_sign(cross * np.exp(2j * np.pi * self.frequency @ shift), frequency)
         weight = 1.0 / (_EVEN + np.sum(noise[:, None] / np.where(used, signal, 1.0), axis=0)) * used
-        share = noise / patches if not stated else None
 
         def logarithm(chosen: Array) -> Array:
             """Return the logarithms of both ratios from the patches with a weight of 1, (2,)."""
-            own = self.noise @ chosen if share is None else share * chosen.sum()
-            part = np.maximum(np.tensordot(chosen, self.power, (0, 1)) - own[:, None], 1e-9 * signal)
-            mean = self.frequency + np.tensordot(chosen, self.mixed, (0, 0)) / part[0][:, None]
-            return _fitted(mean[used], 0.5 * np.log(part[1] / part[0])[used], weight[used], frequency) - math.log(
-                (self.light[1] @ chosen) / (self.light[0] @ chosen)
-            )
+            own = self.noise[0] @ chosen if stated else noise[0] / patches * chosen.sum()
+            part = np.maximum(chosen @ self.power[0] - own, 1e-9 * signal[0])
+            mean = self.frequency + np.tensordot(chosen, self.mixed, (0, 0)) / part[:, None]
+            values = np.log(np.maximum(np.abs(chosen @ self.cross), 1e-300) / part)
+            light = math.log((self.light[1] @ chosen) / (self.light[0] @ chosen))
+            return _fitted(mean[used], values[used], weight[used], frequency, self.blur) - light
 
         every = np.ones(patches)
         without = np.array([logarithm(every - one) for one in np.eye(patches)])
@@ -328,8 +367,22 @@ def _uncorrelated(power: Array, cross: Array, light: Array) -> Array:
     return np.asarray(each * 2.0 * c / (b + math.sqrt(max(b * b - 4.0 * a * c, 0.0))))
 
 
-def _fitted(at: Array, values: Array, weight: Array, frequency: float) -> Array:
-    """Return a smooth function of frequencies (K, 2), fitted to K values, at one frequency along rows and columns."""
+def _fitted(at: Array, values: Array, weight: Array, frequency: float, blur: float) -> Array:
+    """Return the logarithms of the ratio at one frequency along rows and columns, (2,), from K bins of a ring.
+
+    Parameters
+    ----------
+    at : (K, 2) ndarray
+        Mean frequencies of the bins, cycles/pixel.
+    values : (K,) ndarray
+        Logarithms of the ratio.
+    weight : (K,) ndarray
+        Their weights.
+    frequency : float
+        Frequency, cycles/pixel.
+    blur : float
+        Standard deviation of the frequencies that the window mixes, along each axis, cycles/pixel.
+    """
 
     def table(f: Array) -> Array:
         square = np.sum(f**2, axis=1)
@@ -340,4 +393,9 @@ def _fitted(at: Array, values: Array, weight: Array, frequency: float) -> Array:
 
     root = np.sqrt(weight)
     terms = np.linalg.lstsq(root[:, None] * table(at), root * values, rcond=None)[0]
-    return np.asarray(table(frequency * np.eye(2)[::-1]) @ terms)
+    # a cross-spectrum has the mean ratio over the frequencies that a bin mixes: half of its Laplacian too much
+    points, step = frequency * np.eye(2)[::-1], 0.1 * frequency
+    result = table(points) @ terms
+    around = np.stack([table(points + sign * step * axis) @ terms for sign in (-1.0, 1.0) for axis in np.eye(2)])
+    excess = 2.0 * (blur / step) ** 2 * np.mean(np.expm1(around - result), axis=0)
+    return np.asarray(result - np.log1p(np.maximum(excess, -0.5)))
