@@ -7,8 +7,9 @@ noise, which is small. It does not depend on the scene's position; the coherence
 
 A window mixes neighbouring frequencies in the proportion of the scene's power there. To the first order the ratio is
 therefore that at the mean frequency of the power in a bin, which the product of the spectrum with that of the window's
-derivative gives exactly; the second order, for an even power, is removed as well. The logarithms of all bins of a ring about the frequency are fitted by a smooth function of
-frequency and direction, whose values along rows and columns are the result.
+derivative gives exactly; the second order, for a power that is even within a bin, is removed as well. The logarithms of
+all bins of a ring about the frequency are fitted by a smooth function of frequency and direction, whose values along
+rows and columns are the result.
 """
 
 from __future__ import annotations

@@ -115,6 +115,7 @@ def drawn(bench: AsBuiltBench, exact: AsBuiltBench, rng: np.random.Generator, pi
     return errors / sigmas, errors, sigmas, white
 
 
+@pytest.mark.second
 def test_foci_of_drawn_cameras(backend, tmp_path):
     """Three cameras with three fields each, of random scenes: all within 4 sigma, of 0.5 um; a prior of 0.1 mm.
 
@@ -127,3 +128,36 @@ def test_foci_of_drawn_cameras(backend, tmp_path):
     assert np.max(np.abs(pulls)) < 4.0
     assert np.max(sigmas) < 1.5e-6
     assert np.sum(white**2) < 42.3, "1 in 1000 for 18 ratios"
+
+
+@pytest.mark.second
+def test_files_of_pairs(backend, tmp_path):
+    """Pages of two TIFF files give the readings of the arrays, with a further sigma; wrong files are refused."""
+    rng = np.random.default_rng(7)
+    spec = {**PAIR, "pair": ["a.tif", "b.tif"], "gain": 0.5, "read_noise": 20.0, "black_level": 100.0, "sigma": 0.01}
+    bench, _ = benches(backend, tmp_path, PLANE)
+    images = pairs(bench, np.zeros(len(bench.parameters.labels)), rng, 384)
+    grey = np.rint(np.stack(images, axis=1) / 0.5 + 100.0).astype(np.uint16)
+    for name, pages in zip("ab", grey, strict=True):
+        tifffile.imwrite(tmp_path / f"{name}.tif", pages, photometric="minisblack")
+    kind = bench_of(backend, tmp_path, {"mtf": spec}, PLANE).kinds[0]
+    noise = NoiseModel(2.0, 20.0, offset_dn=100.0)
+    ratios = [mtf_ratio(*two, FREQUENCY * 1e3 * PITCH, noise=noise) for two in np.moveaxis(grey, 1, 0)]
+    np.testing.assert_allclose(kind.read(), np.log(np.ravel([ratio.ratio[0] for ratio in ratios])))
+    np.testing.assert_allclose(kind.covariance()[:2, :2], ratios[0].log_covariance[0] + 1e-4 * np.eye(2))
+    assert kind.labels[1] == "(-0.9, 0) track ln ratio"
+    tifffile.imwrite(tmp_path / "b.tif", grey[1][:2], photometric="minisblack")
+    for more, message in (
+        ({}, "2 pages in the file, 3 fields in the test"),
+        ({"pair": ["a.tif", "missing.tif"]}, "missing.tif"),
+        ({"pair": ["a.tif", "a.tif"], "black_level": 60000.0}, "field (-0.9, 0): MTF ratio: an image has no light"),
+        ({"reference_defocus": "0.4 mm"}, "both images have the same defocus"),
+        ({"frequency": None}, "a ratio of images needs a frequency"),
+        ({"reference_defocus": None}, "the focus of the first image is missing"),
+        ({"pair": None, "sigma": None}, "'sigma' is missing"),
+        ({"pair": None, "along_line": [0.5] * 3, "along_track": [0.5] * 3}, "values of one image with a reference"),
+    ):
+        changed = {key: value for key, value in (spec | more).items() if value is not None}
+        with pytest.raises(InputError) as caught:
+            bench_of(backend, tmp_path, {"mtf": changed}, PLANE).kinds[0].read()
+        assert message in str(caught.value)
