@@ -2,8 +2,9 @@
 
 The spectrum of an image is that of the scene times the transfer function, so that the scene cancels in the ratio of two
 images. Spectra are those of patches with Hann windows that overlap by half (Welch, IEEE Trans. Audio Electroacoust. 15,
-70, 1967). The ratio is that of the modulus of the cross-spectrum to the power of the sharper image without its
-noise, which is small. It does not depend on the scene's position; the coherence shows whether the scene is the same.
+70, 1967). The ratio is that of the modulus of the cross-spectrum to the power of the image that is sharper in the
+direction, without its noise, which is small. It does not depend on the scene's position; the coherence shows whether
+the scene is the same.
 
 A window mixes neighbouring frequencies in the proportion of the scene's power there. To the first order the ratio is
 therefore that at the mean frequency of the power in a bin, which the product of the spectrum with that of the window's
@@ -72,7 +73,7 @@ class MtfRatio:
         Covariance of the logarithms of both ratios, from noise, from the scatter of patches, and from what only one of
         the images may show.
     coherence : (F,) ndarray
-        Squared coherence of both images.
+        Squared coherence of both images, noise included, in the worse direction.
     displacement : (2,) ndarray
         Displacement of the scene from the reference to the other image, rows and columns, pixels.
     light : float
@@ -147,7 +148,7 @@ def mtf_ratio(
     displacement = _displacement(*images)
     first, second = _overlapping(images, np.rint(displacement).astype(int))
     rest = displacement - np.rint(displacement)
-    parts = [_measured(first, second, f, noise, rest) for f in frequencies.tolist()]
+    parts = [_Ring.of(first, second, f, noise).result(f, rest) for f in frequencies.tolist()]
     ratios, covariances, coherences, lights, counts = zip(*parts, strict=True)
     return MtfRatio(
         frequencies, np.stack(ratios), np.stack(covariances), np.array(coherences), displacement, lights[0], counts[0]
@@ -204,17 +205,6 @@ _Result = tuple[Array, Array, float, float, int]
 """Both ratios, the covariance of their logarithms, the coherence, the ratio of light, and the number of patches."""
 
 
-def _measured(first: Array, second: Array, frequency: float, noise: NoiseModel | None, shift: Array) -> _Result:
-    """Return the ratio of two images of one scene displaced by a fraction of a pixel, at one frequency."""
-    ring = _Ring.of(first, second, frequency, noise)
-    if not np.all(ring.light.sum(axis=1) > 0.0):
-        raise UndeterminedError("MTF ratio: an image has no light above its black level; check the black level")
-    if ring.first_is_sharper:
-        return ring.result(frequency, shift)
-    ratio, covariance, coherence, light, patches = _Ring.of(second, first, frequency, noise).result(frequency, -shift)
-    return 1.0 / ratio, covariance, coherence, 1.0 / light, patches
-
-
 @dataclass(frozen=True, eq=False)
 class _Ring:
     """Spectra of P patches of two images in K bins of a ring of frequencies.
@@ -229,8 +219,8 @@ class _Ring:
         Cross-spectra.
     noise : (2, P) ndarray
         Power of the noise of both images in any bin; NaN if it is not stated.
-    mixed : (P, K, 2) ndarray
-        Products of the reference's power with the distance of its mean frequency from the bin's.
+    mixed : (2, P, K, 2) ndarray
+        Products of the power of both images with the distance of its mean frequency from the bin's.
     light : (2, P) ndarray
         Mean light of both images.
     blur : float
@@ -267,29 +257,30 @@ class _Ring:
                 if not (np.all(np.isfinite(pair[0])) and np.all(np.isfinite(pair[1]))):
                     continue
                 means = np.array([np.sum(window * patch) / np.sum(window) for patch in pair])
-                flat = pair[0] - means[0]
-                a, b = np.fft.fft2(window * flat)[ring], np.fft.fft2(window * (pair[1] - means[1]))[ring]
-                mixed = [(a.conj() * np.fft.fft2(w * flat)[ring]).imag / (-2.0 * np.pi) for w in slopes]
-                power = np.stack([np.abs(a) ** 2, np.abs(b) ** 2])
+                flat = np.stack(pair) - means[:, None, None]
+                both = np.fft.fft2(window * flat)[:, ring]
+                parts = [(both.conj() * np.fft.fft2(w * flat)[:, ring]).imag / (-2.0 * np.pi) for w in slopes]
                 stated = [np.nan if noise is None else np.sum(window**2 * _variance(noise, patch)) for patch in pair]
                 dark = 0.0 if noise is None else noise.dark_level_dn
-                columns.append((power, a.conj() * b, np.array(stated), np.stack(mixed, axis=-1), means - dark))
+                mixed = np.stack(parts, axis=-1)
+                columns.append((np.abs(both) ** 2, both[0].conj() * both[1], np.array(stated), mixed, means - dark))
         if len(columns) < _LEAST_PATCHES:
             raise UndeterminedError(
                 f"MTF ratio: {len(columns)} patches of {side} px without saturated pixels, {_LEAST_PATCHES} are"
                 f" needed at {frequency:g} cycles/pixel; give larger images"
             )
         power, cross, stated, mixed, light = (np.stack(part) for part in zip(*columns, strict=True))
-        return cls(grid[ring], np.moveaxis(power, 1, 0), cross, stated.T, mixed, light.T, _HANN_BINS / side)
+        power, mixed = np.moveaxis(power, 1, 0), np.moveaxis(mixed, 1, 0)
+        return cls(grid[ring], power, cross, stated.T, mixed, light.T, _HANN_BINS / side)
 
     @property
-    def first_is_sharper(self) -> bool:
-        """True if the first image has at least the modulation of the second one."""
-        modulation = self.power.sum(axis=(1, 2)) / self.light.sum(axis=1) ** 2
-        return bool(modulation[0] >= modulation[1])
+    def directions(self) -> Array:
+        """Weights of the bins along the rows of an image and along its columns, (2, K)."""
+        squares = self.frequency[:, ::-1] ** 2
+        return np.asarray((squares / np.sum(squares, axis=1, keepdims=True)).T ** 2)
 
     def result(self, frequency: float, shift: Array) -> _Result:
-        """Return the ratio of the second image to the first one, the sharper.
+        """Return the ratio of the second image to the first one.
 
         Parameters
         ----------
@@ -300,7 +291,8 @@ class _Ring:
         """
         patches = len(self.cross)
         power, cross, light = self.power.sum(axis=1), self.cross.sum(axis=0), self.light.sum(axis=1)
-        coherence = _share(np.abs(cross) ** 2, power[0] * power[1])
+        if not np.all(light > 0.0):
+            raise UndeterminedError("MTF ratio: an image has no light above its black level; check the black level")
         stated = bool(np.all(np.isfinite(self.noise)))
         noise = self.noise.sum(axis=1) if stated else _uncorrelated(power, cross, light)
         signal = power - noise[:, None]
@@ -311,36 +303,44 @@ class _Ring:
                 f" direction ({100 * np.mean(used):.0f} % of the spectrum); choose a lower frequency, less defocus or"
                 " another scene"
             )
-        same = min(1.0, _share((np.abs(cross) ** 2)[used], np.prod(signal[:, used], axis=0))) if stated else coherence
-        if coherence < _COHERENT or same < _SAME:
+        whole = (np.prod(power, axis=0), np.prod(signal if stated else power, axis=0))
+        weights = self.directions * used
+        total, same = (np.minimum(weights @ np.abs(cross) ** 2 / (weights @ part), 1.0) for part in whole)
+        if np.min(total) < _COHERENT or np.min(same) < _SAME:
             raise UndeterminedError(
-                f"MTF ratio: the images have a coherence of {same:.2f} at {frequency:g} cycles/pixel, {_SAME:g} is"
-                " needed: they show different scenes, or too much noise or aliasing"
+                f"MTF ratio: the images have a coherence of {np.min(same):.2f} at {frequency:g} cycles/pixel, {_SAME:g}"
+                " is needed: they show different scenes, or too much noise or aliasing"
             )
         self._require_sign(cross * np.exp(2j * np.pi * self.frequency @ shift), frequency)
         weight = 1.0 / (_EVEN + np.sum(noise[:, None] / np.where(used, signal, 1.0), axis=0)) * used
 
+        # noise and what the images do not share matter least beside the sharper one
+        second = signal[1] * light[0] ** 2 > signal[0] * light[1] ** 2
+        sign = np.where(second, -1.0, 1.0)
+
         def logarithm(chosen: Array) -> Array:
             """Return the logarithms of both ratios from the patches with a weight of 1, (2,)."""
-            own = self.noise[0] @ chosen if stated else noise[0] / patches * chosen.sum()
-            part = np.maximum(chosen @ self.power[0] - own, 1e-9 * signal[0])
-            mean = self.frequency + np.tensordot(chosen, self.mixed, (0, 0)) / part[:, None]
-            values = np.log(np.maximum(np.abs(chosen @ self.cross), 1e-300) / part)
-            light = math.log((self.light[1] @ chosen) / (self.light[0] @ chosen))
-            return _fitted(mean[used], values[used], weight[used], frequency, self.blur) - light
+            own = self.noise @ chosen if stated else noise / patches * chosen.sum()
+            part = np.maximum(np.tensordot(chosen, self.power, (0, 1)) - own[:, None], 1e-9 * signal)
+            mean = self.frequency + np.tensordot(chosen, self.mixed, (0, 1)) / part[..., None]
+            at, sharper = np.where(second[:, None], mean[1], mean[0]), np.where(second, part[1], part[0])
+            values = sign * np.log(np.maximum(np.abs(chosen @ self.cross), 1e-300) / sharper)
+            gain = math.log((self.light[1] @ chosen) / (self.light[0] @ chosen))
+            return _fitted(at[used], values[used] - gain, weight[used], frequency, self.blur)
 
         every = np.ones(patches)
         without = np.array([logarithm(every - one) for one in np.eye(patches)])
         without -= without.mean(axis=0)
         scatter = (patches - 1) / patches * without.T @ without * (patches - 1) / (patches - 3) * _OVERLAP
+        result = logarithm(every)
         # what only one of the images shows may belong to either
-        unknown = -0.5 * math.log(same) / math.sqrt(3.0)
-        return np.exp(logarithm(every)), scatter + unknown**2, coherence, float(light[1] / light[0]), patches
+        unknown = -0.5 * np.log(same) / math.sqrt(3.0) * np.where(result > 0.0, -1.0, 1.0)
+        covariance = scatter + np.outer(unknown, unknown)
+        return np.exp(result), covariance, float(np.min(total)), float(light[1] / light[0]), patches
 
     def _require_sign(self, cross: Array, frequency: float) -> None:
         """Raise UndeterminedError if the images have opposite contrast in a direction."""
-        squares = self.frequency[:, ::-1] ** 2 / np.sum(self.frequency**2, axis=1, keepdims=True)
-        for weight, name in zip((squares**2).T, ("rows", "columns"), strict=True):
+        for weight, name in zip(self.directions, ("rows", "columns"), strict=True):
             if float(np.real(weight @ cross)) < _SAME_SIGN * float(weight @ np.abs(cross)):
                 raise UndeterminedError(
                     f"MTF ratio: an image reverses the contrast at {frequency:g} cycles/pixel along the {name};"
@@ -351,10 +351,6 @@ class _Ring:
 def _variance(noise: NoiseModel, grey: Array) -> Array:
     """Return the variance of recorded grey values, with patterns of the pixels, DN^2."""
     return np.asarray(noise.frame_variance_dn2(grey) + noise.fixed_variance_dn2(grey))
-
-
-def _share(part: Array, whole: Array) -> float:
-    return float(np.sum(part) / np.sum(whole))
 
 
 def _uncorrelated(power: Array, cross: Array, light: Array) -> Array:
@@ -394,9 +390,10 @@ def _fitted(at: Array, values: Array, weight: Array, frequency: float, blur: flo
 
     root = np.sqrt(weight)
     terms = np.linalg.lstsq(root[:, None] * table(at), root * values, rcond=None)[0]
-    # a cross-spectrum has the mean ratio over the frequencies that a bin mixes: half of its Laplacian too much
+    # the ratio to the sharper image is its mean over the frequencies that a bin mixes: half of its Laplacian too much
     points, step = frequency * np.eye(2)[::-1], 0.1 * frequency
     result = table(points) @ terms
     around = np.stack([table(points + sign * step * axis) @ terms for sign in (-1.0, 1.0) for axis in np.eye(2)])
-    excess = 2.0 * (blur / step) ** 2 * np.mean(np.expm1(around - result), axis=0)
-    return np.asarray(result - np.log1p(np.maximum(excess, -0.5)))
+    sign = np.where(result > 0.0, -1.0, 1.0)
+    excess = 2.0 * (blur / step) ** 2 * np.mean(np.expm1(sign * (around - result)), axis=0)
+    return np.asarray(result - sign * np.log1p(np.maximum(excess, -0.5)))
