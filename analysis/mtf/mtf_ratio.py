@@ -139,7 +139,7 @@ def mtf_ratio(
     """
     frequencies = np.atleast_1d(np.asarray(frequency, np.float64))
     if frequencies.ndim != 1 or not np.all((frequencies >= 0.03) & (frequencies <= 0.25)):
-        raise ValueError(f"MTF ratio: frequencies must be 0.03 to 0.25 cycles/pixel, found {frequency}")
+        raise ValueError(f"MTF ratio: frequencies must be 0.03 to 0.25 cycles/pixel, found {frequencies}")
     pair = [checked_image(image, "MTF ratio") for image in (reference, other)]
     if pair[0].shape != pair[1].shape:
         raise ValueError(f"MTF ratio: the images have different sizes, {pair[0].shape} and {pair[1].shape} px")
@@ -260,10 +260,10 @@ class _Ring:
                 flat = np.stack(pair) - means[:, None, None]
                 both = np.fft.fft2(window * flat)[:, ring]
                 parts = [(both.conj() * np.fft.fft2(w * flat)[:, ring]).imag / (-2.0 * np.pi) for w in slopes]
-                stated = [np.nan if noise is None else np.sum(window**2 * _variance(noise, patch)) for patch in pair]
+                own = [np.nan if noise is None else np.sum(window**2 * _variance(noise, patch)) for patch in pair]
                 dark = 0.0 if noise is None else noise.dark_level_dn
                 mixed = np.stack(parts, axis=-1)
-                columns.append((np.abs(both) ** 2, both[0].conj() * both[1], np.array(stated), mixed, means - dark))
+                columns.append((np.abs(both) ** 2, both[0].conj() * both[1], np.array(own), mixed, means - dark))
         if len(columns) < _LEAST_PATCHES:
             raise UndeterminedError(
                 f"MTF ratio: {len(columns)} patches of {side} px without saturated pixels, {_LEAST_PATCHES} are"
@@ -384,9 +384,9 @@ def _fitted(at: Array, values: Array, weight: Array, frequency: float, blur: flo
     def table(f: Array) -> Array:
         square = np.sum(f**2, axis=1)
         u = square / frequency**2 - 1.0
-        twice = np.stack([(f[:, 1] ** 2 - f[:, 0] ** 2) / square, 2.0 * f[:, 0] * f[:, 1] / square])
-        four = np.stack([twice[0] ** 2 - twice[1] ** 2, 2.0 * twice[0] * twice[1]])
-        return np.stack([np.ones_like(u), u, u * u, *twice, *four, *(u * twice)], axis=-1)
+        turn = ((f[:, 1] + 1j * f[:, 0]) / np.sqrt(square)) ** 2
+        around = [np.ones_like(u), turn.real, turn.imag, (turn**2).real, (turn**2).imag]
+        return np.stack([power * part for power in (np.ones_like(u), u, u * u) for part in around], axis=-1)
 
     root = np.sqrt(weight)
     terms = np.linalg.lstsq(root[:, None] * table(at), root * values, rcond=None)[0]

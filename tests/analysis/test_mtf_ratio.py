@@ -69,7 +69,7 @@ def test_ratios_are_those_of_the_blurs(case, noise):
     assert np.sum(pull**2) < 51.0
     assert noise is None or np.sum(pull**2) > 7.5
     assert abs(np.sum(pull)) < 3.0 * np.sqrt(24)
-    assert np.median(sigma) < (0.05 if case.get("contrast") == 0.03 else 0.015)
+    assert np.median(sigma) < (0.05 if case.get("contrast") == 0.03 else 0.02)
 
 
 def test_several_frequencies_and_light():
@@ -107,7 +107,7 @@ def grating(seed):
     ("images", "frequency", "noise", "message"),
     [
         (lambda: [np.ones((300, 300)), np.ones((300, 301))], FREQUENCY, None, "sizes, (300, 300) and (300, 301)"),
-        (lambda: pair(0), 0.4, None, "frequencies must be 0.03 to 0.25 cycles/pixel, found 0.4"),
+        (lambda: pair(0), 0.4, None, "frequencies must be 0.03 to 0.25 cycles/pixel, found [0.4]"),
         (lambda: [image[:80, :80] for image in pair(0)], FREQUENCY, None, "(80, 80) px are too small"),
         (lambda: [image[:200, :200] for image in pair(0)], FREQUENCY, None, "9 patches of 100 px"),
         (lambda: [pair(0)[0], pair(1)[1]], FREQUENCY, NOISE, "do not show one scene displaced by at most 24 px"),
