@@ -260,18 +260,18 @@ class _Ring:
                 flat = np.stack(pair) - means[:, None, None]
                 both = np.fft.fft2(window * flat)[:, ring]
                 parts = [(both.conj() * np.fft.fft2(w * flat)[:, ring]).imag / (-2.0 * np.pi) for w in slopes]
-                own = [np.nan if noise is None else np.sum(window**2 * _variance(noise, patch)) for patch in pair]
+                stated = [np.nan if noise is None else np.sum(window**2 * _variance(noise, patch)) for patch in pair]
                 dark = 0.0 if noise is None else noise.dark_level_dn
                 mixed = np.stack(parts, axis=-1)
-                columns.append((np.abs(both) ** 2, both[0].conj() * both[1], np.array(own), mixed, means - dark))
+                columns.append((np.abs(both) ** 2, both[0].conj() * both[1], np.array(stated), mixed, means - dark))
         if len(columns) < _LEAST_PATCHES:
             raise UndeterminedError(
                 f"MTF ratio: {len(columns)} patches of {side} px without saturated pixels, {_LEAST_PATCHES} are"
                 f" needed at {frequency:g} cycles/pixel; give larger images"
             )
-        power, cross, stated, mixed, light = (np.stack(part) for part in zip(*columns, strict=True))
+        power, cross, variance, mixed, light = (np.stack(part) for part in zip(*columns, strict=True))
         power, mixed = np.moveaxis(power, 1, 0), np.moveaxis(mixed, 1, 0)
-        return cls(grid[ring], power, cross, stated.T, mixed, light.T, _HANN_BINS / side)
+        return cls(grid[ring], power, cross, variance.T, mixed, light.T, _HANN_BINS / side)
 
     @property
     def directions(self) -> Array:
@@ -320,19 +320,19 @@ class _Ring:
 
         def logarithm(chosen: Array) -> Array:
             """Return the logarithms of both ratios from the patches with a weight of 1, (2,)."""
-            own = self.noise @ chosen if stated else noise / patches * chosen.sum()
-            part = np.maximum(np.tensordot(chosen, self.power, (0, 1)) - own[:, None], 1e-9 * signal)
+            random = self.noise @ chosen if stated else noise / patches * chosen.sum()
+            part = np.maximum(np.tensordot(chosen, self.power, (0, 1)) - random[:, None], 1e-9 * signal)
             mean = self.frequency + np.tensordot(chosen, self.mixed, (0, 1)) / part[..., None]
             at, sharper = np.where(second[:, None], mean[1], mean[0]), np.where(second, part[1], part[0])
             values = sign * np.log(np.maximum(np.abs(chosen @ self.cross), 1e-300) / sharper)
             gain = math.log((self.light[1] @ chosen) / (self.light[0] @ chosen))
             return _fitted(at[used], values[used] - gain, weight[used], frequency, self.blur)
 
-        every = np.ones(patches)
-        without = np.array([logarithm(every - one) for one in np.eye(patches)])
+        all_patches = np.ones(patches)
+        without = np.array([logarithm(all_patches - patch) for patch in np.eye(patches)])
         without -= without.mean(axis=0)
         scatter = (patches - 1) / patches * without.T @ without * (patches - 1) / (patches - 3) * _OVERLAP
-        result = logarithm(every)
+        result = logarithm(all_patches)
         # what only one of the images shows may belong to either
         unknown = -0.5 * np.log(same) / math.sqrt(3.0) * np.where(result > 0.0, -1.0, 1.0)
         covariance = scatter + np.outer(unknown, unknown)
@@ -384,8 +384,8 @@ def _fitted(at: Array, values: Array, weight: Array, frequency: float, blur: flo
     def table(f: Array) -> Array:
         square = np.sum(f**2, axis=1)
         u = square / frequency**2 - 1.0
-        turn = ((f[:, 1] + 1j * f[:, 0]) / np.sqrt(square)) ** 2
-        around = [np.ones_like(u), turn.real, turn.imag, (turn**2).real, (turn**2).imag]
+        twice = ((f[:, 1] + 1j * f[:, 0]) / np.sqrt(square)) ** 2
+        around = [np.ones_like(u), twice.real, twice.imag, (twice**2).real, (twice**2).imag]
         return np.stack([power * part for power in (np.ones_like(u), u, u * u) for part in around], axis=-1)
 
     root = np.sqrt(weight)

@@ -82,7 +82,7 @@ class MtfReadings(MeasuredKind):
         for field, *pages in zip(spec.fields, first, second, strict=True):
             images = pages if noise is not None else [page - spec.black_level for page in pages]
             try:
-                out.append(mtf_ratio(*images, 1e3 * spec.frequency * pitch, noise=noise))
+                out.append(mtf_ratio(images[0], images[1], 1e3 * spec.frequency * pitch, noise=noise))
             except ValueError as error:
                 raise self.wrong(f"field {field_text(field)}: {error}", "pair") from error
         return out
