@@ -22,6 +22,7 @@ Spots and detectors
 Modulation transfer function (MTF)
     slanted_edge_mtf          MTF of an edge (ISO 12233), with standard deviations
     bar_mtf                   MTF at the frequency of a group of bars
+    mtf_ratio                 ratio of the MTFs of two images of one unknown scene
 
 Image matching
     distinct_points           well-defined points of an image, spread evenly
@@ -107,6 +108,7 @@ if TYPE_CHECKING:
     from analysis.monitor.recovery import Recovery, recover_monitor
     from analysis.monitor.series_smoother import SmoothedSeries, detect_jumps, smooth_series
     from analysis.mtf.bar_mtf import BarMtf, bar_mtf
+    from analysis.mtf.mtf_ratio import MtfRatio, mtf_ratio
     from analysis.mtf.slanted_edge import EdgeMtf, slanted_edge_mtf
     from analysis.orbit.forward_intersection import StereoPoints, circular_error, intersect_rays, linear_error
     from analysis.orbit.jitter import Lines, find_jitter
@@ -138,6 +140,7 @@ _MODULES = {
     "monitor.recovery": ("Recovery", "recover_monitor"),
     "monitor.series_smoother": ("SmoothedSeries", "detect_jumps", "smooth_series"),
     "mtf.bar_mtf": ("BarMtf", "bar_mtf"),
+    "mtf.mtf_ratio": ("MtfRatio", "mtf_ratio"),
     "mtf.slanted_edge": ("EdgeMtf", "slanted_edge_mtf"),
     "orbit.forward_intersection": ("StereoPoints", "circular_error", "intersect_rays", "linear_error"),
     "orbit.jitter": ("Lines", "find_jitter"),
@@ -177,6 +180,7 @@ __all__ = [
     "Matches",
     "MonitorCalibration",
     "MonitorGeometry",
+    "MtfRatio",
     "NoiseModel",
     "PhotonTransfer",
     "Pupil",
@@ -215,6 +219,7 @@ __all__ = [
     "linear_error",
     "make_block",
     "match_windows",
+    "mtf_ratio",
     "nm_to_noll",
     "photon_transfer",
     "proportion_interval",

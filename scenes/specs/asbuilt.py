@@ -49,7 +49,9 @@ class ReadingsSpec(spec.Spec):
     @property
     def has_data(self) -> bool:
         """True if the file holds the data or refers to a file of data."""
-        return any(getattr(self, key, None) is not None for key in ("values", "along_line", "file", "zernikes", "maps"))
+        return any(
+            getattr(self, key, None) is not None for key in ("values", "along_line", "file", "pair", "zernikes", "maps")
+        )
 
     @model_validator(mode="after")
     def _one_for_each(self) -> ReadingsSpec:
@@ -155,8 +157,27 @@ class FocusReadingsSpec(ReadingsSpec):
         return self
 
 
-class MtfReadingsSpec(ReadingsSpec):
-    """MTF of the optics at several fields and one spatial frequency.
+class RecordedImagesSpec(ReadingsSpec):
+    """Base of measurements that may be images of the camera's detector.
+
+    Attributes
+    ----------
+    gain : float
+        Electrons per grey value.
+    saturation : float | None
+        Grey value from which a pixel is saturated and is not used; by default the largest that the file can hold.
+    orientation : str
+        Rotation or reflection that brings the images to columns along the line and rows along the track, in the words
+        of `check`.
+    """
+
+    gain: Annotated[spec.Number, Field(gt=0.0, le=1e6)] = 1.0
+    saturation: Annotated[spec.Number, Field(gt=0.0)] | None = None
+    orientation: spec.Text = "as it is"
+
+
+class MtfReadingsSpec(RecordedImagesSpec):
+    """MTF of the optics at several fields and one spatial frequency, or its ratio in two positions of the focal plane.
 
     Attributes
     ----------
@@ -168,24 +189,56 @@ class MtfReadingsSpec(ReadingsSpec):
         MTF at each field for a pattern of lines perpendicular to the line CCD.
     along_track : tuple[float, ...] | None
         MTF at each field for a pattern of lines parallel to the line CCD.
-    sigma : float
-        Standard deviation of each MTF value.
+    sigma : float | None
+        Standard deviation of each MTF value; of a `pair`, of an error of each ratio, as a fraction, that is added to
+        that of the images, 0 by default.
     defocus : float
         Shift of the focal plane along its normal, downstream, during the measurement, in metres. The MTF in focus does
         not have a sign of defocus; that of a page of edges out of focus by more than the prior's sigma has.
+    reference_defocus : float | None
+        Shift of the focal plane during the exposure of reference images. Readings are then the logarithms of the ratios
+        of the MTF with `defocus` to that with this shift.
+    pair : tuple[str, str] | None
+        Images of ordinary textured scenes with `reference_defocus` and with `defocus`, FITS or TIFF files with a page
+        for each field, in their order; both show the same scene, and values are linear in light.
+    read_noise : float | None
+        Standard deviation of the noise of a pixel without light in a `pair`, in electrons; by default all that the
+        images do not have in common is noise.
+    black_level : float
+        Grey value without light in a `pair`.
     """
 
     fields: Fields
     frequency: Annotated[spec.Number, Field(gt=0.0, le=10_000.0)] | None = None
     along_line: Annotated[tuple[Modulation, ...], Field(min_length=1, max_length=200)] | None = None
     along_track: Annotated[tuple[Modulation, ...], Field(min_length=1, max_length=200)] | None = None
-    sigma: Annotated[spec.Number, Field(gt=0.0, le=1.0)]
+    sigma: Annotated[spec.Number, Field(gt=0.0, le=1.0)] | None = None
     defocus: Annotated[float, Quantity(LENGTH, largest="100 mm")] = 0.0
+    reference_defocus: Annotated[float, Quantity(LENGTH, largest="100 mm")] | None = None
+    pair: tuple[spec.Reference, spec.Reference] | None = None
+    read_noise: Annotated[spec.Number, Field(ge=0.0, le=1e6)] | None = None
+    black_level: spec.Number = 0.0
 
     @model_validator(mode="after")
-    def _as_many(self) -> MtfReadingsSpec:
+    def _complete(self) -> MtfReadingsSpec:
         if (self.along_line is None) != (self.along_track is None):
             raise Problem("MTF along one direction only", "along_line or along_track", "both", within=("along_line",))
+        if self.sigma is None and self.pair is None:
+            raise Problem("'sigma' is missing", None, "sigma: 0.005, or a pair of images", within=("sigma",))
+        if self.reference_defocus is None:
+            if self.pair is not None:
+                allowed = "reference_defocus, that of the first image"
+                raise Problem("the focus of the first image is missing", None, allowed, within=("reference_defocus",))
+            return self
+        if self.along_line is not None:
+            allowed = "a pair of images, or `simulate: {}`"
+            raise Problem("values of one image with a reference", "along_line", allowed, within=("along_line",))
+        if self.frequency is None:
+            allowed = "a low one, at which the MTF falls steadily with defocus"
+            raise Problem("a ratio of images needs a frequency", None, allowed, within=("frequency",))
+        if self.reference_defocus == self.defocus:
+            allowed = "two positions of the focal plane; images in the same focus do not show it"
+            raise Problem("both images have the same defocus", None, allowed, within=("reference_defocus",))
         return self
 
 
@@ -347,7 +400,7 @@ class PositionReadingsSpec(ReadingsSpec):
         return self
 
 
-class ImageReadingsSpec(ReadingsSpec):
+class ImageReadingsSpec(RecordedImagesSpec):
     """Images of stars, in focus or defocused, one for each field and all in one position of the focal plane.
 
     Columns run along the line and rows along the track, toward +Y and +X of the focal plane. Position, flux and
@@ -365,15 +418,8 @@ class ImageReadingsSpec(ReadingsSpec):
     seeing : float | 'free'
         Full width at half maximum of the Gaussian blur by air and motion, in radians; `free` to estimate it for every
         star, 0 by default.
-    gain : float
-        Electrons per grey value.
     read_noise : float
         Standard deviation of the noise of a pixel without light, in electrons.
-    saturation : float | None
-        Grey value from which a pixel is saturated and is not used; by default the largest that the file can hold.
-    orientation : str
-        Rotation or reflection that brings the images to columns along the line and rows along the track, in the words
-        of `check`.
     pixels : int
         Rows and columns of simulated images.
     flux : float
@@ -386,10 +432,7 @@ class ImageReadingsSpec(ReadingsSpec):
     file: spec.Reference | None = None
     defocus: Annotated[float, Quantity(LENGTH, largest="100 mm")] = 0.0
     seeing: Literal["free"] | Annotated[float, Quantity(ANGLE, smallest="0 arcsec", largest="1 arcmin")] = 0.0
-    gain: Annotated[spec.Number, Field(gt=0.0, le=1e6)] = 1.0
     read_noise: Annotated[spec.Number, Field(gt=0.0, le=1e6)]
-    saturation: Annotated[spec.Number, Field(gt=0.0)] | None = None
-    orientation: spec.Text = "as it is"
     pixels: Annotated[spec.Whole, Field(ge=8, le=256)] = 32
     flux: Annotated[spec.Number, Field(gt=0.0, le=1e12)] = 1e6
     background: Annotated[spec.Number, Field(ge=0.0, le=1e9)] = 0.0

@@ -6,6 +6,7 @@ from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Any
 
 import numpy as np
 import pytest
@@ -42,6 +43,7 @@ from tests.twin.published_life import (
 )
 from tests.twin.test_operate import run
 from twin.monitor.monitor_experiment import MonitorExperiment
+from twin.operate.estimate.learned_model import contradicted_moves
 from twin.operate.estimate.operation_filter import Operation
 from twin.operate.overview import Overview
 from twin.operate.record.entries import MICRO, Entry, micros
@@ -202,6 +204,23 @@ def test_moves_entered_wrongly_are_named_with_the_mistakes(mistakes: tuple, tmp_
     for text, (_, day, _, said) in zip(named, mistakes, strict=True):
         assert f"the move of {day}" in text
         assert said in text
+
+
+@pytest.mark.second
+def test_larger_sigmas_contradict_no_move(monkeypatch, tmp_path: Path):
+    """A size wrong by 85 sigma is named where all sigmas are ten times as large, and not where they are fifty times."""
+    moves = [move_entry(day, 9.5 if day == "1994-03-07" else size) for day, size in MOVES.items()]
+    calls: list[tuple] = []
+
+    def noted(*call: Any) -> dict[str, str]:
+        calls.append(call)
+        return {}
+
+    monkeypatch.setattr("twin.operate.estimate.operation_filter.contradicted_moves", noted)
+    with record_of(tmp_path / "r", moves, entries_of(drawn(3, every=40.0), 3)) as history:
+        Operation(history, plan(tmp_path / "plan")).filter_readings()
+    (*how, _, text) = calls[-1]
+    assert [len(contradicted_moves(*how, factor, text)) for factor in (1.0, 10.0, 50.0)] == [1, 1, 0]
 
 
 def few(folder: Path, *files: list, changes: dict[str, str] | None = None, causes: str = LAW_ALONE) -> tuple:

@@ -120,6 +120,8 @@ def test_matches_lie_where_the_terrain_is_seen(landscape: Landscape, found: Any)
         ground = landscape.ground(source, points.lines[source].position)
         for name, line in points.searched_lines.items():
             assert line.accepted.mean() > 0.4, (source, name)
+            # at the matched height the prediction lies beside the match, by the shifts across the epipolar line
+            assert np.max(np.abs(line.position - line.predicted)[line.accepted]) < 5.0, (source, name)
             miss = (line.position - landscape.seen(name, ground))[line.accepted]
             wrong.append(np.abs(miss).max())
             spread = line.covariance[line.accepted]

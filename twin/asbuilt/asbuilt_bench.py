@@ -24,7 +24,6 @@ from twin.asbuilt.measured_kinds import (
     DistortionReadings,
     FocusReadings,
     MeasuredKind,
-    MtfReadings,
     PositionReadings,
     SightReadings,
     Site,
@@ -33,6 +32,7 @@ from twin.asbuilt.measured_kinds import (
     View,
     WavefrontReadings,
 )
+from twin.asbuilt.mtf_readings import MtfReadings
 from twin.asbuilt.parameters import Parameters, with_wavefront
 from twin.asbuilt.star_images import ImageReadings, StarResidual
 from twin.camera.camera_optics import CameraOptics

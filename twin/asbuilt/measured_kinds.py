@@ -17,14 +17,14 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from analysis.arrays import ARCSEC
+from analysis.arrays import ARCSEC, MeasurementError
+from analysis.images.image_file import ImageError, ImageFile, Region
 from analysis.instrument_state.state_estimate import MeasuredGroup
-from optics.geometry.tree import Motion, State, compose_each
+from analysis.wavefront_maps.pupil_fit import Orientation
+from optics.geometry.tree import State
 from optics.numerics.array_math import PhysicalError
 from optics.raytrace.first_order import line_tangents
-from scenes.models.camera_model import focal_plane_body
 from scenes.specs import asbuilt as specs
-from scenes.specs.instrument import BASE
 from scenes.specs.perturbation import find_node
 from scenes.specs.tolerance import MeritSpec
 from scenes.yaml.errors import InputError, Problem
@@ -218,6 +218,27 @@ class MeasuredKind(ABC):
         """Return the path of a file that the measurement names."""
         return Path(self.spec.file_at((key,), value, Path(self.site.test.source.file).parent, description))
 
+    def pages(self, key: str, value: str) -> np.ndarray:
+        """Return the images of a file, one for each of F fields, in the program's orientation, (F, R, C).
+
+        Grey values are those of the file; NaN where they are saturated.
+        """
+        spec = self.spec
+        path = self.file(key, value, "an image file with a page for each field")
+        try:
+            source = ImageFile.open(path, choose="")
+            header = source.header
+            pages = source.read({"image": Region(0, 0, header.rows, header.columns)})["image"]
+            orientation = Orientation.named(spec.orientation)
+        except (ImageError, MeasurementError) as error:
+            raise self.wrong(str(error), key) from error
+        if len(pages) != len(spec.fields):
+            text = f"{len(pages)} pages in the file, {len(spec.fields)} fields in the test"
+            raise self.wrong(text, key, "one page for each field, in their order", str(path))
+        limit = header.full_scale if spec.saturation is None else spec.saturation
+        linear = np.where(pages >= limit, np.nan, pages.astype(np.float64))
+        return np.stack([orientation.values(page) for page in linear])
+
     def wrong(self, text: str, key: str, allowed: str | None = None, value: str | None = None) -> InputError:
         """Return an InputError whose position is a key of the measurement in the file."""
         return InputError(self.spec.issue(Problem(text, value, allowed), (key,)))
@@ -327,36 +348,6 @@ class FocusReadings(MeasuredKind):
             raise self.wrong(
                 f"it holds no best foci ({error!r})", "file", "the focus.json of a run of twin.lab focus", str(path)
             ) from error
-
-
-class MtfReadings(MeasuredKind):
-    """Measured MTF of the optics at field points, along the line and along the track."""
-
-    kind = "mtf"
-    shown = ("", 1.0)
-
-    def prepare(self) -> None:
-        """Set up the evaluator that computes this MTF for the states of the instrument."""
-        spec = self.spec
-        asked = MeritSpec(kind="mtf", fields=spec.fields, frequency=spec.frequency, at_least=0.0)
-        self.tried = self.site.bench({self.name: asked})
-        self.plane = focal_plane_body(f"{BASE}/{self.site.camera}")
-        texts = field_texts(spec.fields)
-        self.labels = tuple(f"{text} {direction}" for text in texts for direction in ("line", "track"))
-        self.blocks = tuple(f"field {text}" for text in texts for _ in range(2))
-
-    def predict(self, view: View) -> np.ndarray:
-        """Return the MTF of each field and direction in every state."""
-        if not self.spec.defocus:
-            return self.tried.parts_of(view.states)
-        instrument = self.site.experiment.instrument
-        bodies = {body.path: body for body in instrument.assembly.tree.bodies}
-        shift = {self.plane: Motion(shift=(0.0, 0.0, self.spec.defocus))}
-        return self.tried.parts_of(compose_each([(state, shift) for state in view.states], bodies))
-
-    def read(self) -> np.ndarray:
-        """Return the MTF values in the test's file."""
-        return np.stack([self.spec.along_line, self.spec.along_track], axis=-1).ravel()
 
 
 class DistortionReadings(MeasuredKind):

@@ -9,10 +9,7 @@ from functools import cached_property
 
 import numpy as np
 
-from analysis.arrays import MeasurementError
-from analysis.images.image_file import ImageError, ImageFile, Region
 from analysis.instrument_state.state_estimate import ConsistencyTest, MeasuredGroup
-from analysis.wavefront_maps.pupil_fit import Orientation
 from optics.numerics.backend import one_blas_thread
 from optics.waves.edge_shadow import IlluminatedStop
 from optics.waves.pupil_terms import orders, products, slopes
@@ -200,24 +197,11 @@ class ImageReadings(MeasuredKind):
     @cached_property
     def _recorded(self) -> np.ndarray:
         """Images of the file in the program's orientation, (F, R, C), electrons; NaN where they are saturated."""
-        spec = self.spec
-        path = self.file("file", spec.file, "an image file with a page for each star")
-        try:
-            source = ImageFile.open(path, choose="")
-            header = source.header
-            pages = source.read({"image": Region(0, 0, header.rows, header.columns)})["image"]
-            orientation = Orientation.named(spec.orientation)
-        except (ImageError, MeasurementError) as error:
-            raise self.wrong(str(error), "file") from error
-        if len(pages) != len(spec.fields):
-            text = f"{len(pages)} pages in the file, {len(spec.fields)} fields in the test"
-            raise self.wrong(text, "file", "one page for each field, in their order", str(path))
-        limit = header.full_scale if spec.saturation is None else spec.saturation
-        linear = np.where(pages >= limit, np.nan, pages.astype(np.float64)) * spec.gain
-        for k, page in enumerate(linear):
+        pages = self.pages("file", self.spec.file)
+        for k, page in enumerate(pages):
             if len(np.unique(page[np.isfinite(page)])) < 2:
                 raise self.wrong("a page without a star", "file", "different values below saturation", f"page {k}")
-        return np.stack([orientation.values(page) for page in linear])
+        return pages * self.spec.gain
 
     def read(self) -> np.ndarray:
         """Return the pixels of all images in the file, electrons; NaN where they are saturated."""

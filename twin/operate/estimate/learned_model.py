@@ -187,8 +187,7 @@ def learned_terms(
         Name of a move -> warning that the readings contradict it.
     """
     terms, prior = series_filter.terms, series_filter.prior
-    if terms is None:
-        return ()
+    assert terms is not None
     at = series_filter.space.term_states
     mean, sigma = state.mean[at], np.sqrt(np.maximum(np.diag(state.covariance)[at], 0.0))
     out = []
