@@ -352,7 +352,7 @@ class Corrections:
         slopes = np.empty((count, depth, sum(widths)))
         along, column = by_station @ self.axes, 0
         for part, (_, blend), width in zip(self.parts, self._blends, widths, strict=True):
-            by = (by_turn if part.turns else along) * part.sigma
+            by = (by_turn if part.rotates else along) * part.sigma
             for k in range(blend.shape[1]):
                 start = column + 3 * k
                 np.multiply(by, blend[:, k, None, None], out=slopes[:, :, start : start + 3])

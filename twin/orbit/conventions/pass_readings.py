@@ -328,9 +328,7 @@ def _seconds(value: float) -> str:
 TESTED_CONVENTIONS: Mapping[str, TestedConvention] = FrozenMap(
     {
         "quaternion_scalar": TestedConvention("scalar of the quaternion", "platform.scalar", ("last", "first")),
-        "quaternion_turns": TestedConvention(
-            "quaternion turns", "platform.direction", ("body_to_frame", "frame_to_body")
-        ),
+        "quaternion_turns": TestedConvention("quaternion turns", "platform.sense", ("body_to_frame", "frame_to_body")),
         "body_axes": TestedConvention("body x, y, z point", "platform.body_axes", (), ", ".join),
         "angle_sequence": TestedConvention(
             "sequence of the angles", "platform.sequence", ("xyz", "xzy", "yxz", "yzx", "zxy", "zyx")

@@ -36,7 +36,7 @@ _ROTATION_STEP = 1e-6
 """Step of the derivatives with respect to rotation, in radians: about a metre on the ground, over which the ground
 position is linear to 1e-6.
 """
-_HEIGHT_STEP = 10.0
+_RAISED = 10.0
 """Step of the derivatives with respect to height, in metres."""
 _EDGE = 0.5
 """Half step of the derivatives with respect to line and pixel, in pixels."""
@@ -194,9 +194,7 @@ def _derivatives(sensor: Sensor, line: Array, pixel: Array, height: float, level
         (seen(line, pixel, moved=step) - seen(line, pixel, moved=-step)) / (2.0 * step.max())
         for step in np.diag([_SHIFT_STEP] * 3 + [_ROTATION_STEP] * 3)
     ]
-    raised = (seen(line, pixel, height + _HEIGHT_STEP) - seen(line, pixel, height - _HEIGHT_STEP)) / (
-        2.0 * _HEIGHT_STEP
-    )
+    raised = (seen(line, pixel, height + _RAISED) - seen(line, pixel, height - _RAISED)) / (2.0 * _RAISED)
     # a longer principal distance moves the ground positions of pixels toward the line's middle
     from_middle = pixel - 0.5 * (sensor.camera.pixels - 1)
     interior = np.stack([by_line, by_pixel, -by_pixel * from_middle[:, None]], axis=-1)

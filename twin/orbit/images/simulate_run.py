@@ -277,9 +277,7 @@ GEOREFERENCE: Record[Raster] = Record(
 MATCHED: Record[image_points.MatchedLine] = Record(
     "Points of one kind in one line. Shifts, measured minus predicted, and sigmas of the fit, are medians of "
     "the accepted points.",
-    Quantity(
-        "measured", lambda line: np.isfinite(line.position[:, 0]).sum(), "points for which the fit gave a position"
-    ),
+    Quantity("measured", lambda line: np.isfinite(line.position[:, 0]).sum(), "points with a position from the fit"),
     Quantity("matched", lambda line: line.matched.sum(), "of these, points that passed the thresholds of the matching"),
     Quantity("accepted", lambda line: line.accepted.sum(), "of these, points that agree with their neighbours"),
     Quantity(

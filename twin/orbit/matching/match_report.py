@@ -112,14 +112,8 @@ def rational_report(run: RationalMatch) -> Report:
     rows = {name: MATCHED(line) for name, line in pairs.items() if line.accepted.any()}
     for row in rows.values():
         row["consensus_scatter_px"] = row["consensus_scatter_px"] or "\N{EM DASH}"
-    keys = (
-        "measured",
-        "matched",
-        "accepted",
-        "displacement_lines_px",
-        "displacement_pixels_px",
-        "consensus_scatter_px",
-    )
+    displacement = ("displacement_lines_px", "displacement_pixels_px")
+    keys = ("measured", "matched", "accepted", *displacement, "consensus_scatter_px")
     caption = (
         "Displacement: median of the accepted from the prediction at the height of each point, in lines and samples;"
         " it is that of the polynomials across the epipolar lines. Scatter: beyond the covariances; a dash where these"

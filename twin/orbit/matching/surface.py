@@ -371,9 +371,7 @@ def _displacements(first: np.ndarray, second: np.ndarray, most: int) -> np.ndarr
     partner = np.where(np.isfinite(there), columns - there, -1.0)
     at = np.clip(np.rint(partner).astype(int), 0, there.shape[1] - 1)
     agrees = (np.abs(back[rows, at] - there) <= _AGREE) & (partner >= 0.0) & (partner <= there.shape[1] - 1.0)
-    whole, whole_second = (
-        minimum_filter(np.isfinite(image), _CORRELATED, mode="constant") for image in (first, second)
-    )
+    whole, whole_second = (minimum_filter(np.isfinite(v), _CORRELATED, mode="constant") for v in (first, second))
     alike = _correlation(first, second[rows, at]) >= _LEAST_CORRELATION
     return np.where(agrees & whole & whole_second[rows, at] & alike, there, np.nan)
 

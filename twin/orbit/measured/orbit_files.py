@@ -111,7 +111,7 @@ class AttitudeReadings:
         Time scale of the clock; None where the file does not specify it.
     scalar : Scalar or None
         Position of the quaternion's scalar part, first or last; None where the file does not specify it.
-    direction : Turns or None
+    sense : RotationDirection or None
         Direction of the rotation, body to frame or frame to body; None where the file does not specify it.
     """
 
@@ -122,7 +122,7 @@ class AttitudeReadings:
     frame: str | None = None
     scale: str | None = None
     scalar: Scalar | None = None
-    direction: RotationDirection | None = None
+    sense: RotationDirection | None = None
 
     def taken(self, part: slice) -> AttitudeReadings:
         """Return the attitude readings that a slice of their indices selects."""

@@ -61,7 +61,7 @@ class Conventions:
         Seconds to be added to the times.
     scalar : str
         Position of a quaternion's scalar part.
-    direction : str
+    sense : str
         Direction of a quaternion's rotation.
     body_axes : tuple of str
         Axes of the body whose attitude the file gives.
@@ -78,7 +78,7 @@ class Conventions:
     orbit_offset: float = 0.0
     attitude_offset: float = 0.0
     scalar: str = "last"
-    direction: str = "body_to_frame"
+    sense: str = "body_to_frame"
     body_axes: tuple[str, str, str] = ("forward", "right", "down")
     sequence: str = "xyz"
     law: Attitude = field(default_factory=Attitude)
@@ -135,7 +135,7 @@ def read_platform(spec: PlatformFilesSpec, folder: Path) -> tuple[PlatformReadin
         _of_file_or_test(spec_of, "scalar", spec_of.scalar, attitude.scalar, "the position of the scalar")
         if quaternions
         else "last",
-        _of_file_or_test(spec_of, "direction", spec_of.direction, attitude.direction, "the direction of the rotation")
+        _of_file_or_test(spec_of, "direction", spec_of.direction, attitude.sense, "the direction of the rotation")
         if quaternions
         else "body_to_frame",
         spec_of.body_axes,
@@ -271,7 +271,7 @@ def _body(attitude: orbit_files.AttitudeReadings, conventions: Conventions) -> n
     if attitude.quaternion is not None:
         q = attitude.quaternion if conventions.scalar == "last" else np.roll(attitude.quaternion, -1, axis=1)
         matrix = np.asarray(Rotation.from_quat(q).as_matrix())
-        if conventions.direction == "frame_to_body":
+        if conventions.sense == "frame_to_body":
             matrix = np.swapaxes(matrix, 1, 2)
     else:
         assert attitude.angles is not None
@@ -416,7 +416,7 @@ def _counted(spec: OrbitFileSpec | AttitudeFileSpec, clock: earth_orientation.Re
     )
 
 
-_ITRS = Conventions("ITRS", "UTC", "ITRS", "UTC", scalar="first", direction="body_to_frame")
+_ITRS = Conventions("ITRS", "UTC", "ITRS", "UTC", scalar="first", sense="body_to_frame")
 
 
 @dataclass(frozen=True, eq=False)
