@@ -155,7 +155,7 @@ class ModelScene:
         columns = {"shift": np.ones(len(position)), "drift": scaled[:, 0], "affine": scaled[:, 1]}
         return np.stack([columns[term] for term in self.sigma], axis=1)
 
-    def growth(self, coefficients: Array) -> Array:
+    def jacobian(self, coefficients: Array) -> Array:
         """Return the derivatives (2, 2) of the correction (2,) of line and sample with respect to line and sample.
 
         Parameters
@@ -407,10 +407,10 @@ class Block:
 
     def correction_sigma(self, scene: ModelScene) -> Array:
         """Return the prior standard deviations (2, K) of an image's correction, with the errors that it shares."""
-        own = np.array(list(scene.sigma.values())).T
-        shared = [one.sigma for one in self.shared if scene.name in one.scenes]
+        sigma = np.array(list(scene.sigma.values())).T
+        shared = [errors.sigma for errors in self.shared if scene.name in errors.scenes]
         common = np.array([shared[0].get(term, (0.0, 0.0)) for term in scene.sigma]).T if shared else 0.0
-        return np.hypot(own, common)
+        return np.hypot(sigma, common)
 
     @property
     def sensors(self) -> tuple[str, ...]:
@@ -565,11 +565,11 @@ def make_block(
     start, spread = np.array(points, np.float64), np.asarray(camera_sigma, np.float64)
     if start.ndim != 2 or start.shape[1] != 3 or spread.shape != (4,):
         raise BlockError(f"block: need points (m, 3) and camera_sigma (4,), found {start.shape} and {spread.shape}")
-    given = np.full(len(start), np.inf) if control_sigma is None else np.asarray(control_sigma, np.float64)
-    if given.shape != (len(start),) or not np.all(given > 0):
+    sigma = np.full(len(start), np.inf) if control_sigma is None else np.asarray(control_sigma, np.float64)
+    if sigma.shape != (len(start),) or not np.all(sigma > 0):
         raise BlockError(f"block: control_sigma must be {len(start)} positive sigmas, inf for tie points")
-    role = np.where(np.isfinite(given), "control", "tie").astype(object)
-    covariance = np.where(np.isfinite(given), given, 1.0)[:, None, None] ** 2 * np.eye(3)
+    role = np.where(np.isfinite(sigma), "control", "tie").astype(object)
+    covariance = np.where(np.isfinite(sigma), sigma, 1.0)[:, None, None] ** 2 * np.eye(3)
     passes = tuple(dict.fromkeys(name for name, _ in images))
     same = np.asarray(np.kron(np.ones((len(passes),) * 2), np.diag(spread**2)), np.float64)
     known = CameraPrior(np.zeros((len(passes), 4)), same)

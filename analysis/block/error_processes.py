@@ -108,8 +108,8 @@ class Law:
 
         `seconds` is the time from the middle of the scope (the pass, the passes of a star tracker, or the block).
         """
-        growth = {"rate": abs(seconds), "walk": float(np.sqrt(abs(seconds)))}.get(self.kind, 1.0)
-        a, b, c = (s * growth for s in self.sigma)
+        factor = {"rate": abs(seconds), "walk": float(np.sqrt(abs(seconds)))}.get(self.kind, 1.0)
+        a, b, c = (s * factor for s in self.sigma)
         return a, b, c
 
 
@@ -251,7 +251,7 @@ class Part:
 
     Attributes
     ----------
-    turns : bool
+    rotates : bool
         True for a rotation of the body, in radians; False for a shift of the station along the axes of the pass, in
         metres.
     first : int
@@ -260,7 +260,7 @@ class Part:
         Unknowns of the error model.
     """
 
-    turns: bool
+    rotates: bool
     first: int
     support: Support
 
@@ -295,7 +295,7 @@ class Corrections:
     @cached_property
     def _blends(self) -> tuple[tuple[Indices, Array], ...]:
         """Indices and interpolation coefficients, at the n times, of the unknowns of each error model."""
-        return tuple(one.support.blend(self.time) for one in self.parts)
+        return tuple(part.support.blend(self.time) for part in self.parts)
 
     @property
     def columns(self) -> Indices:
@@ -306,8 +306,8 @@ class Corrections:
             parts.append(columns.reshape(len(number), 3 * number.shape[1]))
         return np.concatenate(parts, axis=1)
 
-    def factors(self, turns: bool) -> tuple[Indices, Array]:
-        """Return indices and coefficients of the unknowns for the rotations or, if not `turns`, for the shifts.
+    def factors(self, rotates: bool) -> tuple[Indices, Array]:
+        """Return indices and coefficients of the unknowns for the rotations or, if not `rotates`, for the shifts.
 
         Both are (n, w, 3) for n times, w unknowns and three axes; coefficients are in radians or metres per unit of the
         unknown.
@@ -315,7 +315,7 @@ class Corrections:
         count = len(self.time)
         columns, factors = [np.zeros((count, 0, 3), np.intp)], [np.zeros((count, 0, 3))]
         for part, (number, blend) in zip(self.parts, self._blends, strict=True):
-            if part.turns == turns:
+            if part.rotates == rotates:
                 columns.append(part.first + 3 * number[:, :, None] + np.arange(3))
                 factors.append(blend[:, :, None] * part.sigma)
         return np.concatenate(columns, axis=1), np.concatenate(factors, axis=1)
@@ -329,7 +329,7 @@ class Corrections:
         for part, (number, blend) in zip(self.parts, self._blends, strict=True):
             unknowns = part.sigma * x[part.first : part.first + part.support.size].reshape(-1, 3)
             value = np.einsum("nw,nwa->na", blend, unknowns[number])
-            if part.turns:
+            if part.rotates:
                 rotation += value
             else:
                 shift += value
@@ -352,7 +352,7 @@ class Corrections:
         slopes = np.empty((count, depth, sum(widths)))
         along, column = by_station @ self.axes, 0
         for part, (_, blend), width in zip(self.parts, self._blends, widths, strict=True):
-            by = (by_turn if part.turns else along) * part.sigma
+            by = (by_turn if part.rotates else along) * part.sigma
             for k in range(blend.shape[1]):
                 start = column + 3 * k
                 np.multiply(by, blend[:, k, None, None], out=slopes[:, :, start : start + 3])

@@ -103,7 +103,7 @@ def simplified(block: Block) -> Block:
     scenes = tuple(
         replace(scene, sigma=shift(scene.sigma)) if isinstance(scene, ModelScene) else scene for scene in block.scenes
     )
-    shared = tuple(replace(one, sigma=shift(one.sigma)) for one in block.shared)
+    shared = tuple(replace(errors, sigma=shift(errors.sigma)) for errors in block.shared)
     attitude, station = whole(block.attitude), whole(block.station)
     return replace(block, scenes=scenes, attitude=attitude, station=station, angles=(), shared=shared)
 

@@ -211,7 +211,7 @@ class ModelImage:
         coefficients = (self.unit * x[self.change]).reshape(2, -1)
         miss = position + basis @ coefficients.T - self.scene.rays.image[which]
         by_x = coefficient_rows(basis) * self.unit
-        by_ground = (np.eye(2) + self.scene.growth(coefficients)) @ slope
+        by_ground = (np.eye(2) + self.scene.jacobian(coefficients)) @ slope
         return np.einsum("nij,nj->ni", white, miss), white @ by_x, white @ by_ground
 
     def taken(self, which: Indices, point: Indices) -> ModelImage:
@@ -316,7 +316,7 @@ class FixedPoints:
         Name of the set.
     point : (n,) ndarray of int
         Indices of the points.
-    given : (n, 3) ndarray
+    surveyed : (n, 3) ndarray
         Surveyed coordinates, ITRS, in metres.
     white : (n, 3, 3) ndarray
         Matrices that whiten the misclosures.
@@ -329,7 +329,7 @@ class FixedPoints:
 
     name: str
     point: Indices
-    given: Array
+    surveyed: Array
     white: Array
     datum: Indices = field(default_factory=lambda: np.zeros(0, np.intp))
     group: str = "control"
@@ -344,12 +344,12 @@ class FixedPoints:
         """Return whitened misclosures of surveyed coordinates, with derivatives for the common shift and points."""
         white = self.white[which]
         shift = x[self.datum] if len(self.datum) else np.zeros(3)
-        miss = np.einsum("nij,nj->ni", white, ground - self.given[which] + shift)
+        miss = np.einsum("nij,nj->ni", white, ground - self.surveyed[which] + shift)
         return miss, white[:, :, : len(self.datum)], white
 
     def taken(self, which: Indices, point: Indices) -> FixedPoints:
         """Return selected control points as a new set, with the given indices of their ground points."""
-        return replace(self, point=point, given=self.given[which], white=self.white[which])
+        return replace(self, point=point, surveyed=self.surveyed[which], white=self.white[which])
 
 
 @dataclass(frozen=True, eq=False)
@@ -919,7 +919,7 @@ class Pool(Protocol):
     def count(self) -> int:
         """Number of worker processes."""
 
-    def hold(self, things: Sequence[Any]) -> Sequence[Any]:
+    def hold(self, objects: Sequence[Any]) -> Sequence[Any]:
         """Send each object to one process and return handles that stand for it in the arguments of `results`."""
 
     def results(self, work: Callable[[tuple[Any, ...]], Any], arguments: Sequence[tuple[Any, ...]]) -> list[Any]:
@@ -991,7 +991,7 @@ class SharedReduction:
         size, count = self.whole.size, self.whole.count
         data, right = sparse.csc_matrix((size, size)), np.zeros(size)
         spread, start = np.zeros((count, 3, 3)), np.zeros((count, 3))
-        square = dict.fromkeys((one.group for one in self.whole.sets), 0.0)
+        square = dict.fromkeys((packets.group for packets in self.whole.sets), 0.0)
         parts = self.pool.results(_eliminated, list(zip(self.held, self._states(state), strict=True)))
         for points, part in zip(self.points, parts, strict=True):
             data, right = data + part.data, right + part.right

@@ -223,10 +223,10 @@ class Reweighted(Protocol[S, T]):
     def solve(self, at: S, screening: bool) -> tuple[S, T]:
         """Return state and solution of the adjustment with fixed weights; a rough solution suffices while screening."""
 
-    def judged(self, at: S, found: T) -> tuple[Array, ...]:
+    def judged(self, at: S, solution: T) -> tuple[Array, ...]:
         """Return the standardised residuals of each set of observations, (n, d) for n measurements of d equations."""
 
-    def tests(self, at: S, found: T) -> Mapping[str, GroupTest]:
+    def tests(self, at: S, solution: T) -> Mapping[str, GroupTest]:
         """Return the test of the residuals' variance of each group of observations, by its name."""
 
     def weighed(self, at: S, weight: tuple[Array, ...], factor: Mapping[str, float]) -> S:

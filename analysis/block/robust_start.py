@@ -94,9 +94,9 @@ def scales(sets: Sequence[Packets], sizes: Sequence[Array]) -> dict[str, float]:
     groups: dict[str, list[Array]] = {}
     for packets, size in zip(sets, sizes, strict=True):
         groups.setdefault(packets.group, []).append(size / _median(packets.rows))
-    every = {group: np.sort(np.concatenate(parts)) for group, parts in groups.items()}
+    norms = {group: np.sort(np.concatenate(parts)) for group, parts in groups.items()}
     # the lower median of two measurements is that of the better one
-    return {group: max(1.0, float(size[(len(size) - 1) // 2])) for group, size in every.items()}
+    return {group: max(1.0, float(size[(len(size) - 1) // 2])) for group, size in norms.items()}
 
 
 def _huber(sets: Sequence[Packets], sizes: Sequence[Array]) -> tuple[Array, ...]:

@@ -120,8 +120,8 @@ class StripAdjustment:
         """
         if rays.time is None:
             raise CalibrationError("strip adjustment: these rays have no times")
-        turned = replace(rays, attitude=rays.attitude @ self._rotation)
-        corrected_rays = self._shared.corrected_at(_NAME, turned, self._values)
+        rotated = replace(rays, attitude=rays.attitude @ self._rotation)
+        corrected_rays = self._shared.corrected_at(_NAME, rotated, self._values)
         return replace(corrected_rays, attitude=corrected_rays.attitude @ self._rotation.T)
 
 
@@ -201,7 +201,7 @@ def _solved(
 
 def _datum(rays: Mapping[str, Rays], shared: SharedNoise, inverse: Array) -> tuple[Datum, ...]:
     """Return the sigmas of the mean and of the slope in time of the attitude's errors over all rays of the pass."""
-    if not any(part.turns for part in shared.parts[_NAME]):
+    if not any(part.rotates for part in shared.parts[_NAME]):
         return ()
     time = np.concatenate([r.time for r in rays.values() if r.time is not None])
     fit = np.linalg.pinv(np.column_stack([np.ones_like(time), time - time.mean()]))

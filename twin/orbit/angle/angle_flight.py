@@ -90,7 +90,7 @@ def angle_camera(setup: AngleSetup, backend: Backend | None) -> AngleCamera:
         laboratory = line_cameras(setup.camera)
         rotations = {name: rotation_matrix(change.rotate).T for name, change in spec.perturb.items()}
         changed = {
-            name: camera.turned(rotations[name]) if name in rotations else camera for name, camera in laboratory.items()
+            name: line.rotated(rotations[name]) if name in rotations else line for name, line in laboratory.items()
         }
         return AngleCamera(FrozenMap(laboratory), FrozenMap(changed), FrozenMap())
     if setup.instrument is None or backend is None:

@@ -182,8 +182,8 @@ def _strip(
     spread = spread + slope @ points.covariance @ np.swapaxes(slope, 1, 2)
     spread = spread + LEAST_SIGMA**2 * np.eye(3)
     square = np.sum(arm**2, axis=1)[:, None, None] * np.eye(3) - arm[:, :, None] * arm[:, None, :]
-    turned, moved = _shared(seconds - moment, path, errors)
-    spread = spread + turned[:, None, None] * square + moved[:, None, None] * np.eye(3)
+    attitude_variance, position_variance = _shared(seconds - moment, path, errors)
+    spread = spread + attitude_variance[:, None, None] * square + position_variance[:, None, None] * np.eye(3)
     return Strip.of(
         path.position(moment) + np.einsum("nij,nj->ni", carried, arm), carried @ spread @ np.swapaxes(carried, 1, 2)
     )

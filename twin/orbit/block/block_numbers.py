@@ -98,10 +98,10 @@ CHANGE: Record[CameraChange] = Record(
             (("d_alpha", "arcsec", 3), ("d_beta", "arcsec", 3), ("d_gamma", "arcsec", 3), ("d_f", "um", 2))
         )
         for end, words, get in (
-            ("", "", lambda one: one.value),
-            ("_sigma", ", sigma", lambda one: one.sigma),
-            ("_sigma_before", ", prior sigma", lambda one: one.before),
-            ("_true", ", true", lambda one: one.truth),
+            ("", "", lambda change: change.value),
+            ("_sigma", ", sigma", lambda change: change.sigma),
+            ("_sigma_before", ", prior sigma", lambda change: change.before),
+            ("_true", ", true", lambda change: change.truth),
         )
     ),
 )

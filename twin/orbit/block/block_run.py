@@ -401,12 +401,12 @@ class PointWorkers:
     workers: Workers
     count: int
 
-    def hold(self, things: Sequence[Any]) -> Sequence[Any]:
+    def hold(self, objects: Sequence[Any]) -> Sequence[Any]:
         """Distribute the objects over the workers in rotation, and return a future for each object."""
         client = self.workers.client
         addresses = sorted(client.scheduler_info(n_workers=-1)["workers"])
         return [
-            client.scatter(thing, workers=[addresses[k % len(addresses)]], hash=False) for k, thing in enumerate(things)
+            client.scatter(item, workers=[addresses[k % len(addresses)]], hash=False) for k, item in enumerate(objects)
         ]
 
     def results(self, work: Callable[[tuple[Any, ...]], Any], arguments: Sequence[tuple[Any, ...]]) -> list[Any]:

@@ -60,7 +60,7 @@ def read_image(spec: RationalImageSpec) -> PolynomialImage:
 
 
 def rational_block(setup: RationalAdjustSetup, advance: Advance = silent) -> tuple[model.Block, Array]:
-    """Return the block of images with rational polynomials, and the given coordinates (m, 3) of its m points.
+    """Return the block of images with rational polynomials, and the surveyed coordinates (m, 3) of its m points.
 
     The coordinates are in the ITRS, in metres, and NaN for tie points. Tie points start where the images without
     corrections intersect.
@@ -81,13 +81,13 @@ def rational_block(setup: RationalAdjustSetup, advance: Advance = silent) -> tup
     ids, places = _image_points(spec, ground)
     if ground is not None and not (known := set(map(str, ground.points.ids))) & ids.keys():
         raise spec.error("no image point of these ground points", ("ground",), value=names_text(sorted(known)[:3]))
-    points, given = _points(ids, places, images, ground)
+    points, surveyed = _points(ids, places, images, ground)
     scenes = tuple(
         model.ModelScene(name, image, FrozenMap((spec.images[name].errors or spec.errors).sigma), places[name])
         for name, image in images.items()
     )
     shared = tuple(
-        model.SharedCorrection(tuple(one.images), FrozenMap(one.errors.sigma)) for one in spec.passes.values()
+        model.SharedCorrection(tuple(group.images), FrozenMap(group.errors.sigma)) for group in spec.passes.values()
     )
     block = model.Block((), scenes, FrozenMap(), FrozenMap(), (), (), 1.0, points, shared=shared)
     try:
@@ -97,7 +97,7 @@ def rational_block(setup: RationalAdjustSetup, advance: Advance = silent) -> tup
     except BlockError as error:
         raise BenchError(str(error), ("image_points",), "points that two images see") from error
     start = np.where((points.role == "control")[:, None], points.start, first)
-    return replace(block, points=replace(points, start=start, approximate=first)), given
+    return replace(block, points=replace(points, start=start, approximate=first)), surveyed
 
 
 def _image_points(
@@ -123,7 +123,7 @@ def _image_points(
                 raise table.error(k, "point", f"this point occurs twice in {image}", point, "each point once")
             seen.add((point, image))
             rows[image].append((ids.setdefault(point, len(ids)), *map(float, numbers)))  # type: ignore[arg-type]
-    files = {Path(one.file).name: name for name, one in spec.images.items() if one.file is not None}
+    files = {Path(image.file).name: name for name, image in spec.images.items() if image.file is not None}
     for image, measured in ({} if ground is None else ground.images).items():
         name = image if image in rows else files.get(Path(image).name)
         if name is None:
@@ -150,12 +150,12 @@ def _points(
     images: Mapping[str, PolynomialImage],
     ground: GroundFile | None,
 ) -> tuple[model.Points, Array]:
-    """Return the points with first coordinates, and the given coordinates (m, 3), NaN for tie points.
+    """Return the points with first coordinates, and the surveyed coordinates (m, 3), NaN for tie points.
 
     A tie point starts where the first image sees the middle height of its polynomials.
     """
     count = len(ids)
-    start, given = np.full((count, 3), np.nan), np.full((count, 3), np.nan)
+    start, surveyed = np.full((count, 3), np.nan), np.full((count, 3), np.nan)
     covariance, role = np.zeros((count, 3, 3)), np.full(count, "tie", object)
     for name, seen in places.items():
         new = ~np.isfinite(start[seen.point]).all(axis=1)
@@ -163,12 +163,12 @@ def _points(
     for k, name in enumerate([] if ground is None else ground.points.ids.tolist()):
         if (at := ids.get(str(name))) is not None:
             assert ground is not None
-            role[at], given[at], covariance[at] = (
+            role[at], surveyed[at], covariance[at] = (
                 ground.points.role[k],
                 ground.points.itrs[k],
                 ground.points.covariance[k],
             )
-            start[at] = given[at]
+            start[at] = surveyed[at]
     lost = ~np.isfinite(start).all(axis=1)
     if np.any(lost):
         names = np.array(list(ids), object)[lost][:3].tolist()
@@ -176,7 +176,7 @@ def _points(
         raise BenchError(problem, ("image_points",), "lines and samples of the images to which the polynomials belong")
     exact = (role == "control") & ~np.any(covariance, axis=(1, 2))
     covariance[exact] = 1e-6 * np.eye(3)
-    return model.Points(np.array(list(ids), object), start, role, covariance), given
+    return model.Points(np.array(list(ids), object), start, role, covariance), surveyed
 
 
 @dataclass(frozen=True, eq=False)

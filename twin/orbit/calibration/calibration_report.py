@@ -387,13 +387,13 @@ def _images(run: CalibrationRun, data: Mapping[str, Any]) -> Section:
         f"Wrong: {WRONG}; before any test, after the thresholds of matching, after consensus with the neighbours. RMS "
         "and chi-square of correct positions."
     )
-    counts = ("wrong_found", "found", "wrong_matched", "matched", "wrong_accepted", "accepted")
+    counts = ("wrong_measured", "measured", "wrong_matched", "matched", "wrong_accepted", "accepted")
     keys = (*counts, "right_rejected_by_consensus", "rms_lines_px", "rms_pixels_px", "chi_square_ratio")
     matching = MATCHING.table("image-matching", "Matching", caption, judgements, keys, "field, points, line", digits=4)
     remaining = " and ".join(str(int(p.control.control.sum())) for p in campaign.passes)
     text = (
         f"In each field {len(spec.patches)} patches of {spec.lines} x {spec.pixels} pixels are rendered by every line. "
-        f"Of {total['found']} matched positions, {total['wrong_found']} are wrong, mostly on parcels that look "
+        f"Of {total['measured']} measured positions, {total['wrong_measured']} are wrong, mostly on parcels that look "
         f"different in the orthophoto; {total['wrong_accepted']} of {total['accepted']} pass the thresholds of "
         f"matching and the test of the neighbours, {total['wrong_left']} of {total['left']} image points and "
         f"{total['wrong_check_left']} of {total['check_left']} check points the adjustment, which rejects "

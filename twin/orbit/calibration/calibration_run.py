@@ -354,9 +354,9 @@ def third_differences(flight: FieldPass) -> tuple[ThirdDifference | None, ThirdD
     measured, table = flight.measured, flight.measured.table
     fixes, looks = _even(table.orbit_time), _even(table.attitude_time[measured.covers(table.attitude_time)])
     positions = table.position[np.isin(table.orbit_time, fixes)]
-    turned = np.swapaxes(measured.orbital_to_itrs(looks), 1, 2) @ measured.body_to_itrs(looks)
+    rotation = np.swapaxes(measured.orbital_to_itrs(looks), 1, 2) @ measured.body_to_itrs(looks)
     # small angles: the skew part of the rotation
-    skew = 0.5 * (turned - np.swapaxes(turned, 1, 2))
+    skew = 0.5 * (rotation - np.swapaxes(rotation, 1, 2))
     angles = np.stack([skew[:, 2, 1], skew[:, 0, 2], skew[:, 1, 0]], axis=-1)
     orbit, attitude = (
         third_difference(time, values) if len(time) >= _LEAST_EVEN else None

@@ -195,8 +195,8 @@ class Imager:
                 ties.append(_SelectedPoints.of(tied, tied.in_all, record.judgements["tie"]))
         control_points, check_points, tie = (_joined(parts, data) for parts in (control, check, ties))
         if control_points.count < _LEAST_CONTROL or check_points.count < 2:
-            found = f"only {control_points.count} control and {check_points.count} check points"
-            problem = f"{data.name}: {found} were matched in every line; {_match_counts(records)}"
+            counts = f"only {control_points.count} control and {check_points.count} check points"
+            problem = f"{data.name}: {counts} were matched in every line; {_match_counts(records)}"
             remedy = f"{_LEAST_CONTROL} control and 2 check points or more: {POINTS_REMEDY}"
             raise BenchError(problem, ("images", "points"), remedy)
         # an error in plan is common to all points of a patch: each of n points gets n times the variance

@@ -277,7 +277,7 @@ def _around(platform: PlatformReadings, lines: Mapping[str, LineClock]) -> Platf
 
 _SCALES = ("UTC", "GPS", "TAI", "TT")
 _FRAMES = ("ITRS", "GCRS", "EME2000", "TEME")
-_TURNED = {"forward": "back", "back": "forward", "right": "left", "left": "right", "down": "up", "up": "down"}
+_OPPOSITE = {"forward": "back", "back": "forward", "right": "left", "left": "right", "down": "up", "up": "down"}
 
 
 @dataclass(frozen=True)
@@ -313,10 +313,10 @@ class TestedConvention:
         return replace(conventions, platform=replace(conventions.platform, **{name: value}))
 
 
-def _turned(c: PassConventions) -> tuple[tuple[str, str, str], ...]:
+def _rotated_axes(c: PassConventions) -> tuple[tuple[str, str, str], ...]:
     """Return the body axes that the file specifies, and these axes rotated by 180 degrees about each of them."""
     a = c.platform.body_axes
-    x, y, z = (_TURNED[v] for v in a)
+    x, y, z = (_OPPOSITE[v] for v in a)
     return a, (a[0], y, z), (x, a[1], z), (x, y, a[2])
 
 
@@ -328,7 +328,7 @@ def _seconds(value: float) -> str:
 TESTED_CONVENTIONS: Mapping[str, TestedConvention] = FrozenMap(
     {
         "quaternion_scalar": TestedConvention("scalar of the quaternion", "platform.scalar", ("last", "first")),
-        "quaternion_turns": TestedConvention("quaternion turns", "platform.turns", ("body_to_frame", "frame_to_body")),
+        "quaternion_turns": TestedConvention("quaternion turns", "platform.sense", ("body_to_frame", "frame_to_body")),
         "body_axes": TestedConvention("body x, y, z point", "platform.body_axes", (), ", ".join),
         "angle_sequence": TestedConvention(
             "sequence of the angles", "platform.sequence", ("xyz", "xzy", "yxz", "yzx", "zxy", "zyx")
@@ -371,7 +371,7 @@ def alternatives(specified: PassConventions, quaternions: bool) -> dict[str, tup
         here = convention.get(specified)
         if name in without or (name == "attitude_frame" and here == "orbital"):
             continue
-        possible = convention.values or _turned(specified)
+        possible = convention.values or _rotated_axes(specified)
         values[name] = tuple(v for v in possible if v != here)
     return values
 

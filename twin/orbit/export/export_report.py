@@ -314,14 +314,14 @@ def export_report(run: export_run.Export) -> Report:
     """Return the report of an export: its files, and their differences from the rigorous sensor."""
     isd = max((e.worst_px, name) for name, line in run.lines.items() for e in line.scanner.errors)
     rpc = [(max(line.polynomial.error_px), name) for name, line in run.lines.items() if line.polynomial is not None]
-    low, _, high = run.heights
+    (largest, worst), (low, _, high) = max(rpc, default=(0.0, "")), run.heights
     images = sum(line.window.frame is not None for line in run.lines.values())
     verdict, more = answer(
         f"The folder contains {len(run.lines)} lines as community sensor models and rational polynomials"
         + (f", with {images} images" if images else ""),
         f"on ground {low:.0f} to {high:.0f} m high the sensor models are within {significant(isd[0], 2)} pixels of the "
         f"rigorous sensor ({isd[1]} is the worst)",
-        f"the polynomials are within {significant(max(rpc)[0], 2)} pixels ({max(rpc)[1]})"
+        f"the rational polynomials reproduce the sensor model within {significant(largest, 2)} px (largest: {worst})"
         if rpc
         else "there are no polynomials",
         *quality_answers(run.quality),

@@ -349,10 +349,10 @@ def read_source(path: Path, seed: int | None = None) -> ExportSource:
         return _of_run(path)
     kind = kind_of(read_yaml(path).data)
     if kind is None or kind.name not in READS:
-        found = None if kind is None else kind.what
+        value = None if kind is None else kind.what
         allowed = "a simulation, a test of intersection angles, the run folder of one, or DIM_NAME.XML of a scene"
         hint = _PAYLOAD_HINT if kind is not None and kind.name in ("three_line_camera", "instrument") else allowed
-        raise InputError(Issue("twin.orbit export does not read this", str(path), value=found, allowed=hint))
+        raise InputError(Issue("twin.orbit export does not read this", str(path), value=value, allowed=hint))
     setup: SimulateSetup | AngleSetup = (SimulateSetup if kind.name == "orbit_simulate" else AngleSetup).read(path)
     return ExportSource(setup, setup.to_yaml(), None, setup.test.seed if seed is None else seed, FrozenMap())
 
@@ -360,8 +360,8 @@ def read_source(path: Path, seed: int | None = None) -> ExportSource:
 def _of_run(folder: Path) -> ExportSource:
     manifest = read_manifest(folder)
     if manifest is None or manifest.program != "twin.orbit" or manifest.test not in ("simulate", "angle"):
-        found = None if manifest is None else f"a run of {' '.join(filter(None, (manifest.program, manifest.test)))}"
-        raise InputError(Issue("not the run folder of twin.orbit simulate or angle", str(folder), value=found))
+        value = None if manifest is None else f"a run of {' '.join(filter(None, (manifest.program, manifest.test)))}"
+        raise InputError(Issue("not the run folder of twin.orbit simulate or angle", str(folder), value=value))
     if manifest.test == "angle":  # has no images
         tested = AngleSetup.read(folder / "config.yaml")
         return ExportSource(tested, tested.to_yaml(), None, manifest.seed, FrozenMap())
@@ -467,9 +467,9 @@ def _windows(
             first_line, first_pixel, lines, pixels = source.windows[name]
             frame = _image(source.folder, name)
             if frame.shape != (lines, pixels):
-                found, allowed = f"{frame.shape[0]} lines of {frame.shape[1]} pixels", f"{lines} lines of {pixels}"
+                value, allowed = f"{frame.shape[0]} lines of {frame.shape[1]} pixels", f"{lines} lines of {pixels}"
                 where = str(_file(source.folder, name))
-                raise InputError(Issue("an image of another size", where, value=found, allowed=allowed))
+                raise InputError(Issue("an image of another size", where, value=value, allowed=allowed))
         part = replace(sensor, first_line_time=float(sensor.time(np.array([first_line]))[0]), lines=lines)
         windows[name] = ImagedWindow(name, part, first_pixel, pixels, setup.camera.pitch_of(name), frame)
     return str(setup.test.orbit.epoch), windows

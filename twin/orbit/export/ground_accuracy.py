@@ -30,9 +30,9 @@ from twin.orbit.flight.sensor import OffsetPlatform, Sensor
 
 _GRID = (13, 13)
 """Number of lines and pixels of the grid over an image at which errors are computed; they vary smoothly."""
-_MOVED = 1.0
+_SHIFT_STEP = 1.0
 """Step of the derivatives with respect to position, in metres."""
-_TURNED = 1e-6
+_ROTATION_STEP = 1e-6
 """Step of the derivatives with respect to rotation, in radians: about a metre on the ground, over which the ground
 position is linear to 1e-6.
 """
@@ -192,7 +192,7 @@ def _derivatives(sensor: Sensor, line: Array, pixel: Array, height: float, level
     by_pixel = (seen(line, pixel + _EDGE) - seen(line, pixel - _EDGE)) / (2.0 * _EDGE)
     columns = [
         (seen(line, pixel, moved=step) - seen(line, pixel, moved=-step)) / (2.0 * step.max())
-        for step in np.diag([_MOVED] * 3 + [_TURNED] * 3)
+        for step in np.diag([_SHIFT_STEP] * 3 + [_ROTATION_STEP] * 3)
     ]
     raised = (seen(line, pixel, height + _RAISED) - seen(line, pixel, height - _RAISED)) / (2.0 * _RAISED)
     # a longer principal distance moves the ground positions of pixels toward the line's middle

@@ -339,8 +339,8 @@ def _smooth(camera: EffectiveCamera) -> bool:
     inner = slice(_SPARE, -_SPARE) if len(between) > 4 * _SPARE else slice(None)
     station = _lagrange(coarse, camera.station[::2], between) - camera.station[1:-1:2]
     quaternion = _quaternions(camera.rotation)
-    turned = _lagrange(coarse, quaternion[::2], between) - quaternion[1:-1:2]
-    angle = 2.0 * np.max(np.linalg.norm(turned[inner], axis=-1))
+    difference = _lagrange(coarse, quaternion[::2], between) - quaternion[1:-1:2]
+    angle = 2.0 * np.max(np.linalg.norm(difference[inner], axis=-1))
     shift = np.max(np.linalg.norm(station[inner], axis=-1)) / _NEAREST
     return bool(angle + shift < _FOLLOWED * camera.pitch / camera.focal_length)
 

@@ -161,8 +161,8 @@ def _polynomial_of(
     if small:
         raise InputError(Issue("the scale is not above zero", file, None, (f"{small[0]}_SCALE",)))
     if not (-90.0 <= offset[2] <= 90.0 and -180.0 <= offset[3] <= 360.0):
-        found = f"{offset[2]:g}, {offset[3]:g}"
-        raise InputError(Issue("not a latitude and longitude in degrees", file, None, ("LAT_OFF", "LONG_OFF"), found))
+        value = f"{offset[2]:g}, {offset[3]:g}"
+        raise InputError(Issue("not a latitude and longitude in degrees", file, None, ("LAT_OFF", "LONG_OFF"), value))
     for name, part in zip(_PARTS, parts, strict=True):
         if name.endswith("DEN") and not np.any(part):
             raise InputError(Issue("all coefficients of the denominator are zero", file, None, (f"{name}_COEFF",)))

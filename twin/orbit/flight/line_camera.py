@@ -141,8 +141,8 @@ def drifted_payload(payload: ThreeLineCameraSpec, drift: Mapping[str, np.ndarray
     lines = dict(payload.lines)
     for name, (alpha, beta, gamma, d_f) in drift.items():
         line = lines[name]
-        turned = rotation_matrix(np.array(line.rotate)) @ about_axis(0, beta) @ about_axis(1, alpha)
-        rotate = tuple(Rotation.from_matrix(turned @ about_axis(2, gamma)).as_rotvec().tolist())
+        rotation = rotation_matrix(np.array(line.rotate)) @ about_axis(0, beta) @ about_axis(1, alpha)
+        rotate = tuple(Rotation.from_matrix(rotation @ about_axis(2, gamma)).as_rotvec().tolist())
         focal = line.principal_distance + float(d_f)
         lines[name] = line.model_copy(update={"rotate": rotate, "principal_distance": focal})
     return payload.model_copy(update={"lines": FrozenMap(lines)})
@@ -211,7 +211,7 @@ class LineCamera:
     origins: np.ndarray
     pieces: tuple[LinePiece, ...] = ()
 
-    def turned(self, rotation: np.ndarray) -> LineCamera:
+    def rotated(self, rotation: np.ndarray) -> LineCamera:
         """Return the line with its lines of sight rotated by a (3, 3) matrix in body axes: new = old @ rotation."""
         pieces = tuple(replace(piece, directions=piece.directions @ rotation) for piece in self.pieces)
         return replace(self, directions=self.directions @ rotation, pieces=pieces)

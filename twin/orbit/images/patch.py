@@ -349,10 +349,10 @@ class LineComparison:
 
     Attributes
     ----------
-    found, matched, accepted : int
+    measured, matched, accepted : int
         Number of positions that were measured, that matching accepted, and that also agree with their neighbours
         (consensus).
-    wrong_found, wrong_matched, wrong_accepted : int
+    wrong_measured, wrong_matched, wrong_accepted : int
         Number of wrong positions (see `WRONG`) among each of these.
     right_rejected_by_consensus : int
         Number of right positions that were rejected because they disagree with their neighbours.
@@ -370,10 +370,10 @@ class LineComparison:
         Degrees of freedom, two for each position.
     """
 
-    found: int
+    measured: int
     matched: int
     accepted: int
-    wrong_found: int
+    wrong_measured: int
     wrong_matched: int
     wrong_accepted: int
     right_rejected_by_consensus: int
@@ -421,10 +421,10 @@ def judged(patch: Patch, points: MatchedPoints) -> Mapping[str, LineComparison]:
         good = error[right]
         square = float(np.einsum("ni,nij,nj->", good, np.linalg.inv(line.covariance[right]), good))
         judgements[name] = LineComparison(
-            found=int(np.isfinite(size).sum()),
+            measured=int(np.isfinite(size).sum()),
             matched=int(line.matched.sum()),
             accepted=int(line.accepted.sum()),
-            wrong_found=int(wrong.sum()),
+            wrong_measured=int(wrong.sum()),
             wrong_matched=int((wrong & line.matched).sum()),
             wrong_accepted=int((wrong & line.accepted).sum()),
             right_rejected_by_consensus=int((line.matched & ~line.accepted & ~wrong).sum()),

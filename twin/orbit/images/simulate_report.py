@@ -131,7 +131,7 @@ def found_table(points: PatchPoints) -> Table:
         "Displacement from predicted to measured and sigma: medians of the accepted, px along the track and the line."
     )
     displacement = ("displacement_lines_px", "displacement_pixels_px")
-    keys = ("found", "matched", "accepted", *displacement, *(f"{key}_sigma" for key in displacement))
+    keys = ("measured", "matched", "accepted", *displacement, *(f"{key}_sigma" for key in displacement))
     return simulate_run.MATCHED.table("points-found", "Matching", caption, rows, keys, "points, line", digits=4)
 
 

@@ -277,7 +277,7 @@ GEOREFERENCE: Record[Raster] = Record(
 MATCHED: Record[image_points.MatchedLine] = Record(
     "Points of one kind in one line. Shifts, measured minus predicted, and sigmas of the fit, are medians of "
     "the accepted points.",
-    Quantity("found", lambda line: np.isfinite(line.position[:, 0]).sum(), "points for which the fit gave a position"),
+    Quantity("measured", lambda line: np.isfinite(line.position[:, 0]).sum(), "points with a position from the fit"),
     Quantity("matched", lambda line: line.matched.sum(), "of these, points that passed the thresholds of the matching"),
     Quantity("accepted", lambda line: line.accepted.sum(), "of these, points that agree with their neighbours"),
     Quantity(
@@ -367,10 +367,10 @@ def _errors(judgement: patch_images.LineComparison) -> list[list[float | None]]:
 
 
 MATCH_COUNTS = {
-    "found": "points with a measured position, before any is rejected",
+    "measured": "points with a measured position, before any is rejected",
     "matched": "points that passed the thresholds of the matching",
     "accepted": "points that also passed the consensus",
-    "wrong_found": "wrong ones among all measured points",
+    "wrong_measured": "wrong ones among all measured points",
     "wrong_matched": "wrong ones among those that passed the matching",
     "wrong_accepted": "wrong ones among those that passed the consensus",
     "right_rejected_by_consensus": "right matches that the consensus rejected",

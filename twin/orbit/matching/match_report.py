@@ -90,10 +90,10 @@ def _images(run: Match) -> Section:
 
 def _warnings(run: Match) -> tuple[str, ...]:
     """Return warnings on displacements near the search range and on the accuracy of the maps' datum."""
-    texts, reach = [], run.setup.test.points.search_radius
+    texts, radius = [], run.setup.test.points.search_radius
     for group in run.points.sorts.values():
         for name, line in group.lines.items():
-            if group.kind == "map" and line.accepted.any() and np.max(np.abs(line.median_shift)) > _FAR * reach:
+            if group.kind == "map" and line.accepted.any() and np.max(np.abs(line.median_shift)) > _FAR * radius:
                 texts.append(f"points of {name} lie at the search limit; a larger `points.search_radius` may find more")
     if run.accuracy is None or run.accuracy < 0.0:
         texts.append("the accuracy of the datum transformation of the maps to WGS 84 is not stated by its authority")
@@ -112,7 +112,8 @@ def rational_report(run: RationalMatch) -> Report:
     rows = {name: MATCHED(line) for name, line in pairs.items() if line.accepted.any()}
     for row in rows.values():
         row["consensus_scatter_px"] = row["consensus_scatter_px"] or "\N{EM DASH}"
-    keys = ("found", "matched", "accepted", "displacement_lines_px", "displacement_pixels_px", "consensus_scatter_px")
+    displacement = ("displacement_lines_px", "displacement_pixels_px")
+    keys = ("measured", "matched", "accepted", *displacement, "consensus_scatter_px")
     caption = (
         "Displacement: median of the accepted from the prediction at the height of each point, in lines and samples;"
         " it is that of the polynomials across the epipolar lines. Scatter: beyond the covariances; a dash where these"

@@ -193,15 +193,15 @@ def _image(spec: LineImageFileSpec, name: str, sensor: Sensor, folder: Path, cou
         frame = np.ascontiguousarray(frame[:, ::-1])
         first_pixel = sensor.camera.pixels - spec.first_pixel - column - columns
     if first_pixel < 0 or first_pixel + columns > sensor.camera.pixels:
-        found = f"columns {column} to {column + columns - 1} from pixel {spec.first_pixel}"
+        value = f"columns {column} to {column + columns - 1} from pixel {spec.first_pixel}"
         allowed = (
             f"{sensor.camera.pixels} pixels of {name}; `first_pixel` of the image's first column, and its `window`"
         )
-        raise spec.error("an image wider than its line", ("first_pixel",), value=found, allowed=allowed)
+        raise spec.error("an image wider than its line", ("first_pixel",), value=value, allowed=allowed)
     if first_line + rows > sensor.lines + 1:
-        found = f"lines to {first_line + rows - 1}"
+        value = f"lines to {first_line + rows - 1}"
         allowed = f"lines to {sensor.lines - 1}, of which the table has times; or a `window`"
-        raise spec.error("an image longer than its line times", ("first_line",), value=found, allowed=allowed)
+        raise spec.error("an image longer than its line times", ("first_line",), value=value, allowed=allowed)
     return LineFrame(frame, Window(first_line, first_pixel, rows, columns), sensor, (1.0, 1.0))
 
 
@@ -209,10 +209,10 @@ def _extent(
     spec: OrbitMatchSpec, images: Mapping[str, LineFrame], heights: tuple[float, float]
 ) -> tuple[GroundFrame, tuple[float, float, float, float]]:
     """Return plane coordinates of the ground, and the images' bounds west, east, south and north, in metres."""
-    seen, reach = [], spec.points.search_radius + spec.points.template
+    seen, margin = [], spec.points.search_radius + spec.points.template
     for name, image in images.items():
         window = image.window
-        side = [np.linspace(-reach, n - 1.0 + reach, _BORDER) for n in (window.lines, window.pixels)]
+        side = [np.linspace(-margin, n - 1.0 + margin, _BORDER) for n in (window.lines, window.pixels)]
         row, column = (v.ravel() for v in np.meshgrid(*side, indexing="ij"))
         line, pixel = image.image_point(row, column)
         sensor = image.measured

@@ -52,8 +52,8 @@ def read_pixels(
             allowed = f"within {shape[0]} rows and {shape[1]} columns"
             raise spec.error("a window outside of the image", ("window",), allowed=allowed)
         if rows * columns > LARGEST_PART:
-            found, allowed = f"{rows} x {columns} pixels", f"a `window:` of at most {LARGEST_PART:.0e} pixels"
-            raise spec.error("too large an image to be matched at once", ("window",), value=found, allowed=allowed)
+            value, allowed = f"{rows} x {columns} pixels", f"a `window:` of at most {LARGEST_PART:.0e} pixels"
+            raise spec.error("too large an image to be matched at once", ("window",), value=value, allowed=allowed)
         key = ("file",) if part is None else ("window", "rows")
         unit = "rows in a `window`" if part is None else "rows"
         require_memory(Lowered(spec, key, rows, unit, lambda n: n * columns * count * _PIXEL, 32))

@@ -187,8 +187,8 @@ def _searched(
     for k, level in enumerate(levels.tolist()):
         expected, _ = other.image.seen(frame.image.ground(place, level))
         peaks = search(other.values, templates, expected, spec.search_radius)
-        found = peaks.reason == Reason.ACCEPTED
-        positions[k], values[k] = peaks.position, np.where(found, peaks.value, -1.0)
+        accepted = peaks.reason == Reason.ACCEPTED
+        positions[k], values[k] = peaks.position, np.where(accepted, peaks.value, -1.0)
     best = np.argmax(values, axis=0)
     which = np.arange(len(place))
     peak, value = positions[best, which], values[best, which]
@@ -270,7 +270,7 @@ def _templates(frame: Frame, other: Frame, place: np.ndarray, height: np.ndarray
         [np.cos(latitude) * np.cos(longitude), np.cos(latitude) * np.sin(longitude), np.sin(latitude)], axis=1
     )
     axes = np.stack([level, np.cross(up, level)], axis=2)
-    here, there = (one.image.seen(ground)[1] @ axes for one in (frame, other))
+    here, there = (view.image.seen(ground)[1] @ axes for view in (frame, other))
     defined = np.isfinite(here).all(axis=(1, 2)) & np.isfinite(there).all(axis=(1, 2))
     affine = np.full_like(here, np.nan)
     affine[defined] = here[defined] @ np.linalg.inv(there[defined])

@@ -48,7 +48,7 @@ _AGREE = 1.0
 """Largest difference, in pixels, of the displacements from the first image to the second and back."""
 _APART = 3.0
 """Difference from the median of the pairs, in sigmas of both, from which a pair's height is not used."""
-_EVERY = 16
+_GRID_SPACING = 16
 """Spacing, in pixels, of the positions at which polynomials are evaluated; between them they are interpolated."""
 _CORRELATED, _LEAST_CORRELATION = 7, 0.6
 """Side of the windows, pixels, that must lie within both images, and smallest correlation of their grey values: that of
@@ -166,8 +166,8 @@ class _View:
         from scipy.ndimage import map_coordinates
 
         rows, columns = place.shape[:2]
-        coarse = self.seen(place[::_EVERY, ::_EVERY], height)
-        line, sample = np.meshgrid(np.arange(rows) / _EVERY, np.arange(columns) / _EVERY, indexing="ij")
+        coarse = self.seen(place[::_GRID_SPACING, ::_GRID_SPACING], height)
+        line, sample = np.meshgrid(np.arange(rows) / _GRID_SPACING, np.arange(columns) / _GRID_SPACING, indexing="ij")
         at = [map_coordinates(coarse[..., k], [line, sample], order=1, mode="nearest") for k in (0, 1)]
         inside = (at[0] >= 0) & (at[1] >= 0) & (at[0] <= self.values.shape[0] - 1) & (at[1] <= self.values.shape[1] - 1)
         grey = map_coordinates(self.values, at, order=3, prefilter=False, mode="nearest")
@@ -235,10 +235,10 @@ def surface(
                     [west + columns.stop * spec.spacing, north - rows.start * spec.spacing],
                 ]
             )
-            found = _tile(views[a], views[b], box, heights, spec)
-            if found is not None:
-                grid[rows, columns], step[rows, columns] = found[:2]
-                variance, count = variance + found[2] ** 2, count + 1
+            tile = _tile(views[a], views[b], box, heights, spec)
+            if tile is not None:
+                grid[rows, columns], step[rows, columns] = tile[:2]
+                variance, count = variance + tile[2] ** 2, count + 1
         if np.any(np.isfinite(grid)):
             grids[a, b], steps[a, b], sigmas[a, b] = grid, step, float(np.sqrt(variance / count))
     advance("surface", len(pairs), len(pairs))
@@ -394,12 +394,12 @@ def _displacements(first: np.ndarray, second: np.ndarray, most: int) -> np.ndarr
     import cv2
     from scipy.ndimage import minimum_filter
 
-    seen = [_eight_bits(one) for one in (first, second)]
+    seen = [_eight_bits(image) for image in (first, second)]
     span = _span(most)
-    found = []
-    for left, right in (seen, [one[:, ::-1] for one in seen[::-1]]):
+    displacements = []
+    for left, right in (seen, [image[:, ::-1] for image in seen[::-1]]):
         # columns beyond the image, so that its border has all displacements
-        left, right = (cv2.copyMakeBorder(one, 0, 0, span, span, cv2.BORDER_REPLICATE) for one in (left, right))
+        left, right = (cv2.copyMakeBorder(image, 0, 0, span, span, cv2.BORDER_REPLICATE) for image in (left, right))
         matcher = cv2.StereoSGBM_create(
             minDisparity=-most,
             numDisparities=span,
@@ -412,13 +412,13 @@ def _displacements(first: np.ndarray, second: np.ndarray, most: int) -> np.ndarr
             mode=cv2.STEREO_SGBM_MODE_HH,
         )
         value = matcher.compute(left, right)[:, span:-span].astype(np.float64) / _STEPS
-        found.append(np.where(value < -most, np.nan, value))
-    there, back = found[0], found[1][:, ::-1]
+        displacements.append(np.where(value < -most, np.nan, value))
+    there, back = displacements[0], displacements[1][:, ::-1]
     rows, columns = np.indices(there.shape)
     partner = np.where(np.isfinite(there), columns - there, -1.0)
     at = np.clip(np.rint(partner).astype(int), 0, there.shape[1] - 1)
     agrees = (np.abs(back[rows, at] - there) <= _AGREE) & (partner >= 0.0) & (partner <= there.shape[1] - 1.0)
-    whole, whole_second = (minimum_filter(np.isfinite(one), _CORRELATED, mode="constant") for one in (first, second))
+    whole, whole_second = (minimum_filter(np.isfinite(v), _CORRELATED, mode="constant") for v in (first, second))
     alike = _correlation(first, second[rows, at]) >= _LEAST_CORRELATION
     return np.where(agrees & whole & whole_second[rows, at] & alike, there, np.nan)
 
@@ -432,8 +432,8 @@ def _correlation(first: np.ndarray, second: np.ndarray) -> np.ndarray:
     """Return the correlation of two images' grey values in a window about each pixel."""
     from scipy.ndimage import uniform_filter
 
-    a, b = (np.nan_to_num(one - np.nanmean(one)) for one in (first, second))
-    means = [uniform_filter(one, _CORRELATED) for one in (a, b, a * a, b * b, a * b)]
+    a, b = (np.nan_to_num(image - np.nanmean(image)) for image in (first, second))
+    means = [uniform_filter(image, _CORRELATED) for image in (a, b, a * a, b * b, a * b)]
     variance = (means[2] - means[0] ** 2) * (means[3] - means[1] ** 2)
     return np.asarray((means[4] - means[0] * means[1]) / np.sqrt(np.maximum(variance, 1e-12)))
 

@@ -194,8 +194,8 @@ class DimapPass:
             step = at - time[end]
             if abs(step) > _NEAR:
                 problem = f"the image {'begins before' if end == 0 else 'ends after'} the ephemeris"
-                found, allowed = f"by {abs(step):.6g} s", f"{_NEAR:g} s at most"
-                raise InputError(Issue(problem, self.file, None, ("Ephemeris",), found, allowed))
+                value, allowed = f"by {abs(step):.6g} s", f"{_NEAR:g} s at most"
+                raise InputError(Issue(problem, self.file, None, ("Ephemeris",), value, allowed))
             other, index = (1, 0) if end == 0 else (-2, len(time))
             rate = (velocity[end] - velocity[other]) / (time[end] - time[other])
             # Velocities a few milliseconds apart are too noisy for an acceleration. That relative to the rotating Earth
@@ -353,8 +353,8 @@ def _times(time: Element, lines: int) -> tuple[Readings, float]:
     lasted = float((last.day[0] - first.day[0]) * _DAY + last.second[0] - first.second[0])
     off = abs(lasted - (lines - 1) * period)
     if off > max(_LINES_OFF * period, 0.002 * lines * period):
-        found = f"{lasted:.6g} s from START to END, and {lines} lines of {period * 1e3:.6g} ms"
-        stamp.wrong("line period, number of lines and times do not agree", found, "END at the last line")
+        value = f"{lasted:.6g} s from START to END, and {lines} lines of {period * 1e3:.6g} ms"
+        stamp.wrong("line period, number of lines and times do not agree", value, "END at the last line")
     return first, period
 
 
@@ -379,8 +379,8 @@ def _orbit(ephemeris: Element, file: str) -> tuple[orbit_files.OrbitReadings, bo
     if inertial:
         velocity = velocity - earth_rotation_velocity(position)
     elif np.median(share) > orbit_files.SPEED_TOLERANCE:
-        found = f"they differ by {100.0 * np.median(share):.3g} % in the median"
-        points[0].single("VELOCITY_XYZ").wrong("not the velocity of these positions", found, "Earth-fixed, m/s")
+        value = f"they differ by {100.0 * np.median(share):.3g} % in the median"
+        points[0].single("VELOCITY_XYZ").wrong("not the velocity of these positions", value, "Earth-fixed, m/s")
     return orbit_files.OrbitReadings(file, clock, position, velocity, "ITRS", "UTC"), inertial
 
 
@@ -389,8 +389,8 @@ def _attitude(attitudes: Element, file: str, day: int) -> orbit_files.AttitudeRe
     polynomial = attitudes.maybe("Polynomial_Quaternions")
     samples = attitudes.all("Quaternion_List", "Quaternion")
     if (polynomial is None) == (not samples):
-        found = "neither" if polynomial is None else "both"
-        attitudes.wrong("the attitude must be given exactly once", found, "Polynomial_Quaternions or Quaternion_List")
+        value = "neither" if polynomial is None else "both"
+        attitudes.wrong("the attitude must be given exactly once", value, "Polynomial_Quaternions or Quaternion_List")
     if polynomial is None:
         if len(samples) < 4:
             attitudes.wrong("too few quaternions", str(len(samples)), "4 or more in Quaternion_List")

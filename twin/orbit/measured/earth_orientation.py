@@ -133,8 +133,8 @@ class Readings:
         late = self.second >= DAY
         if scale != "UTC":
             if np.any(late):
-                found = f"{self.second[late][0]:g} s of the day"
-                raise Problem("a leap second, which only UTC has", found, "time_scale UTC")
+                value = f"{self.second[late][0]:g} s of the day"
+                raise Problem("a leap second, which only UTC has", value, "time_scale UTC")
             return Instants(self.day, self.second + TAI_MINUS[scale])
         days, where = np.unique(self.day, return_inverse=True)
         ahead = np.array([tai_minus_utc(int(day)) for day in days])
@@ -337,10 +337,10 @@ class EarthOrientation:
         day, second = calendar_reading(epoch)
         begin, end = (day + (second + t) / DAY for t in (first, last))
         if not np.all(in_span(DAY * (np.array([begin, end]) - day), *(DAY * (self.mjd[[0, -1]] - day)))):
-            found = f"{calendar(int(self.mjd[0]))} to {calendar(int(self.mjd[-1]))}"
+            value = f"{calendar(int(self.mjd[0]))} to {calendar(int(self.mjd[-1]))}"
             needed = f"a table that covers {calendar(int(begin))} to {calendar(int(end))}"
             raise InputError(
-                Issue("the table of Earth orientation does not cover the data", self.file, None, (), found, needed)
+                Issue("the table of Earth orientation does not cover the data", self.file, None, (), value, needed)
             )
         return TableRotation(self, epoch, celestial_pole(epoch, first, last))
 
@@ -486,8 +486,8 @@ def _c04(file: str, rows: list[tuple[int, str]]) -> EarthOrientation:
     columns = [4, 5, 6, 7, 8, 9] if len(cells[0]) == 21 else [3, 4, 5, 6, 8, 9]
     short = next((k for k, row in enumerate(cells) if len(row) != len(cells[0])), None)
     if short is not None:
-        found = f"{len(cells[short])} columns"
-        raise InputError(Issue("wrong number of columns", file, lines[short], (), found, f"{len(cells[0])} columns"))
+        value = f"{len(cells[short])} columns"
+        raise InputError(Issue("wrong number of columns", file, lines[short], (), value, f"{len(cells[0])} columns"))
     heads = ("MJD", "x", "y", "UT1-UTC", "dX", "dY")
     table = numbers(file, [[row[k] for k in columns] for row in cells], lines, heads)
     late = table[:, 0] >= FIRST_DAY
@@ -536,8 +536,8 @@ def _checked(
         raise InputError(Issue(problem, file, lines[row], (), f"MJD {mjd[row]:g}", "days in order"))
     far = (np.abs(ut1_utc) > 1.0) | np.any(np.abs(pole) > 1e-5, axis=1) | (mjd < FIRST_DAY) | (mjd > LAST_DAY)
     for row in np.flatnonzero(far)[:1]:
-        found = f"MJD {mjd[row]:g}, UT1 - UTC {ut1_utc[row]:g} s"
-        raise InputError(Issue("implausible Earth orientation", file, lines[row], (), found, "UT1 - UTC within 1 s, a "
+        value = f"MJD {mjd[row]:g}, UT1 - UTC {ut1_utc[row]:g} s"
+        raise InputError(Issue("implausible Earth orientation", file, lines[row], (), value, "UT1 - UTC within 1 s, a "
                                "pole within 2 arcsec, days of 1972 to 2099"))  # fmt: skip
     ahead = np.array([tai_minus_utc(int(np.floor(day))) for day in mjd])
     return EarthOrientation(file, mjd, ut1_utc - ahead, pole, offsets)

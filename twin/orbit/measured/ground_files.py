@@ -107,9 +107,9 @@ def read_ground_points(spec: GroundFileSpec, folder: Path) -> GroundFile:
         raise InputError(Issue(problem.problem, file, line, (), problem.value, problem.allowed)) from None
     height = Earth().geodetic(itrs)[2]
     for row in np.flatnonzero(~((height > -1000.0) & (height < 10000.0)))[:1]:
-        found = f"{height[row]:.6g} m above the ellipsoid"
+        value = f"{height[row]:.6g} m above the ellipsoid"
         raise InputError(
-            Issue("not a position on the ground", file, rows.lines[row], (), found, "-1000 m to 10 000 m; units?")
+            Issue("not a position on the ground", file, rows.lines[row], (), value, "-1000 m to 10 000 m; units?")
         )
     covariance = _covariance(spec, file, rows, itrs, path.suffix.lower() == ".gcp" and spec.sigma_axes == "xyz")
     points = GroundPoints.of(np.array(rows.ids, object), itrs, covariance, np.array(rows.roles, object))

@@ -98,9 +98,9 @@ class GeoRaster:
         part = rows or slice(0, self.shape[0]), columns or slice(0, self.shape[1])
         size = [s.stop - s.start for s in part]
         if size[0] * size[1] > LARGEST_PART:
-            found = f"{size[0]} x {size[1]} pixels"
+            value = f"{size[0]} x {size[1]} pixels"
             allowed = f"at most {LARGEST_PART:.0e} pixels at once; a map that is cut to the images"
-            raise InputError(Issue("the part of a map is too large", self.file, None, (), found, allowed))
+            raise InputError(Issue("the part of a map is too large", self.file, None, (), value, allowed))
         with opened(self.file) as source:
             from rasterio.windows import Window
 
@@ -141,8 +141,8 @@ def open_raster(path: str | Path, band: int = 1, crs: str | None = None) -> GeoR
     if np.dtype(dtype).kind not in "uif":
         raise InputError(Issue("not grey values or heights", file, None, (), str(dtype), "real numbers"))
     if affine.is_identity or affine.determinant == 0.0:
-        found = "ground control points only" if ground else "no georeference"
-        raise InputError(Issue("a raster without georeference", file, None, (), found, "a GeoTIFF with a geotransform"))
+        value = "ground control points only" if ground else "no georeference"
+        raise InputError(Issue("a raster without georeference", file, None, (), value, "a GeoTIFF with a geotransform"))
     if text is None and crs is None:
         raise InputError(
             Issue("a raster without a coordinate reference system", file, None, ("crs",), None, "`crs:`, EPSG:32650")
@@ -219,8 +219,8 @@ class Geoid:
     def _values(self) -> np.ndarray:
         values, valid = self.raster.read()
         if np.any(np.abs(values[valid]) > 150.0):
-            found = f"{np.max(np.abs(values[valid])):g}"
-            raise InputError(Issue("not heights of a geoid", self.raster.file, None, (), found, "metres, within 150 m"))
+            value = f"{np.max(np.abs(values[valid])):g}"
+            raise InputError(Issue("not heights of a geoid", self.raster.file, None, (), value, "metres, within 150 m"))
         known = np.where(valid, values, np.nan).astype(np.float64)
         # Append the first column to a whole circle, otherwise repeat the last one, which then has no weight.
         return np.pad(known, ((0, 0), (0, 1)), mode="wrap" if self._is_global else "edge")
@@ -256,8 +256,8 @@ class Geoid:
             inside &= (column >= -1e-6) & (column <= columns - 1.0 + 1e-6)
         if not np.all(inside):
             k = int(np.argmin(np.ravel(inside)))
-            found = f"{np.ravel(lat)[k]:.6g} deg N, {np.ravel(lon)[k]:.6g} deg E"
-            raise Problem("a position outside the grid of the geoid", found, self.raster.file)
+            value = f"{np.ravel(lat)[k]:.6g} deg N, {np.ravel(lon)[k]:.6g} deg E"
+            raise Problem("a position outside the grid of the geoid", value, self.raster.file)
         at = np.clip(row, 0.0, rows - 1.0), column % columns if around else np.clip(column, 0.0, columns - 1.0)
         height = map_coordinates(self._values, at, order=1, mode="nearest")
         if not np.all(np.isfinite(height)):
@@ -352,8 +352,8 @@ class Datum:
         x, y, z = (np.asarray(v, np.float64) for v in np.broadcast_arrays(x, y, z))
         if self.crs.is_geographic and (np.any(np.abs(y) > 90.0) or np.any(np.abs(x) > 540.0)):
             k = int(np.argmax((np.abs(y) > 90.0) | (np.abs(x) > 540.0)))
-            found = f"longitude {np.ravel(x)[k]:g}, latitude {np.ravel(y)[k]:g}"
-            raise Problem("not a longitude and latitude", found, "degrees, and longitude before latitude", within=(k,))
+            value = f"longitude {np.ravel(x)[k]:g}, latitude {np.ravel(y)[k]:g}"
+            raise Problem("not a longitude and latitude", value, "degrees, and longitude before latitude", within=(k,))
         height = z
         if self.geoid is not None:
             height = z + self.geoid(*self.geographic.transform(x, y))
@@ -518,8 +518,8 @@ class UserMap:
             raise InputError(Issue("a map without values", self.raster.file))
         low, high = float(values.min()), float(values.max())
         if max(-low, high) > MOST_HEIGHT:
-            found, allowed = f"{low:.6g} to {high:.6g} m", f"up to {MOST_HEIGHT:g} m; empty pixels as nodata"
-            raise InputError(Issue("values are not ground heights", self.raster.file, value=found, allowed=allowed))
+            value, allowed = f"{low:.6g} to {high:.6g} m", f"up to {MOST_HEIGHT:g} m; empty pixels as nodata"
+            raise InputError(Issue("values are not ground heights", self.raster.file, value=value, allowed=allowed))
         return low, high
 
     def part(self, frame: GroundFrame, ends: tuple[float, float, float, float], heights: bool = False) -> MapPart:
@@ -552,11 +552,11 @@ class UserMap:
             low, high = int(max(np.floor(coordinate.min()) - 2, 0)), int(min(np.ceil(coordinate.max()) + 3, count))
             if high - low < 4:
                 lon, lat = np.degrees((frame.longitude, frame.latitude))
-                found = f"images near {lat:.4f} deg N, {lon:.4f} deg E"
+                value = f"images near {lat:.4f} deg N, {lon:.4f} deg E"
                 allowed = "a map of the ground in the images; the centre of this one is at "
                 x, y = self.to_geographic.transform(*self.raster.coordinates_of(*(0.5 * n for n in self.raster.shape)))
                 raise InputError(
-                    Issue("the map does not cover the images", self.raster.file, None, (), found,
+                    Issue("the map does not cover the images", self.raster.file, None, (), value,
                           f"{allowed}{float(x):.4f} deg E, {float(y):.4f} deg N")
                 )  # fmt: skip
             bounds.append(slice(low, high))
@@ -586,7 +586,7 @@ class UserMap:
                     raise InputError(problem.at(self.raster.file)) from None
         known = values if part.valid is None else values[part.valid]
         if known.size and (known.min() < -1000.0 or known.max() > 10000.0):
-            found = f"{known.min():g} to {known.max():g} m"
+            value = f"{known.min():g} to {known.max():g} m"
             allowed = "heights within -1000 m to 10 000 m; is a nodata value missing in the file?"
-            raise InputError(Issue("values are not ground heights", self.raster.file, None, (), found, allowed))
+            raise InputError(Issue("values are not ground heights", self.raster.file, None, (), value, allowed))
         return values

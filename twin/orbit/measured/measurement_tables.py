@@ -136,9 +136,9 @@ def read_pass(
             allowed = f"{role} points in the ground table whose image points are measured"
             raise InputError(Issue(f"no {role} point is seen by {seen}", pixels.file, allowed=allowed))
     if len(images) < 2:
-        found = f"of {names_text(tuple(images)) or 'none'}"
+        value = f"of {names_text(tuple(images)) or 'none'}"
         allowed = "image points of two line cameras or more"
-        raise InputError(Issue("too few line cameras", pixels.file, value=found, allowed=allowed))
+        raise InputError(Issue("too few line cameras", pixels.file, value=value, allowed=allowed))
     return PassMeasurements(name, platform, {line: times[line] for line in images}, ground, images)
 
 
@@ -253,9 +253,9 @@ def ground_of(table: Table) -> GroundPoints:
     with np.errstate(divide="ignore", invalid="ignore"):
         height = radius - radius / np.linalg.norm(position / _EARTH_AXES, axis=1)
     for row in np.flatnonzero(~(np.abs(height) < MOST_HEIGHT))[:1]:
-        found = f"{height[row] / 1e3:.6g} km above the ellipsoid"
+        value = f"{height[row] / 1e3:.6g} km above the ellipsoid"
         allowed = "Earth-centred, Earth-fixed coordinates of the ground, not geodetic ones; and is the unit right?"
-        raise table.error(int(row), "x", "not a position on the ground", found, allowed)
+        raise table.error(int(row), "x", "not a position on the ground", value, allowed)
     return GroundPoints.of(table["point"], position, _covariance(table, position), table["role"])
 
 
@@ -561,9 +561,9 @@ def platform_of(epoch: str, orbit: Table, attitude: Table, conventions: measurem
     time, position = orbit["time"][order], orbit.stacked("x", "y", "z")[order]
     radius = np.linalg.norm(position, axis=1)
     for k in np.flatnonzero((radius < _LEAST_RADIUS) | (radius > _MOST_RADIUS))[:1]:
-        found = f"{radius[k] / 1e3:.6g} km from the Earth's centre"
+        value = f"{radius[k] / 1e3:.6g} km from the Earth's centre"
         allowed = f"{_LEAST_RADIUS / 1e3:g} to {_MOST_RADIUS / 1e3:g} km; is the unit in the head right?"
-        raise orbit.error(int(order[k]), "x", "not a satellite position", found, allowed)
+        raise orbit.error(int(order[k]), "x", "not a satellite position", value, allowed)
     _check_jumps(orbit, order, time, position)
     speed = None
     columns = [name for name in ("vx", "vy", "vz") if name in orbit]
@@ -628,8 +628,8 @@ def _check_jumps(table: Table, order: NDArray[np.intp], time: Array, position: A
         speed = np.median(np.linalg.norm(rate, axis=1))
         jump = ~(change <= _FALL * (step[1:] + step[:-1]) + _JUMP * speed)
     for k in np.flatnonzero(jump)[:1]:
-        found, allowed = f"the velocity changes by {change[k]:.4g} m/s", "one pass without manoeuvre"
-        raise table.error(int(order[k + 1]), "x", "a jump of the orbit", found, f"{allowed}; leave out wrong readings")
+        value, allowed = f"the velocity changes by {change[k]:.4g} m/s", "one pass without manoeuvre"
+        raise table.error(int(order[k + 1]), "x", "a jump of the orbit", value, f"{allowed}; leave out wrong readings")
 
 
 def _check_rotations(table: Table, order: NDArray[np.intp], quaternion: Array) -> None:
@@ -637,8 +637,8 @@ def _check_rotations(table: Table, order: NDArray[np.intp], quaternion: Array) -
     step = np.diff(table["time"][order])
     rotation = 2.0 * np.arccos(np.clip(np.abs(np.sum(quaternion[1:] * quaternion[:-1], axis=1)), 0.0, 1.0))
     for k in np.flatnonzero(rotation > _LEAST_ROTATION + _FASTEST_ROTATION * step)[:1]:
-        found = f"{np.degrees(rotation[k]):.4g} deg in {step[k]:.4g} s"
-        raise table.error(int(order[k + 1]), "q1", "a jump of the attitude", found, "leave out wrong readings")
+        value = f"{np.degrees(rotation[k]):.4g} deg in {step[k]:.4g} s"
+        raise table.error(int(order[k + 1]), "q1", "a jump of the attitude", value, "leave out wrong readings")
 
 
 def _check_velocity(table: Table, order: NDArray[np.intp], time: Array, position: Array, speed: Array) -> None:
@@ -646,6 +646,6 @@ def _check_velocity(table: Table, order: NDArray[np.intp], time: Array, position
     far, inertial = velocity_misfit(time, position, speed)
     if np.median(far) > SPEED_TOLERANCE:
         row = int(order[int(np.argsort(far)[len(far) // 2])])
-        found = f"they differ by {100.0 * np.median(far):.3g} % in the median"
+        value = f"they differ by {100.0 * np.median(far):.3g} % in the median"
         problem = INERTIAL_VELOCITY if inertial else "not the velocity of these positions"
-        raise table.error(row, "vx", problem, found, EARTH_FIXED_VELOCITY)
+        raise table.error(row, "vx", problem, value, EARTH_FIXED_VELOCITY)

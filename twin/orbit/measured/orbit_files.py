@@ -111,7 +111,7 @@ class AttitudeReadings:
         Time scale of the clock; None where the file does not specify it.
     scalar : Scalar or None
         Position of the quaternion's scalar part, first or last; None where the file does not specify it.
-    turns : Turns or None
+    sense : RotationDirection or None
         Direction of the rotation, body to frame or frame to body; None where the file does not specify it.
     """
 
@@ -122,7 +122,7 @@ class AttitudeReadings:
     frame: str | None = None
     scale: str | None = None
     scalar: Scalar | None = None
-    turns: RotationDirection | None = None
+    sense: RotationDirection | None = None
 
     def taken(self, part: slice) -> AttitudeReadings:
         """Return the attitude readings that a slice of their indices selects."""
@@ -159,9 +159,9 @@ def require_orbit(file: str, position: np.ndarray, lines: list[int]) -> None:
     """
     radius = np.linalg.norm(position, axis=1)
     for row in np.flatnonzero((radius < 6.3e6) | (radius > 1e8))[:1]:
-        found = f"{radius[row] / 1e3:.6g} km from the Earth's centre"
+        value = f"{radius[row] / 1e3:.6g} km from the Earth's centre"
         raise InputError(
-            Issue("not a satellite position", file, lines[row], (), found, "6300 km to 100 000 km; units?")
+            Issue("not a satellite position", file, lines[row], (), value, "6300 km to 100 000 km; units?")
         )
 
 
@@ -169,8 +169,8 @@ def require_unit(file: str, quaternion: np.ndarray, lines: list[int]) -> None:
     """Raise InputError unless M quaternions (M, 4), read from these lines of a file, have length 1 to a thousandth."""
     length = np.linalg.norm(quaternion, axis=1)
     for row in np.flatnonzero(np.abs(length - 1.0) > 1e-3)[:1]:
-        found = f"length {length[row]:.6g}"
-        raise InputError(Issue("not a unit quaternion", file, lines[row], (), found, "length 1"))
+        value = f"length {length[row]:.6g}"
+        raise InputError(Issue("not a unit quaternion", file, lines[row], (), value, "length 1"))
 
 
 SPEED_TOLERANCE = 0.02
@@ -304,10 +304,10 @@ def read_aem(path: str | Path, satellite: str | None = None) -> AttitudeReadings
     frames = {key: _same(file, segments, key) for key in ("REF_FRAME_A", "REF_FRAME_B")}
     body = [key for key, (name, _) in frames.items() if name.upper().startswith(("SC_", "SC", "SPACECRAFT"))]
     if len(body) != 1:
-        found = names_text(name for name, _ in frames.values())
+        value = names_text(name for name, _ in frames.values())
         problem = "one of the two frames must be the body's"
         allowed = "SC_BODY or another frame of the spacecraft, SC_..., and a reference frame"
-        raise InputError(Issue(problem, file, frames["REF_FRAME_A"][1], ("REF_FRAME_A",), found, allowed))
+        raise InputError(Issue(problem, file, frames["REF_FRAME_A"][1], ("REF_FRAME_A",), value, allowed))
     reference, at = frames["REF_FRAME_A" if body[0] == "REF_FRAME_B" else "REF_FRAME_B"]
     direction, direction_line = _same(file, segments, "ATTITUDE_DIR", "A2B")
     if direction.upper() not in ("A2B", "B2A"):
@@ -415,8 +415,8 @@ def _chosen(file: str, segments: list[_Segment], satellite: str | None) -> list[
     allowed = [name for known in names.values() for name in known]
     if satellite is None:
         if len(names) > 1:
-            found = names_text(names)
-            raise InputError(Issue("the satellite is not specified", file, None, ("satellite",), found, "one of them"))
+            value = names_text(names)
+            raise InputError(Issue("the satellite is not specified", file, None, ("satellite",), value, "one of them"))
         return segments
     segments_of_object = [
         s for s in segments if satellite in (s.keys.get(k, ("",))[0] for k in ("OBJECT_ID", "OBJECT_NAME"))
@@ -439,8 +439,8 @@ def _same(file: str, segments: list[_Segment], key: str, usual: str | None = Non
     if first is None or None in values:
         raise InputError(Issue(f"no {key}", file, None, (key,), None, "this key in the metadata of every segment"))
     if len(values) > 1:
-        found = names_text(sorted(map(str, values)))
-        raise InputError(Issue(f"segments with different {key}", file, first[1], (key,), found, "the same in all"))
+        value = names_text(sorted(map(str, values)))
+        raise InputError(Issue(f"segments with different {key}", file, first[1], (key,), value, "the same in all"))
     return first
 
 
@@ -540,9 +540,9 @@ def read_sp3(path: str | Path, satellite: str | None = None) -> OrbitReadings:
             break
     epoch_count = head[32:39].strip()
     if not ended and not (epoch_count.isdigit() and int(epoch_count) == epochs and used):
-        found = f"{epochs} of {epoch_count} epochs" if epoch_count.isdigit() else None
+        value = f"{epochs} of {epoch_count} epochs" if epoch_count.isdigit() else None
         allowed = "EOF as the last line, or all epochs of the header"
-        raise InputError(Issue("the file ends early", file, len(lines), (), found, allowed))
+        raise InputError(Issue("the file ends early", file, len(lines), (), value, allowed))
     if len(rows) < 2:
         raise InputError(Issue(f"fewer than two positions of {which}", file, None, (), str(len(rows)), "two or more"))
     clock = readings(file, texts, rows)
@@ -552,8 +552,8 @@ def read_sp3(path: str | Path, satellite: str | None = None) -> OrbitReadings:
     velocity = None
     if speeds:
         if len(speeds) != len(rows):
-            found = f"{len(speeds)} velocities and {len(rows)} positions"
-            raise InputError(Issue("velocities are missing", file, None, (), found, "one for each position, or none"))
+            value = f"{len(speeds)} velocities and {len(rows)} positions"
+            raise InputError(Issue("velocities are missing", file, None, (), value, "one for each position, or none"))
         velocity = 0.1 * numbers(file, speeds, speed_rows, ("vx", "vy", "vz"))
     return OrbitReadings(file, clock, position, velocity, frame, scale)
 
@@ -561,15 +561,15 @@ def read_sp3(path: str | Path, satellite: str | None = None) -> OrbitReadings:
 def _satellite(file: str, lines: list[str], wanted: str | None, old: bool) -> str:
     """Return the identifier of a satellite as the SP3 file writes it; in versions a and b it may be a bare number."""
     names = list(dict.fromkeys(line[1:4].strip() for line in lines if line[:1] == "P"))
-    key, found = ("satellite",), names_text(names[:20]) or "none"
+    key, value = ("satellite",), names_text(names[:20]) or "none"
     if wanted is None:
         if len(names) != 1:
-            raise InputError(Issue("the satellite is not specified", file, None, key, found, "the name of one"))
+            raise InputError(Issue("the satellite is not specified", file, None, key, value, "the name of one"))
         return names[0]
     alike = [n for n in sorted(names) if n.lstrip("Gg").strip().lstrip("0") == wanted.lstrip("Gg").lstrip("0")]
     name = wanted if wanted in names or not (old and alike) else alike[0]
     if name not in names:
-        raise InputError(Issue("no such satellite", file, None, key, wanted, found, nearest(wanted, names)))
+        raise InputError(Issue("no such satellite", file, None, key, wanted, value, nearest(wanted, names)))
     return name
 
 

@@ -61,7 +61,7 @@ class Conventions:
         Seconds to be added to the times.
     scalar : str
         Position of a quaternion's scalar part.
-    turns : str
+    sense : str
         Direction of a quaternion's rotation.
     body_axes : tuple of str
         Axes of the body whose attitude the file gives.
@@ -78,7 +78,7 @@ class Conventions:
     orbit_offset: float = 0.0
     attitude_offset: float = 0.0
     scalar: str = "last"
-    turns: str = "body_to_frame"
+    sense: str = "body_to_frame"
     body_axes: tuple[str, str, str] = ("forward", "right", "down")
     sequence: str = "xyz"
     law: Attitude = field(default_factory=Attitude)
@@ -135,7 +135,7 @@ def read_platform(spec: PlatformFilesSpec, folder: Path) -> tuple[PlatformReadin
         _of_file_or_test(spec_of, "scalar", spec_of.scalar, attitude.scalar, "the position of the scalar")
         if quaternions
         else "last",
-        _of_file_or_test(spec_of, "direction", spec_of.direction, attitude.turns, "the direction of the rotation")
+        _of_file_or_test(spec_of, "direction", spec_of.direction, attitude.sense, "the direction of the rotation")
         if quaternions
         else "body_to_frame",
         spec_of.body_axes,
@@ -193,9 +193,9 @@ def platform_table(readings: PlatformReadings, conventions: Conventions, epoch: 
         )
         known = flown.covers(attitude_time)
         if np.sum(known) < 2:
-            found = f"{attitude_time[0]:.9g} s to {attitude_time[-1]:.9g} s, and orbit from {flown.first:.9g} s"
+            value = f"{attitude_time[0]:.9g} s to {attitude_time[-1]:.9g} s, and orbit from {flown.first:.9g} s"
             allowed = "two or more attitude readings within the time span of the orbit, which defines their frame"
-            raise InputError(Issue("attitude at times without orbit", attitude.file, None, (), found, allowed))
+            raise InputError(Issue("attitude at times without orbit", attitude.file, None, (), value, allowed))
         attitude_time = attitude_time[known]
         matrix = flown.orbital_to_itrs(attitude_time) @ matrix[known]
     elif rotation is not None and conventions.attitude_frame != "ITRS":
@@ -208,10 +208,10 @@ def platform_table(readings: PlatformReadings, conventions: Conventions, epoch: 
     between = TabulatedTrajectory(table).interpolation_error
     if between > _LARGEST_ERROR:
         step = float(np.median(np.diff(time)))
-        found = f"{between:.2g} m with {step:g} s between readings"
+        value = f"{between:.2g} m with {step:g} s between readings"
         allowed = f"{_LARGEST_ERROR:g} m: readings closer together"
         raise InputError(
-            Issue("positions between the readings are too uncertain", orbit.file, None, (), found, allowed)
+            Issue("positions between the readings are too uncertain", orbit.file, None, (), value, allowed)
         )
     if usable is None:
         return table
@@ -271,7 +271,7 @@ def _body(attitude: orbit_files.AttitudeReadings, conventions: Conventions) -> n
     if attitude.quaternion is not None:
         q = attitude.quaternion if conventions.scalar == "last" else np.roll(attitude.quaternion, -1, axis=1)
         matrix = np.asarray(Rotation.from_quat(q).as_matrix())
-        if conventions.turns == "frame_to_body":
+        if conventions.sense == "frame_to_body":
             matrix = np.swapaxes(matrix, 1, 2)
     else:
         assert attitude.angles is not None
@@ -349,8 +349,8 @@ def _attitude(spec: AttitudeFileSpec, folder: Path) -> orbit_files.AttitudeReadi
     sets = [names for names in (_NAMED, _PLACED, _ANGLES) if any(n in table for n in names)]
     if len(sets) != 1 or not all(name in table for name in sets[0]):
         allowed = "qx, qy, qz, qw, or q1, q2, q3, q4, or roll [deg], pitch [deg], yaw [deg]"
-        found = ", ".join(table.columns)
-        raise InputError(Issue("not one complete set of columns", str(path), None, (), found, allowed))
+        value = ", ".join(table.columns)
+        raise InputError(Issue("not one complete set of columns", str(path), None, (), value, allowed))
     values, lines = table.stacked(*sets[0]), [int(v) for v in table.lines]
     if sets[0] == _ANGLES:
         return orbit_files.AttitudeReadings(str(path), clock, None, values, None, scale)
@@ -369,8 +369,8 @@ def clock_of(table: Table, spec: OrbitFileSpec | AttitudeFileSpec | LineTimesFil
         The table has none or both of the columns, a text is not a date and time, or seconds come without their epoch.
     """
     if ("time" in table) == ("date_time" in table):
-        found, allowed = ", ".join(table.columns), "time [s] with `epoch:`, or date_time"
-        raise InputError(Issue("times must be given exactly once", table.file, None, (), found, allowed))
+        value, allowed = ", ".join(table.columns), "time [s] with `epoch:`, or date_time"
+        raise InputError(Issue("times must be given exactly once", table.file, None, (), value, allowed))
     try:
         if "date_time" in table:
             return earth_orientation.Readings.of_texts(table["date_time"].tolist())
@@ -416,7 +416,7 @@ def _counted(spec: OrbitFileSpec | AttitudeFileSpec, clock: earth_orientation.Re
     )
 
 
-_ITRS = Conventions("ITRS", "UTC", "ITRS", "UTC", scalar="first", turns="body_to_frame")
+_ITRS = Conventions("ITRS", "UTC", "ITRS", "UTC", scalar="first", sense="body_to_frame")
 
 
 @dataclass(frozen=True, eq=False)

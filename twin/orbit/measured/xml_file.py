@@ -57,8 +57,8 @@ def numbers(file: str, cells: Sequence[Sequence[str]], lines: Sequence[int], hea
     width = len(heads)
     uneven = next((k for k, row in enumerate(cells) if len(row) != width), None)
     if uneven is not None:
-        found = f"{len(cells[uneven])} numbers"
-        raise InputError(Issue("wrong number of columns", file, lines[uneven], value=found, allowed=", ".join(heads)))
+        value = f"{len(cells[uneven])} numbers"
+        raise InputError(Issue("wrong number of columns", file, lines[uneven], value=value, allowed=", ".join(heads)))
     try:
         values = np.array([list(map(float, row)) for row in cells], dtype=np.float64).reshape(len(cells), width)
     except ValueError:
@@ -239,9 +239,9 @@ class Element:
             element.wrong("not a whole number", shown(element.text), f"{least} to {most}")
         return int(value)
 
-    def wrong(self, problem: str, found: str | None = None, allowed: str | None = None) -> NoReturn:
+    def wrong(self, problem: str, value: str | None = None, allowed: str | None = None) -> NoReturn:
         """Raise an InputError about this element that names file, line and path."""
-        raise InputError(Issue(problem, self.file, self.line, self.path, found, allowed))
+        raise InputError(Issue(problem, self.file, self.line, self.path, value, allowed))
 
 
 class _Builder:
