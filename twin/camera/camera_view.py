@@ -568,11 +568,10 @@ def section_lines(model: CameraModel, axis: int, points: int = 80, holes: bool =
         pose = model.image_body if name == IMAGE else model.mirror_pose(name)
         sag = np.zeros(points) if name == IMAGE else model.surfaces[name].sag(x, y)
         bored = holes and name != IMAGE and not model.spec.mirrors[name].light
-        for cut in model.edges.get(name, ()) if bored else ():
-            if cut.blocks and isinstance(cut.shape, Circle) and not cut.shape.inner:
-                sag = np.where(
-                    np.hypot(x - cut.shape.centre[0], y - cut.shape.centre[1]) < cut.shape.radius, np.nan, sag
-                )
+        for stop in model.edges.get(name, ()) if bored else ():
+            if stop.blocks and isinstance(stop.shape, Circle) and not stop.shape.inner:
+                x0, y0 = stop.shape.centre
+                sag = np.where(np.hypot(x - x0, y - y0) < stop.shape.radius, np.nan, sag)
         lines[name] = pose.apply(np.stack([x, y, sag], axis=-1))
     return lines
 

@@ -547,8 +547,8 @@ def _focus(figure: Figure, views: list[CameraView], field: Field) -> None:
         colour = np.array([view.model.spec.wavelength])
         frequency = view.nyquist * np.eye(2)
         values = np.abs(polychromatic_transfer(pupil, frequency, colour, np.ones(1), shift))
-        for column, ink, way in ((0, BLUE, "along the line"), (1, VERMILION, "along the track")):
-            axes.plot(1e6 * shift, values[:, column], color=ink, ls=style, label=f"{name}, {way}")
+        for column, ink, direction in ((0, BLUE, "along the line"), (1, VERMILION, "along the track")):
+            axes.plot(1e6 * shift, values[:, column], color=ink, ls=style, label=f"{name}, {direction}")
     axes.axvline(0.0, color=INK, lw=0.6)
     axes.set_xlabel(f"the line CCD moved downstream by [{UM}]")
     axes.set_ylabel("MTF of the optics at Nyquist")

@@ -289,8 +289,8 @@ class LiveApi:
             try:
                 await self._answer_request(client, *client.next_request())
             except ComputerLost as error:
-                for one in self.clients:
-                    one.queue_json({"type": "refused", "problem": str(error)})
+                for client in self.clients:
+                    client.queue_json({"type": "refused", "problem": str(error)})
                 raise
 
     def _next(self) -> Client | None:
@@ -308,16 +308,16 @@ class LiveApi:
 
     async def _build(self, client: Client, asked: messages.Factors) -> None:
         """Have the instrument built with other values of a study's factors, and inform all pages."""
-        for one in self.clients:
-            one.queue_json({"type": "building"})
+        for client in self.clients:
+            client.queue_json({"type": "building"})
         answer = await self.computer.ask("factors", asked.values)
         if isinstance(answer, str):
             client.queue_json({"type": "refused", "problem": answer})
         else:
-            for one in self.clients:
-                one.shown = one.before = one.recorded = None
-        for one in self.clients:
-            one.queue_json({"type": "hello", **self.computer.opened.greeting})
+            for client in self.clients:
+                client.shown = client.before = client.recorded = None
+        for client in self.clients:
+            client.queue_json({"type": "hello", **self.computer.opened.greeting})
 
     async def _answer_request(self, client: Client, kind: str, asked: Any) -> None:
         """Have the computing process answer a request of a page, and queue the answer."""

@@ -211,8 +211,8 @@ def checked_knob(name: str, value: float, knobs: Mapping[str, Knob]) -> Knob:
     if knob is None:
         raise InputError(unknown("no such knob", name, knobs).at())
     if not abs(value) <= knob.limit:
-        found, allowed = f"{value:g} {knob.unit}".strip(), f"up to {knob.limit:g} {knob.unit}".strip()
-        raise InputError(Issue(f"{name} is too large", value=found, allowed=allowed))
+        amount, allowed = f"{value:g} {knob.unit}".strip(), f"up to {knob.limit:g} {knob.unit}".strip()
+        raise InputError(Issue(f"{name} is too large", value=amount, allowed=allowed))
     return knob
 
 
@@ -221,8 +221,8 @@ def _without_knobs(what: Mapping[str, Any]) -> dict[str, Any]:
 
     They are tables of nodes and of temperatures, a body's own temperature, radii, conic constants and indices.
     """
-    turned = {kind.key for kind in KINDS.values()}
-    out = {key: value for key, value in what.items() if key not in (*turned, "pivot")}
+    kinds = {kind.key for kind in KINDS.values()}
+    out = {key: value for key, value in what.items() if key not in (*kinds, "pivot")}
     heat = what.get("temperature")
     if isinstance(heat, Mapping):
         out["temperature"] = {key: value for key, value in heat.items() if key not in ("change", "gradient")}
@@ -292,8 +292,8 @@ class FactorKnob:
 
 def factor_knobs(setup: StudySetup) -> tuple[FactorKnob, ...]:
     """Return the knobs of the numeric factors of a study."""
-    turned = (_factor(name, factor, setup) for name, factor in setup.study.factors.items())
-    return tuple(factor for factor in turned if factor is not None)
+    factors = (_factor(name, factor, setup) for name, factor in setup.study.factors.items())
+    return tuple(factor for factor in factors if factor is not None)
 
 
 def base_with_factors(setup: StudySetup, scalars: Mapping[str, Any]) -> Tree:
@@ -312,8 +312,8 @@ def base_with_factors(setup: StudySetup, scalars: Mapping[str, Any]) -> Tree:
         A value is not possible.
     """
     factors = {name: _fixed(setup.study.factors[name], scalar) for name, scalar in scalars.items()}
-    one = setup.study.model_copy(update={"factors": factors, "design": DesignSpec(kind="grid")})
-    return with_values(setup.base, Plan.of(replace(setup, study=one)).run(0).values)
+    grid = setup.study.model_copy(update={"factors": factors, "design": DesignSpec(kind="grid")})
+    return with_values(setup.base, Plan.of(replace(setup, study=grid)).run(0).values)
 
 
 def _fixed(factor: FactorSpec, scalar: Any) -> FactorSpec:

@@ -315,7 +315,7 @@ class LiveBench:
             seed=self.seed_of(asked.seed),
             truth=experiment.sight.truth([state], placed),
             warnings=(
-                *(f"image quality of {name}: {own['reason']}" for name, own in cameras if "reason" in own),
+                *(f"image quality of {name}: {quality['reason']}" for name, quality in cameras if "reason" in quality),
                 *([BLURRED] if blurred else []),
             ),
         )

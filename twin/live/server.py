@@ -141,8 +141,8 @@ class Guard:
         """
         host = headers.get("host", "").lower()
         plain = local_address.removeprefix("::ffff:")
-        own = _host_text(f"[{plain}]" if ":" in plain else plain, self.port)
-        if host not in self.hosts and not (plain and host == own):
+        address = _host_text(f"[{plain}]" if ":" in plain else plain, self.port)
+        if host not in self.hosts and not (plain and host == address):
             return "the Host header does not name this server"
         origin = headers.get("origin")
         if origin is not None and origin.lower() != f"http://{host}":

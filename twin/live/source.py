@@ -142,7 +142,7 @@ def _no_config(folder: Path, manifest: Manifest | None) -> Issue:
     if manifest is not None:
         return _nothing_to_show(folder, f"a run folder of {manifest.program}", folder)
     try:
-        inside = sorted(one.name for one in folder.iterdir() if (one / CONFIG).is_file())
+        inside = sorted(child.name for child in folder.iterdir() if (child / CONFIG).is_file())
     except OSError:
         inside = []
     meant = names_text(str(folder / name) for name in inside[:MOST_NAMED])
@@ -200,7 +200,7 @@ def _nothing_to_show(place: Path, what: str, folder: Path, data: Any = None) -> 
     remedies = []
     if (folder / REPORT).is_file():
         remedies.append(f"its results are in {folder / REPORT}")
-    instruments = sorted(one for one in (folder / "artefacts").glob("*.yaml") if _is_instrument(one))
+    instruments = sorted(path for path in (folder / "artefacts").glob("*.yaml") if _is_instrument(path))
     instrument = data.get("instrument") if isinstance(data, dict) else None
     name = instrument.get("name") if isinstance(instrument, dict) else None
     if instruments:
@@ -276,8 +276,8 @@ def _of_study(file: Path, run: int | None) -> Source:
     """Return the base job of a study, or one of its runs, as a source."""
     setup = resolve_study(file)
     if setup.study.base.command != "render":
-        found, allowed = setup.study.base.command, "a study of base: {command: render}"
-        raise setup.error(Problem("this study does not vary a job of a monitor", found, allowed), ("base", "command"))
+        command, allowed = setup.study.base.command, "a study of base: {command: render}"
+        raise setup.error(Problem("this study does not vary a job of a monitor", command, allowed), ("base", "command"))
     factors, name = factor_knobs(setup), setup.study.name
     if run is None:
         resolved: ResolvedJob = validate(ResolvedJob, YamlFile("", setup.base, {}))
@@ -286,16 +286,16 @@ def _of_study(file: Path, run: int | None) -> Source:
     if not 0 <= run < plan.runs:
         text = "the study has no such run"
         raise InputError(Issue(text, str(file), value=f"--run {run}", allowed=f"0 to {plan.runs - 1}"))
-    one, scalars = plan.run(run), {column.name: column.cell(run) for column in plan.columns}
+    single, scalars = plan.run(run), {column.name: column.cell(run) for column in plan.columns}
     try:
         resolved = validate(ResolvedJob, YamlFile("", base_with_factors(setup, scalars), {}))
     except InputError as error:
         raise setup.blamed(error) from None
-    if one.seed is not None:
-        resolved = resolved.with_render(resolved.frames, one.seed)
+    if single.seed is not None:
+        resolved = resolved.with_render(resolved.frames, single.seed)
     factors = tuple(factor.starting_at(scalars[factor.name]) for factor in factors)
     values = ", ".join(f"{key} {value}" for key, value in scalars.items())
-    about, has_own_seed = f"run {run} of the study {name}: {values}", one.seed is not None
+    about, has_own_seed = f"run {run} of the study {name}: {values}", single.seed is not None
     return Source(resolved, about=about, study=setup, factors=factors, scalars=scalars, has_own_seed=has_own_seed)
 
 

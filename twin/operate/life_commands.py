@@ -28,7 +28,9 @@ def simulate(
     options: Options,
     start: Annotated[str, typer.Option("--from", help="UTC of the first reading; time laws count from it.")],
     days: Annotated[float, typer.Option(help="Length of the life, in days.")],
-    every: Annotated[str, typer.Option(help="Time from one reading to the next, with its unit: 6d, 12h.")],
+    interval: Annotated[
+        str, typer.Option("--every", help="Time from one reading to the next, with its unit: 6d, 12h.")
+    ],
     record: Annotated[
         str | None, typer.Argument(metavar="[DIR_OR_URL]", help="Record to create. Without it only files are written.")
     ] = None,
@@ -84,7 +86,7 @@ def simulate(
         from optics.numerics.backend import load_backend
         from twin.operate.simulation_run import simulate_into, simulation
 
-        option_values = {"--from": start, "--days": f"{days:.17g}", "--every": every, "--frames": str(frames)}
+        option_values = {"--from": start, "--days": f"{days:.17g}", "--every": interval, "--frames": str(frames)}
         option_values |= {"--coefficient-error": coefficient_error, "--sensor-sigma": sensor_sigma}
         several = {"--sensor": sensor or [], "--dead": dead or [], "--stuck": stuck or [], "--event": event or []}
         what = simulation(option_values, several, seed)

@@ -189,8 +189,8 @@ def _prior_of_record(
             look = setup.camera.lines[line].look
             if abs(mounted[line].look - look) > _NEAR:
                 text = f"the record is of {history.name}, whose {line} camera has another look angle than this block's"
-                found = f"{np.degrees(mounted[line].look):.4g} deg, not {np.degrees(look):.4g} deg"
-                raise Problem(text, found, "the record of the instrument that took the images", within=("record",))
+                value = f"{np.degrees(mounted[line].look):.4g} deg, not {np.degrees(look):.4g} deg"
+                raise Problem(text, value, "the record of the instrument that took the images", within=("record",))
         operation = Operation(history, plan, lambda done, of: advance("follow the record", done, of))
         operation.filter_readings()
         for line in lines:
@@ -198,8 +198,8 @@ def _prior_of_record(
             specified = setup.camera.lines[line].principal_distance
             if abs(length / specified - 1.0) > _NEAR:
                 text = f"the record is of {history.name}, whose {line} camera has another principal distance"
-                found = f"{1e3 * length:.5g} mm, not {1e3 * specified:.5g} mm"
-                raise Problem(text, found, "the record of the instrument that took the images", within=("record",))
+                value = f"{1e3 * length:.5g} mm, not {1e3 * specified:.5g} mm"
+                raise Problem(text, value, "the record of the instrument that took the images", within=("record",))
         times = {name: micros(epoch) for name, epoch in epochs.items()}
         order = sorted(set(times.values()))
         names = [f"{line} {key}" for line in lines for key in KEYS]

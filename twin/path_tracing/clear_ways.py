@@ -256,8 +256,8 @@ def _edge_distance(face: SceneSurface, aperture: Aperture) -> float:
     outward = np.stack([along[:, 1], -along[:, 0]], axis=-1) / np.linalg.norm(along, axis=-1, keepdims=True)
     outward *= np.sign(np.sum(outward * (corners - corners.mean(axis=0)), axis=-1, keepdims=True))
     x0, x1, y0, y1 = aperture.bounds
-    reach = np.abs(outward) * [0.5 * (x1 - x0), 0.5 * (y1 - y0)]
-    far = reach.sum(axis=-1) if isinstance(aperture, Rectangle) else np.linalg.norm(reach, axis=-1)
+    half_extent = np.abs(outward) * [0.5 * (x1 - x0), 0.5 * (y1 - y0)]
+    far = half_extent.sum(axis=-1) if isinstance(aperture, Rectangle) else np.linalg.norm(half_extent, axis=-1)
     return float(np.min(np.sum(outward * (corners - [0.5 * (x0 + x1), 0.5 * (y0 + y1)]), axis=-1) - far))
 
 
@@ -318,7 +318,7 @@ def _reaches(triangles: np.ndarray, planes: np.ndarray, margin: float) -> bool:
             continue
         left = corners
         for plane in planes:
-            left = _cut(left, left @ plane[:3] + plane[3] - margin)
+            left = _clip(left, left @ plane[:3] + plane[3] - margin)
             if not len(left):
                 break
         if len(left):
@@ -326,7 +326,7 @@ def _reaches(triangles: np.ndarray, planes: np.ndarray, margin: float) -> bool:
     return False
 
 
-def _cut(corners: np.ndarray, levels: np.ndarray) -> np.ndarray:
+def _clip(corners: np.ndarray, levels: np.ndarray) -> np.ndarray:
     """Return the part of a convex polygon where a linear function is zero or negative.
 
     ``levels`` are the values of the function at the polygon's corners.

@@ -316,7 +316,7 @@ class PathHistory:
     ----------
     passed : (N,) ndarray
         Number of surfaces of the nominal path that were passed.
-    turned : (N,) ndarray of bool
+    redirected : (N,) ndarray of bool
         True where the path left the nominal path at a surface; False where it missed the next one or reached the
         detector.
     steps : (N,) ndarray
@@ -324,7 +324,7 @@ class PathHistory:
     """
 
     passed: np.ndarray
-    turned: np.ndarray
+    redirected: np.ndarray
     steps: np.ndarray
 
 
@@ -339,15 +339,15 @@ def learn_survival(launches: Sequence[tuple[PathHistory, np.ndarray, np.ndarray]
     seed : int
         Seed of the random numbers that decide survival.
     """
-    passed, turned, steps = (
-        np.concatenate([getattr(done, name) for done, _, _ in launches]) for name in ("passed", "turned", "steps")
+    passed, redirected, steps = (
+        np.concatenate([getattr(done, name) for done, _, _ in launches]) for name in ("passed", "redirected", "steps")
     )
-    paths, weights = (np.concatenate([one[k] for one in launches]) for k in (1, 2))
+    paths, weights = (np.concatenate([launch[k] for launch in launches]) for k in (1, 2))
     count, classes = len(passed), int(passed.max()) + 1
     brought = np.bincount(paths.astype(np.int64), weights, count) ** 2
 
     def of_classes(values: np.ndarray) -> np.ndarray:
-        return np.bincount(passed[turned], values[turned], classes)
+        return np.bincount(passed[redirected], values[redirected], classes)
 
     number, cost, variance = (of_classes(values) for values in (np.ones(count), steps, brought))
     rest = NOMINAL_COST * passed.sum() + steps.sum() - cost.sum()
@@ -871,8 +871,8 @@ def _step(
                 cosine_after = dr.copysign(shared.bent, place.cosine)
                 refracted = dr.fma(place.normal, cosine_after - ratio * place.cosine, ratio * d)
                 outgoing = dr.select(through, refracted, outgoing)
-                own = kind >> layout.Kind.BODY_SHIFT & layout.Kind.BODY_MASK
-                medium = dr.select(met & through, dr.select(inside, 0, own), medium)
+                body = kind >> layout.Kind.BODY_SHIFT & layout.Kind.BODY_MASK
+                medium = dr.select(met & through, dr.select(inside, 0, body), medium)
                 out_index = dr.select(medium != 0, place.row[layout.INDEX], 1.0)
             leaving = OutgoingPaths(outgoing, place.normal, out_index, event, onward, place.cosine, diffusing)
             drawn = TableSampling(tables.measured, shared.marks, dr.abs(place.cosine)) if shared.marks else None

@@ -30,7 +30,7 @@ from twin.path_tracing.path_result import Accumulators, Arrival, record
 GROUP = 4
 """Number of consecutive surfaces between two tests of whether any path processed together is still active."""
 
-ENDED, MISSED, TURNED = range(3)
+ENDED, MISSED, REDIRECTED = range(3)
 """Reasons why a path has left the nominal path.
 
 They are: absorbed by the detector; does not meet the next surface as nominal light does; takes another direction there
@@ -185,7 +185,7 @@ class NominalPart:
     passed : Dr.Jit array
         Number of surfaces that each has passed.
     reason : Dr.Jit array
-        Reason why each has left: ``ENDED``, ``MISSED`` or ``TURNED``.
+        Reason why each has left: ``ENDED``, ``MISSED`` or ``REDIRECTED``.
     draws : tuple of int
         Number of steps of the random generator still to be taken, by the surfaces passed.
     """
@@ -223,19 +223,19 @@ def trace_nominal(
         dr.zeros(backend.Float, n),
         launch.rng.state + 0,
         dr.zeros(backend.UInt, n),
-        dr.full(backend.UInt, TURNED, n),
+        dr.full(backend.UInt, REDIRECTED, n),
         dr.full(backend.Bool, True, n),
     )
     draws = [0]
     for first in range(0, len(steps), GROUP):
 
-        def some(*state: Any, first: int = first) -> tuple[Any, ...]:
+        def part(*state: Any, first: int = first) -> tuple[Any, ...]:
             for place in range(first, min(first + GROUP, len(steps))):
                 state, left = along.step(place, state, launch.rng, draws[place])
                 draws.append(left)
             return state
 
-        state = dr.if_stmt(state, state[-1], some, lambda *same: same, label="nominal", mode="symbolic")
+        state = dr.if_stmt(state, state[-1], part, lambda *same: same, label="nominal", mode="symbolic")
     p, d, weight, length, rng_state, passed, reason, _ = state
     rng = type(launch.rng)(launch.rng)
     rng.state = rng_state
@@ -327,11 +327,11 @@ class _NominalTracer:
         if step.ends:
             ended = dr.select(continues, ENDED, reason)
             return (p, d, weight, length, rng_state, passed, ended, continues & False), pending
-        turned = dr.fma(at.normal, -2.0 * at.cosine, d)
+        direction = dr.fma(at.normal, -2.0 * at.cosine, d)
         if step.event == Event.TRANSMIT:
             bent = dr.copysign(shared.bent, at.cosine)
-            turned = dr.fma(at.normal, bent - shared.ratio * at.cosine, shared.ratio * d)
-        after = (q, turned, new_weight, longer, generator.state, passed + 1)
+            direction = dr.fma(at.normal, bent - shared.ratio * at.cosine, shared.ratio * d)
+        after = (q, direction, new_weight, longer, generator.state, passed + 1)
         new = (
             dr.select(continues, a, b) for a, b in zip(after, (p, d, weight, length, rng_state, passed), strict=True)
         )
@@ -410,8 +410,8 @@ class OneSurface:
         """
         tables, first = self.prepared.tables, layout.FINISH_ROW * self.step.row
         amounts = tables.host_finishes.ravel()[first : first + layout.BLOCK]
-        found = zip(amounts, self._numbers(tables.finishes, first, layout.BLOCK), strict=True)
-        return [self._literal(amount) if amount in (-1.0, 0.0, 1.0) else number for amount, number in found]
+        pairs = zip(amounts, self._numbers(tables.finishes, first, layout.BLOCK), strict=True)
+        return [self._literal(amount) if amount in (-1.0, 0.0, 1.0) else number for amount, number in pairs]
 
     def surface(self, number: Any, form: layout.SurfaceForm, active: Any) -> SurfaceNumbers:
         """Return the numbers that describe the shape of the surface."""
@@ -440,7 +440,7 @@ class Departures:
     ----------
     passed : (N,) ndarray
         Number of surfaces passed by each path of the launch.
-    turned : (N,) ndarray of bool
+    redirected : (N,) ndarray of bool
         True where the path left at a surface.
     chosen : ndarray
         Indices in the launch of the paths that continue.
@@ -449,7 +449,7 @@ class Departures:
     """
 
     passed: np.ndarray
-    turned: np.ndarray
+    redirected: np.ndarray
     chosen: np.ndarray
     probabilities: np.ndarray
 
@@ -457,7 +457,7 @@ class Departures:
     def of(
         cls,
         steps: Sequence[Step],
-        stretch: NominalPart,
+        nominal: NominalPart,
         numbers: np.ndarray,
         learned: LearnedRoulette | None,
         again: bool,
@@ -468,7 +468,7 @@ class Departures:
         ----------
         steps : Sequence[Step]
             Surfaces of the nominal path.
-        stretch : NominalPart
+        nominal : NominalPart
             The paths at the point where they have left the nominal path.
         numbers : (N,) ndarray
             Numbers of the N paths in the run.
@@ -477,37 +477,37 @@ class Departures:
         again : bool
             The paths are traced again and known to survive.
         """
-        passed, reason = stretch.passed.numpy(), stretch.reason.numpy()
+        passed, reason = nominal.passed.numpy(), nominal.reason.numpy()
         # at the end of a nominal part before the detector, no path has left at a surface
-        turned = (reason == TURNED) & ((passed < len(steps)) | steps[-1].detects)
+        redirected = (reason == REDIRECTED) & ((passed < len(steps)) | steps[-1].detects)
         goes_on, probabilities = reason != ENDED, np.ones(len(reason))
         if learned is not None:
-            some = np.flatnonzero(turned)
-            probabilities[some] = learned.survival_probability(numbers[some], passed[some])
+            selected = np.flatnonzero(redirected)
+            probabilities[selected] = learned.survival_probability(numbers[selected], passed[selected])
             if not again:
-                goes_on[some] = learned.survives(numbers[some], probabilities[some])
+                goes_on[selected] = learned.survives(numbers[selected], probabilities[selected])
         left = np.flatnonzero(goes_on)
         # 16-bit keys are sorted by radix, without comparisons
-        order = np.argsort((passed[left] * (TURNED + 1) + reason[left]).astype(np.uint16), kind="stable")
+        order = np.argsort((passed[left] * (REDIRECTED + 1) + reason[left]).astype(np.uint16), kind="stable")
         chosen = left[order]
-        return cls(passed, turned, chosen, probabilities[chosen])
+        return cls(passed, redirected, chosen, probabilities[chosen])
 
 
-def continue_paths(backend: Backend, steps: Sequence[Step], stretch: NominalPart, left: Departures) -> kernel.Launch:
+def continue_paths(backend: Backend, steps: Sequence[Step], nominal: NominalPart, left: Departures) -> kernel.Launch:
     """Return the chosen paths at the point where they have left the nominal path."""
     import drjit as dr
 
-    launch = stretch.launch
+    launch = nominal.launch
     Float, UInt = backend.Float, backend.UInt
     UInt64 = dr.uint64_array_t(Float)
     chosen = backend.opaque(left.chosen, UInt)
-    place = dr.gather(UInt, stretch.passed, chosen)
+    place = dr.gather(UInt, nominal.passed, chosen)
 
     def by_place(kind: Any, values: Sequence[Any]) -> Any:
         return dr.gather(kind, backend.opaque(values, kind), place)
 
     codes = [step.code for step in steps]
-    jumps = [_jump(draws) for draws in stretch.draws]
+    jumps = [_jump(draws) for draws in nominal.draws]
     factor, shift = (by_place(UInt64, [jump[k] for jump in jumps]) for k in range(2))
     rng = dr.gather(type(launch.rng), launch.rng, chosen)
     rng.state = rng.state * factor + rng.inc * shift
@@ -518,7 +518,7 @@ def continue_paths(backend: Backend, steps: Sequence[Step], stretch: NominalPart
         dr.gather(UInt, launch.path, chosen),
         rng,
         dr.select(
-            dr.gather(UInt, stretch.reason, chosen) == TURNED, by_place(UInt, [*(s.segment for s in steps), 0]), 0
+            dr.gather(UInt, nominal.reason, chosen) == REDIRECTED, by_place(UInt, [*(s.segment for s in steps), 0]), 0
         ),
         dr.gather(Float, launch.length, chosen),
         by_place(UInt, [0, *(s.after for s in steps)]),

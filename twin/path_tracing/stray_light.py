@@ -78,13 +78,15 @@ class StrayResult:
         run = self.runs[channel]
         nominal = run.nominal(f"{channel}/area_ccd")
         others = [(family, family.energy / nominal.energy) for family in run.families if family.kind != "nominal"]
-        others.sort(key=lambda one: -one[1])
+        others.sort(key=lambda entry: -entry[1])
         # a path belongs to one family only: the covariance of two energies is -1 / paths times their product
         relative_variance = (nominal.error / nominal.energy) ** 2 + 2.0 / run.paths
         sigmas = [
             share * float(np.sqrt((family.error / family.energy) ** 2 + relative_variance)) for family, share in others
         ]
-        return [ListedFamily(*one, sigma, nominal.surface_events) for one, sigma in zip(others, sigmas, strict=True)]
+        return [
+            ListedFamily(*entry, sigma, nominal.surface_events) for entry, sigma in zip(others, sigmas, strict=True)
+        ]
 
 
 @dataclass(frozen=True, eq=False)
@@ -292,19 +294,19 @@ class StrayLight:
 
 FAMILY: Record[ListedFamily] = Record(
     "All paths that reach a detector by the same events in the same order.",
-    Quantity("detector", lambda one: one.family.detector, "where the paths end"),
-    Quantity("kind", lambda one: one.family.kind, "ghost, or stray where something scatters or diffuses on the way"),
+    Quantity("detector", lambda path: path.family.detector, "where the paths end"),
+    Quantity("kind", lambda path: path.family.kind, "ghost, or stray where something scatters or diffuses on the way"),
     Quantity(
-        "name", lambda one: family_name(one.family.surface_events, one.nominal), "how it differs from nominal light"
+        "name", lambda path: family_name(path.family.surface_events, path.nominal), "how it differs from nominal light"
     ),
-    Quantity("surfaces", lambda one: list(map(str, one.family.surface_events)), "in order"),
-    Quantity("relative_to_nominal", lambda one: one.share, "its light over that of the source's spot", "share"),
-    Quantity("relative_to_nominal_sigma", lambda one: one.sigma, "sigma by the number of paths", "its σ"),
-    Quantity("paths", lambda one: one.family.count, "that were traced"),
-    Quantity("x_um", lambda one: one.family.centroid[0], "centroid from the detector's middle"),
-    Quantity("y_um", lambda one: one.family.centroid[1], "centroid from the detector's middle"),
-    Quantity("rms_x_um", lambda one: one.family.rms[0], "size about the centroid"),
-    Quantity("rms_y_um", lambda one: one.family.rms[1], "size about the centroid"),
+    Quantity("surfaces", lambda path: list(map(str, path.family.surface_events)), "in order"),
+    Quantity("relative_to_nominal", lambda path: path.share, "its light over that of the source's spot", "share"),
+    Quantity("relative_to_nominal_sigma", lambda path: path.sigma, "sigma by the number of paths", "its σ"),
+    Quantity("paths", lambda path: path.family.count, "that were traced"),
+    Quantity("x_um", lambda path: path.family.centroid[0], "centroid from the detector's middle"),
+    Quantity("y_um", lambda path: path.family.centroid[1], "centroid from the detector's middle"),
+    Quantity("rms_x_um", lambda path: path.family.rms[0], "size about the centroid"),
+    Quantity("rms_y_um", lambda path: path.family.rms[1], "size about the centroid"),
 )
 _BALANCE: Record[Balance] = Record(
     "Where the light of a source went, in shares of its power.",
@@ -428,7 +430,7 @@ def ghosts(experiment: MonitorExperiment, light: StrayLight) -> tuple[Ghost, ...
         ]
         total = sum(share for share, _, _ in ghost_paths)
         if total > GHOSTS:
-            share, source, family = max(ghost_paths, key=lambda one: one[0])
+            share, source, family = max(ghost_paths, key=lambda entry: entry[0])
             off = np.hypot(*np.subtract(family.centroid, spot.centroid)) / experiment.path.pitch
             nominal_events = traced.runs[source].nominal(f"{source}/area_ccd").surface_events
             text = (

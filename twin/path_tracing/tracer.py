@@ -100,8 +100,8 @@ class DiskSource:
         """
         place = np.asarray(directions) @ self.across.T
         middle = 0.5 * (place.min(axis=0) + place.max(axis=0))
-        reach = room * float(np.max(np.linalg.norm(place - middle, axis=-1)))
-        return replace(self, narrow=(float(middle[0]), float(middle[1]), reach), share=share)
+        radius = room * float(np.max(np.linalg.norm(place - middle, axis=-1)))
+        return replace(self, narrow=(float(middle[0]), float(middle[1]), radius), share=share)
 
     @property
     def patch(self) -> Patch:
@@ -237,12 +237,12 @@ def _drawn(backend: Backend, source: DiskSource, numbers: Any, total: int, seed:
     return Launch(position, direction, weight, numbers, rng)
 
 
-def pieces(total: int, size: int, cut: int = 0) -> Iterator[tuple[int, int]]:
+def pieces(total: int, size: int, boundary: int = 0) -> Iterator[tuple[int, int]]:
     """Divide a run into launches of at most ``size`` paths; yield the number of the first path and of paths of each.
 
-    A launch is a group of paths traced together. No launch extends across the path number ``cut``.
+    A launch is a group of paths traced together. No launch extends across the path number ``boundary``.
     """
-    for begin, end in ((0, cut), (cut, total)):
+    for begin, end in ((0, boundary), (boundary, total)):
         for first in range(begin, end, size):
             yield first, min(size, end - first)
 
@@ -431,15 +431,15 @@ def launch(
             follow(scene, features, limits, start, accumulators)
             dr.eval(accumulators.arrays)
             return None
-        stretch = trace_nominal(scene, features, limits, start, accumulators, along.steps)
-        dr.eval(accumulators.arrays, stretch.arrays)
-        left = Departures.of(along.steps, stretch, along.numbers, along.learned, features.log)
+        nominal = trace_nominal(scene, features, limits, start, accumulators, along.steps)
+        dr.eval(accumulators.arrays, nominal.arrays)
+        left = Departures.of(along.steps, nominal, along.numbers, along.learned, features.log)
         steps = np.zeros(len(along.numbers))
         if len(left.chosen):
-            taken = follow(scene, features, limits, continue_paths(backend, along.steps, stretch, left), accumulators)
+            taken = follow(scene, features, limits, continue_paths(backend, along.steps, nominal, left), accumulators)
             dr.eval(accumulators.arrays, taken)
             steps[left.chosen] = taken.numpy() - left.passed[left.chosen]
-    return PathHistory(left.passed, left.turned, steps)
+    return PathHistory(left.passed, left.redirected, steps)
 
 
 CHUNK = 1 << 19

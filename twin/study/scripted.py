@@ -375,5 +375,5 @@ def _factor(match: re.Match[str], unit: str) -> Mapping[str, Any]:
     return {"normal": {"mean": first, "sigma": second}}
 
 
-def _wrong(problem: str, key: KeyPath, found: str) -> InputError:
-    return InputError(Issue(problem, key=("vary", *key), value=found, allowed=_FORMS))
+def _wrong(problem: str, key: KeyPath, value: str) -> InputError:
+    return InputError(Issue(problem, key=("vary", *key), value=value, allowed=_FORMS))

@@ -117,18 +117,18 @@ def _term(
     """Return one term of a plan, with the times [s], values and sigmas of the samples of its input."""
     k, size = _motion(spec.motion, prior)
     mean, sigma = spec.amount.si(spec.kind)
-    given = name, k, mean / size, sigma / size
+    arguments = name, k, mean / size, sigma / size
     since = 0.0 if spec.since is None else (micros(spec.since) - epoch) / MICRO
     if spec.per is not None:
-        return Slope(*given, since, spec.per)
+        return Slope(*arguments, since, spec.per)
     if spec.decay is not None:
-        return Decay(*given, since, spec.decay.value, spec.decay.sigma or None)
+        return Decay(*arguments, since, spec.decay.value, spec.decay.sigma or None)
     if spec.input is None:
-        return Term(*given)
+        return Term(*arguments)
     times, values, sigmas = np.array(samples[spec.input]).T
     lag, spread = (None, None) if spec.lag is None else (spec.lag.value, spec.lag.sigma or None)
     noise = float(np.median(sigmas))
-    return Input(*given, times, values - spec.reference, noise, spec.window, spec.relative, lag, spread, spec.gap)
+    return Input(*arguments, times, values - spec.reference, noise, spec.window, spec.relative, lag, spread, spec.gap)
 
 
 @dataclass(frozen=True)
@@ -211,8 +211,8 @@ def learned_terms(
         amount, spread, before, before_sigma = unit * np.array([mean[k], sigma[k], term.mean, term.sigma])
         note, warning = "; ".join(texts), contradicted.get(term.name, "")
         what = prior.labels[term.motion], prior.units[term.motion]
-        found = float(amount), float(spread), float(before), float(before_sigma)
-        out.append(LearnedTerm(term.name, *what, *found, constant, constant_sigma, when, vague, note, warning))
+        estimates = float(amount), float(spread), float(before), float(before_sigma)
+        out.append(LearnedTerm(term.name, *what, *estimates, constant, constant_sigma, when, vague, note, warning))
     return tuple(out)
 
 

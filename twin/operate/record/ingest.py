@@ -86,7 +86,7 @@ class Ingest:
     def ingest(self, content: FileContent) -> IngestResult:
         """Compare the content of the file with the record and add what is new."""
         source_digest = digest_of_data([content.sha256, content.meaning])
-        source = self.connection.execute(select(SOURCE.c.id).where(SOURCE.c.taking == source_digest)).first()
+        source = self.connection.execute(select(SOURCE.c.id).where(SOURCE.c.ingest == source_digest)).first()
         entries = [(item, item.digest) for item in content.items if isinstance(item, Entry)]
         known = self._present(ENTRY.c.sha256, [digest for _, digest in entries])
         digests, refused, new_entries = iter(entries), [], []
@@ -231,7 +231,7 @@ class Ingest:
         """
         moment = utc_text(now())
         if source is None:
-            row = {"file": content.file, "sha256": content.sha256, "taking": source_digest, "taken_utc": moment}
+            row = {"file": content.file, "sha256": content.sha256, "ingest": source_digest, "taken_utc": moment}
             written = self.connection.execute(insert(SOURCE).values(**row, rows_read=len(content.items)))
             source = int(written.inserted_primary_key[0])  # type: ignore[index]
             frames = [{"source_id": source, "file": f, "sha256": d} for f, d in content.frames.items()]

@@ -79,12 +79,13 @@ SOURCE = _table(
     "source",
     Column("file", Text, nullable=False),
     _digest("sha256", nullable=False),
-    _digest("taking", nullable=False, unique=True),
+    _digest("taking", key="ingest", nullable=False, unique=True),
     Column("taken_utc", String(32), nullable=False),
     Column("rows_read", Integer, nullable=False),
 )
-"""Table of ingested files, one row each; ``taking`` is the digest of the file and of the description with which it was
-read.
+"""Table of ingested files, one row each.
+
+``ingest`` (in the file: ``taking``) is the digest of the file and of the description with which it was read.
 """
 FRAME = _table(
     "frame",

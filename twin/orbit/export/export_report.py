@@ -329,8 +329,8 @@ def export_report(run: export_run.Export) -> Report:
     rows: list[tuple[Cell, ...]] = []
     for name, line in run.lines.items():
         polynomial = line.polynomial
-        largest = (None, None) if polynomial is None else (max(polynomial.error_px), max(polynomial.rms_px))
-        rows.append((name, *(error.worst_px for error in line.scanner.errors), *largest))
+        errors_px = (None, None) if polynomial is None else (max(polynomial.error_px), max(polynomial.rms_px))
+        rows.append((name, *(error.worst_px for error in line.scanner.errors), *errors_px))
     summary = Table(
         "models",
         "Models against the rigorous sensor",
