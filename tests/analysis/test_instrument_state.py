@@ -12,6 +12,7 @@ from scipy.linalg import block_diag
 from scipy.stats import chi2
 
 from analysis.arrays import UndeterminedError
+from analysis.instrument_state.linearity import effective_share
 from analysis.instrument_state.state_estimate import (
     Actuators,
     MeasuredGroup,
@@ -271,3 +272,30 @@ def test_the_worth_of_a_measurement_is_what_it_saves() -> None:
 
     saved = merit(np.zeros_like(states)) - merit(guess)
     assert abs(np.mean(saved) - worth) < 4.5 * np.std(saved) / np.sqrt(len(saved))
+
+
+def test_linear_readings_have_draws_of_the_exact_posterior() -> None:
+    """Directions that are hardly determined count as undetermined, which costs 1e-5."""
+    rng = np.random.default_rng(3)
+    groups = [random_group(rng, "one", 5), random_group(rng, "two", 4, 2, True)]
+    instrument = Linear(rng, random_prior(rng), groups)
+    state = estimate_state(instrument.prior, instrument.drawn()[1], instrument.predict, instrument.slope)
+    assert effective_share(state, instrument.predict) == pytest.approx(1.0, abs=1e-4)
+
+
+@pytest.mark.parametrize("bend", [0.0, 0.1, 0.2])
+def test_share_of_a_bent_reading_is_that_of_its_integral(bend: float) -> None:
+    """y = x + bend x^2, x ~ N(0, 1), with an error of 0.3: the share is (E w)^2 / E w^2 over the linear posterior."""
+    group = MeasuredGroup(
+        "y", "numbers", ("y",), np.array([0.5]), np.array([[0.09]]), np.zeros((1, 0)), np.zeros(0), ("y",)
+    )
+    curve = lambda x: x + bend * x**2  # noqa: E731
+    state = estimate_state(
+        StatePrior.of(["x"], np.eye(1)), [group], curve, lambda x: np.array([[1.0 + 2.0 * bend * x[0]]])
+    )
+    x = state.unit[0] + state.root[0, 0] * np.linspace(-4.5, 4.5, 20001)
+    linear = np.exp(-0.5 * ((x - state.unit[0]) / state.root[0, 0]) ** 2)
+    exact = np.exp(-0.5 * ((0.5 - curve(x)) / 0.3) ** 2 - 0.5 * x**2)
+    share = exact.sum() ** 2 / linear.sum() / (exact**2 / linear).sum()
+    assert effective_share(state, curve, count=40000) == pytest.approx(share, rel=0.03)
+    assert (share > 0.999) == (bend == 0.0)

@@ -11,6 +11,7 @@ from functools import cached_property
 import numpy as np
 
 from analysis.arrays import MeasurementError
+from analysis.instrument_state.linearity import effective_share
 from analysis.instrument_state.state_estimate import Actuators, StateEstimate, estimate_state
 from optics.geometry.tree import State
 from optics.numerics.array_math import PhysicalError
@@ -327,6 +328,16 @@ class AsBuiltBench(Site):
         fewest = min((len(mode.excluded) for mode in modes), default=0)
         modes = [mode for mode in modes if len(mode.excluded) == fewest]
         return tuple(sorted(modes, key=lambda mode: -mode.log_evidence)) or (state,)
+
+    def linear_share(self, data: Sequence[np.ndarray], state: StateEstimate) -> float:
+        """Return how well the linear posterior of an estimate represents the exact one, from 0 to 1.
+
+        Only values of MTF are checked, which bend most; all other readings count as linear.
+        """
+        if not any(isinstance(kind, MtfReadings) for kind in self.kinds):
+            return 1.0
+        kinds = tuple(kind.about(values) for kind, values in zip(self.kinds, data, strict=True))
+        return effective_share(state, lambda values: self._predicted(values, kinds, self.afters))
 
     def star_images(self, data: Sequence[np.ndarray], state: StateEstimate) -> tuple[StarResidual, ...]:
         """Return measured and predicted images of all stars in an estimated state."""

@@ -190,15 +190,15 @@ def changed_camera(spec: CameraSpec, values: Mapping[str, float]) -> CameraSpec:
             "conic": mirror.conic + conic,
         }
         # -950.114 mm, not -950.1139999999999
-        update = {key: float(f"{number:.14g}") for key, number in numbers.items()}
-        mirrors[name] = mirror.model_copy(update=update)
+        changed = {key: float(f"{number:.15g}") for key, number in numbers.items() if number != getattr(mirror, key)}
+        mirrors[name] = mirror.model_copy(update=changed)
         heading = heading if mirror.light else -heading
         gap = places[k + 1] - places[k]
         if longer and abs(gap) + 1e-3 * longer < 0.0:
             problem = f"{names[k + 1]} would be on the other side of {name}"
             raise InputError(Issue(problem, value=f"{longer:g} mm", allowed=f"{-1e3 * abs(gap):.6g} mm or more"))
         moved += math.copysign(1e-3 * longer, longer * (gap or heading))
-    image = spec.image.model_copy(update={"z": float(f"{spec.image.z + moved:.14g}")})
+    image = spec.image.model_copy(update={"z": float(f"{spec.image.z + moved:.15g}") if moved else spec.image.z})
     # without the file that it came from, whose lines have other numbers
     return CameraSpec.model_construct(**{**dict(spec), "mirrors": FrozenMap(mirrors), "image": image})
 
