@@ -46,7 +46,7 @@ _BINS = 0.7
 _EVEN = 0.01
 """Variance of the logarithm of a bin's ratio, relative to one of no coherence, that is assumed besides its noise."""
 _COHERENT, _SAME = 0.5, 0.8
-"""Least coherence of both images, and least coherence of what is left without the stated noise."""
+"""Least coherence of both images, and least coherence of what is left without the specified noise."""
 _TEMPLATE, _RADIUS, _POINTS, _LEAST_POINTS = 63, 24, 6, 5
 """Side of the windows that are matched, largest displacement of the scene, windows a side, and least number of them."""
 _ALIKE, _UNIQUE = 0.5, 0.9
@@ -156,7 +156,7 @@ def mtf_ratio(
 
 
 def _unsaturated(grey: Array, saturation: float) -> Array:
-    """Return an image with NaN in saturated pixels, and where many have the largest value without a stated one."""
+    """Return an image with NaN in saturated pixels, and where many have the largest value without a specified one."""
     bad = ~(grey < saturation)
     largest = grey == np.max(grey, initial=-math.inf, where=~bad)
     if _CLIPPED < np.mean(largest) < _MOST_SATURATED:
@@ -218,7 +218,7 @@ class _Ring:
     cross : (P, K) ndarray
         Cross-spectra.
     noise : (2, P) ndarray
-        Power of the noise of both images in any bin; NaN if it is not stated.
+        Power of the noise of both images in any bin; NaN if it is not specified.
     mixed : (2, P, K, 2) ndarray
         Products of the power of both images with the distance of its mean frequency from the bin's.
     light : (2, P) ndarray
@@ -260,10 +260,10 @@ class _Ring:
                 flat = np.stack(pair) - means[:, None, None]
                 both = np.fft.fft2(window * flat)[:, ring]
                 parts = [(both.conj() * np.fft.fft2(w * flat)[:, ring]).imag / (-2.0 * np.pi) for w in slopes]
-                stated = [np.nan if noise is None else np.sum(window**2 * _variance(noise, patch)) for patch in pair]
+                random = [np.nan if noise is None else np.sum(window**2 * _variance(noise, patch)) for patch in pair]
                 dark = 0.0 if noise is None else noise.dark_level_dn
                 mixed = np.stack(parts, axis=-1)
-                columns.append((np.abs(both) ** 2, both[0].conj() * both[1], np.array(stated), mixed, means - dark))
+                columns.append((np.abs(both) ** 2, both[0].conj() * both[1], np.array(random), mixed, means - dark))
         if len(columns) < _LEAST_PATCHES:
             raise UndeterminedError(
                 f"MTF ratio: {len(columns)} patches of {side} px without saturated pixels, {_LEAST_PATCHES} are"
@@ -293,8 +293,8 @@ class _Ring:
         power, cross, light = self.power.sum(axis=1), self.cross.sum(axis=0), self.light.sum(axis=1)
         if not np.all(light > 0.0):
             raise UndeterminedError("MTF ratio: an image has no light above its black level; check the black level")
-        stated = bool(np.all(np.isfinite(self.noise)))
-        noise = self.noise.sum(axis=1) if stated else _uncorrelated(power, cross, light)
+        specified = bool(np.all(np.isfinite(self.noise)))
+        noise = self.noise.sum(axis=1) if specified else _uncorrelated(power, cross, light)
         signal = power - noise[:, None]
         used = np.all(signal > _SIGNAL * noise[:, None] / math.sqrt(patches), axis=0)
         if np.mean(used) < _BINS:
@@ -303,7 +303,7 @@ class _Ring:
                 f" direction ({100 * np.mean(used):.0f} % of the spectrum); choose a lower frequency, less defocus or"
                 " another scene"
             )
-        whole = (np.prod(power, axis=0), np.prod(signal if stated else power, axis=0))
+        whole = (np.prod(power, axis=0), np.prod(signal if specified else power, axis=0))
         weights = self.directions * used
         total, same = (np.minimum(weights @ np.abs(cross) ** 2 / (weights @ part), 1.0) for part in whole)
         if np.min(total) < _COHERENT or np.min(same) < _SAME:
@@ -320,7 +320,7 @@ class _Ring:
 
         def logarithm(chosen: Array) -> Array:
             """Return the logarithms of both ratios from the patches with a weight of 1, (2,)."""
-            random = self.noise @ chosen if stated else noise / patches * chosen.sum()
+            random = self.noise @ chosen if specified else noise / patches * chosen.sum()
             part = np.maximum(np.tensordot(chosen, self.power, (0, 1)) - random[:, None], 1e-9 * signal)
             mean = self.frequency + np.tensordot(chosen, self.mixed, (0, 1)) / part[..., None]
             at, sharper = np.where(second[:, None], mean[1], mean[0]), np.where(second, part[1], part[0])

@@ -312,11 +312,7 @@ class AsBuiltBench(Site):
         prior = self.parameters.prior
         unit = np.random.default_rng(0).standard_normal((_TRIED, prior.root.shape[1]))
         states = prior.mean + unit @ prior.root.T
-        predicted, ends = self._predicted(states, kinds, self.afters), np.cumsum([0, *map(len, data)])
-        costs = np.zeros(_TRIED)
-        for kind, values, first, last in zip(kinds, data, ends[:-1], ends[1:], strict=True):
-            white = kind.group(values).whitener()
-            costs += np.sum((white @ (values - predicted[:, first:last]).T) ** 2, axis=0)
+        costs = self._chi_squares(kinds, data, states)
         modes, known = [state] if state.converged else [], 0
         for start in states[np.argsort(costs)[:_FOLLOWED]]:
             other = self._estimate(kinds, data, start)
@@ -328,6 +324,14 @@ class AsBuiltBench(Site):
         fewest = min((len(mode.excluded) for mode in modes), default=0)
         modes = [mode for mode in modes if len(mode.excluded) == fewest]
         return tuple(sorted(modes, key=lambda mode: -mode.log_evidence)) or (state,)
+
+    def _chi_squares(self, kinds: Sequence[MeasuredKind], data: Sequence[np.ndarray], states: np.ndarray) -> np.ndarray:
+        """Return the chi-square of all readings in each of S states (S, K), (S,); NaN where light is lost."""
+        predicted, out, first = self._predicted(states, kinds, self.afters), np.zeros(len(states)), 0
+        for kind, values in zip(kinds, data, strict=True):
+            rest = values - predicted[:, first : (first := first + len(values))]
+            out += np.sum((kind.group(values).whitener() @ rest.T) ** 2, axis=0)
+        return out
 
     def linear_share(self, data: Sequence[np.ndarray], state: StateEstimate) -> float:
         """Return how well the linear posterior of an estimate represents the exact one, from 0 to 1.
@@ -360,12 +364,7 @@ class AsBuiltBench(Site):
         direction = prior.root @ np.linalg.svd(slope, full_matrices=False)[2][0]
         amounts = np.linspace(-_MOST, _MOST, _STARTS)
         states = prior.mean + amounts[:, None] * direction
-        predicted = self._predicted(states, kinds, self.afters)
-        costs, first = amounts**2, 0
-        for kind, values in zip(kinds, data, strict=True):
-            white = kind.group(values).whitener()
-            rows = slice(first, first := first + len(values))
-            costs = costs + np.sum((white @ (values - predicted[:, rows]).T) ** 2, axis=0)
+        costs = amounts**2 + self._chi_squares(kinds, data, states)
         return np.asarray(states[np.nanargmin(costs)]) if np.any(np.isfinite(costs)) else prior.mean
 
     def _mirrored(self, kinds: Sequence[MeasuredKind], state: StateEstimate) -> np.ndarray | None:

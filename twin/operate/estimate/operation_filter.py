@@ -71,7 +71,7 @@ Filtering so many readings again takes as long as saving the state.
 """
 CHECKED_READINGS = 2000
 """Number of the latest readings among which commanded moves are compared with the readings."""
-MOST_PASSES, INFLATION = 6, 1.25
+MOST_PASSES, READINGS_RATIO = 6, 1.25
 """Largest number of linearisations at one number of readings, and ratio of that number to the next one."""
 _MODEL, _HEAD = -1, 0
 """Numbers of two checkpoints in the record: the traced model, and the newest state of the estimator."""
@@ -291,7 +291,7 @@ class Operation:
         moved = terms.relinearised(current.mean[at], current.covariance[at, at])
         count = state.scores.readings
         if moved is None or state.passes >= MOST_PASSES:
-            return replace(state, due=max(count + 4, round(INFLATION * count)), passes=0)
+            return replace(state, due=max(count + 4, round(READINGS_RATIO * count)), passes=0)
         self._point = cast("Array", moved.point)
         vars(self).pop("_entry_filter")
         first = int(next(self._moments(None))[0]["time_us"])

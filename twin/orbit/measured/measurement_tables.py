@@ -629,7 +629,7 @@ def _check_jumps(table: Table, order: NDArray[np.intp], time: Array, position: A
         jump = ~(change <= _FALL * (step[1:] + step[:-1]) + _JUMP * speed)
     for k in np.flatnonzero(jump)[:1]:
         value, allowed = f"the velocity changes by {change[k]:.4g} m/s", "one pass without manoeuvre"
-        raise table.error(int(order[k + 1]), "x", "a jump of the orbit", value, f"{allowed}; leave out wrong readings")
+        raise table.error(int(order[k + 1]), "x", "a jump of the orbit", value, f"{allowed}; exclude wrong readings")
 
 
 def _check_rotations(table: Table, order: NDArray[np.intp], quaternion: Array) -> None:
@@ -638,7 +638,7 @@ def _check_rotations(table: Table, order: NDArray[np.intp], quaternion: Array) -
     rotation = 2.0 * np.arccos(np.clip(np.abs(np.sum(quaternion[1:] * quaternion[:-1], axis=1)), 0.0, 1.0))
     for k in np.flatnonzero(rotation > _LEAST_ROTATION + _FASTEST_ROTATION * step)[:1]:
         value = f"{np.degrees(rotation[k]):.4g} deg in {step[k]:.4g} s"
-        raise table.error(int(order[k + 1]), "q1", "a jump of the attitude", value, "leave out wrong readings")
+        raise table.error(int(order[k + 1]), "q1", "a jump of the attitude", value, "exclude wrong readings")
 
 
 def _check_velocity(table: Table, order: NDArray[np.intp], time: Array, position: Array, speed: Array) -> None:
