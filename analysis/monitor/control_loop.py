@@ -26,7 +26,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from analysis.arrays import Array
 
@@ -43,43 +43,6 @@ _SETTLING, _WATCHED = 400, 400
 """Numbers of simulated readings in the search for limit cycles: those for settling, then those examined."""
 _OFFSETS = 41
 """Number of constant values of the uncorrected quantity, spread over one step, for which limit cycles are searched."""
-
-
-def open_loop(gain: float, delay: int, frequency: ArrayLike) -> NDArray[np.complex128]:
-    """Return the complex transfer function of the open loop, an integrator with a delay, at given frequencies.
-
-    Parameters
-    ----------
-    gain : float
-        Gain: the fraction of the residual that one reading corrects.
-    delay : int
-        Delay of the mechanism, in readings.
-    frequency : array_like
-        Frequency, of any shape, cycles per reading, above 0 up to 0.5.
-    """
-    delay_factor = np.exp(-2j * np.pi * np.asarray(frequency, np.float64))
-    return np.asarray(gain * delay_factor ** (delay + 1) / (1.0 - delay_factor))
-
-
-def rejection(gain: float, delay: int, frequency: ArrayLike) -> Array:
-    """Return the ratio of a quantity's residual under control to its uncorrected oscillation, at given frequencies.
-
-    A ratio below 1 means that the loop reduces the oscillation. Images are taken after the command of the same reading:
-    with delay 0 and gain 1 the residual is zero at any frequency.
-
-    Parameters
-    ----------
-    gain : float
-        Gain: the fraction of the residual that one reading corrects.
-    delay : int
-        Delay of the mechanism, in readings.
-    frequency : array_like
-        Frequency, of any shape, cycles per reading, above 0 up to 0.5.
-    """
-    delay_factor = np.exp(-2j * np.pi * np.asarray(frequency, np.float64))
-    return np.asarray(
-        np.abs(1.0 - gain * delay_factor**delay / (1.0 - delay_factor + gain * delay_factor ** (delay + 1)))
-    )
 
 
 @dataclass(frozen=True)

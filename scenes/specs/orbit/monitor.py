@@ -19,8 +19,7 @@ from scenes.specs.job import AnalysisSpec, JobSpec, PerturbationSpec, RenderSpec
 from scenes.specs.orbit.angle import Relief, TerrainHeight, check_ends
 from scenes.specs.orbit.calibration import Count, FieldLength
 from scenes.specs.orbit.flight import AttitudeSpec, EarthSpec, ErrorsSpec, OrbitSpec
-from scenes.specs.orbit.scene import GroundSpec as SceneGroundSpec
-from scenes.specs.orbit.scene import ImagePointsSpec, LineTime, Side
+from scenes.specs.orbit.scene import LineTime
 from scenes.specs.perturbation import NodeInfo, PlainPerturbationSpec, perturbation_issues
 from scenes.yaml.errors import InputError, KeyPath, Problem, shown
 from scenes.yaml.spec import Flag, Name, Named, NothingIsEmpty, Number, Paths, Ref, Seed, Spec, Text, TitledSpec, Whole
@@ -279,33 +278,6 @@ class ReadingsSpec(Spec):
         return tuple(self.begin + self.interval * k for k in range(self.count))
 
 
-class LoopImagesSpec(Spec):
-    """Pairs of line images, rendered after some of the readings with the loop open and closed.
-
-    Attributes
-    ----------
-    times : tuple[float, ...]
-        Times of these readings from the orbit's epoch, in seconds.
-    side : int
-        Number of lines and of pixels of every image.
-    ground : SceneGroundSpec
-        True ground.
-    points : ImagePointsSpec
-        Settings of matching points of the second camera's image in the first one's; `tie` is their number.
-    """
-
-    times: Annotated[tuple[Moment, ...], Field(min_length=1, max_length=20)]
-    side: Annotated[Side, Field(le=2000)] = 400
-    ground: SceneGroundSpec = SceneGroundSpec()
-    points: ImagePointsSpec = ImagePointsSpec.model_validate({"control": 0, "tie": 60, "search_radius": 16})
-
-    @model_validator(mode="after")
-    def _has_ties(self) -> "LoopImagesSpec":
-        if not self.points.tie:
-            raise Problem("there are no tie points", "tie: 0", "at least 1", None, ("points", "tie"))
-        return self
-
-
 class MechanismsSpec(Spec):
     """Closed loop: mechanisms point and refocus the cameras by the monitor's readings.
 
@@ -318,13 +290,10 @@ class MechanismsSpec(Spec):
         time laws. With a course the spots are read at each of its times.
     corrections : Mapping[str, CorrectionSpec]
         Name -> correction by the readings.
-    images : LoopImagesSpec | None
-        Pairs of line images; by default there are none.
     """
 
     readings: ReadingsSpec | None = None
     corrections: Annotated[Named[CorrectionSpec], Field(min_length=1, max_length=50)]
-    images: LoopImagesSpec | None = None
 
 
 class OrbitMonitorSpec(TitledSpec):
@@ -424,11 +393,6 @@ class OrbitMonitorSpec(TitledSpec):
             self._check_interval(self.cadence, ("interval",))
             for k, interval in enumerate(self.intervals or ()):
                 self._check_interval(interval, ("intervals", k))
-        elif self.mechanisms.images is not None:
-            for k, time in enumerate(self.mechanisms.images.times):
-                if index_of_value(time, self.times) is None:
-                    wrong = no_such_time(time, self.times, "the time of a reading")
-                    raise wrong.below("mechanisms", "images", "times", k)
         return self
 
     def _require_keys(self) -> None:

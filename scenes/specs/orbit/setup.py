@@ -24,7 +24,7 @@ from scenes.specs.orbit.monitor import MechanismsSpec, OrbitMonitorSpec
 from scenes.specs.orbit.rational import RationalAdjustSpec, RationalMatchSpec
 from scenes.specs.orbit.scene import LineImageSpec, OrbitSimulateSpec
 from scenes.specs.orbit.three_line_camera import ThreeLineCameraSpec
-from scenes.specs.resolved import ExperimentSetup, ResolvedJob, TestType, line_detector, resolve_job
+from scenes.specs.resolved import ExperimentSetup, ResolvedJob, TestType, resolve_job
 from scenes.yaml.errors import KeyPath, Problem, names_text, unknown
 from scenes.yaml.input_file import MISSING, no_file
 from scenes.yaml.spec import Inline, Paths, Spec, validate
@@ -229,8 +229,6 @@ class MonitorSetup(ExperimentSetup[OrbitMonitorSpec]):
         Data sheet of the monitor's area CCDs.
     disturbances : DisturbancesSpec | None
         Expected disturbances; None if there is none.
-    line_detectors : Mapping[str, DetectorSpec] | None
-        Reference of a camera -> data sheet of its line CCD; None if no line images are rendered.
     """
 
     FOLDER = load.ORBIT
@@ -239,17 +237,12 @@ class MonitorSetup(ExperimentSetup[OrbitMonitorSpec]):
     cameras: Paths[CameraSpec]
     detector: DetectorSpec
     disturbances: DisturbancesSpec | None = None
-    line_detectors: Paths[DetectorSpec] | None = None
 
     @classmethod
     def parts(cls, test: OrbitMonitorSpec) -> dict[str, Any]:
         """Read the instrument with its cameras, data sheets and disturbances; return field -> content."""
         job = resolve_job(test.job)
-        parts = {key: getattr(job, key) for key in _JOB_PARTS}
-        if test.mechanisms is not None and test.mechanisms.images is not None:
-            sheets = {name: line_detector(camera) for name, camera in job.cameras.items()}
-            parts["line_detectors"] = FrozenMap(sheets)
-        return parts
+        return {key: getattr(job, key) for key in _JOB_PARTS}
 
     def checked(self) -> Self:
         """Check that test and instrument fit together; return the set-up."""
@@ -547,17 +540,11 @@ def _require_rotations(test: OrbitAngleSpec, lines: tuple[str, ...]) -> None:
 
 
 def _require_mechanisms(setup: MonitorSetup, loop: MechanismsSpec) -> None:
-    """Raise `InputError` unless there are disturbances, mechanisms act on the pair, and its images have data sheets."""
+    """Raise `InputError` unless there are disturbances and all mechanisms act on the pair."""
     test = setup.test
     if setup.disturbances is None:
         problem = "there are no disturbances, so that spots say nothing of what to correct"
         raise test.error(problem, ("disturbances",), allowed="the name of a file in scenes/library/disturbances")
-    if loop.images is not None:
-        for name in setup.cameras:
-            if name not in (setup.line_detectors or {}):
-                problem = f"images need the data sheet of the line CCD of camera {name!r}"
-                allowed = "line_detectors with one for each camera"
-                raise test.error(problem, ("mechanisms", "images"), allowed=allowed)
     for name, correction in loop.corrections.items():
         if correction.camera not in setup.pair:
             unknown_camera = unknown("no camera of the pair", correction.camera, setup.pair)

@@ -15,7 +15,6 @@ from analysis.arrays import ARCSEC
 from analysis.calibration.adjustment import Adjustment
 from analysis.orbit.calibration_parameters import OFFSET, RATE
 from analysis.orbit.three_line_model import BIAS, misclosure
-from scenes.yaml.units import ANGLE, LENGTH, format_quantity
 from twin.framework import svg
 from twin.framework.artefact import Cell, SvgFigure, Table
 from twin.framework.report import Section
@@ -23,7 +22,6 @@ from twin.orbit.calibration.calibration_numbers import BIAS_OF_FIELD, CHIP_STEP,
 from twin.orbit.calibration.calibration_run import STEPWISE_TOLERANCE, CalibrationRun
 from twin.orbit.calibration.campaign import FieldPass
 from twin.orbit.calibration.flown_campaign import true_bias
-from twin.orbit.calibration.influences import UNEXPECTED_SIGMAS
 
 _SCALES = {"rad": (ARCSEC, "arcsec"), "rad/s": (1e-3 * ARCSEC, "mas/s"), "m": (1.0, "m")}
 """Unit of an unknown in result files -> unit of the tables of the report, as its size in SI units and its name."""
@@ -43,7 +41,7 @@ def adjustment_sections(run: CalibrationRun, data: Mapping[str, Any]) -> tuple[S
     data : Mapping[str, Any]
         Content of calibration.json.
     """
-    return (_parameters(run, data), _fields(run, data), _biases(run, data), _datum(run), _rank(run), _data(data))
+    return (_parameters(run, data), _fields(run, data), _biases(run, data), _rank(run))
 
 
 def figure_of(
@@ -77,28 +75,6 @@ def _latitude_figure(run: CalibrationRun) -> Figure:
         svg.gridded(axes)
         handles = axes.get_legend_handles_labels()
     figure.legend(*handles, loc="outside lower center", ncols=4)
-    return figure
-
-
-def _correlation_figure(run: CalibrationRun) -> Figure:
-    """Draw the correlation matrix of the simultaneous adjustment, without the unknowns that the gauge fixes."""
-    adjustment = run.together
-    sigma = adjustment.sigma
-    free = [k for k, name in enumerate(adjustment.names) if sigma[name] > 0.0]
-    names = [adjustment.names[k] for k in free]
-    figure = svg.new_figure(min(9.2, 2.6 + 0.14 * len(names)))
-    axes = figure.subplots()
-    shown = svg.signed_map(axes, adjustment.correlation[np.ix_(free, free)], 1.0)
-    size = 6.5 if len(names) > 40 else 8.0
-    axes.set_xticks(np.arange(len(names)), names, rotation=90, fontsize=size)
-    axes.set_yticks(np.arange(len(names)), names, fontsize=size)
-    # lines between the interior and the fields
-    groups = ["interior" if name in run.campaign.inner else name.split()[0] for name in names]
-    for k in range(1, len(groups)):
-        if groups[k] != groups[k - 1]:
-            axes.axhline(k - 0.5, color=svg.INK, lw=0.6)
-            axes.axvline(k - 0.5, color=svg.INK, lw=0.6)
-    figure.colorbar(shown, ax=axes, shrink=0.6, label="correlation")
     return figure
 
 
@@ -265,13 +241,6 @@ def _biases(run: CalibrationRun, data: Mapping[str, Any]) -> Section:
         "axis",
         digits=4,
     )
-    truth = ""
-    if run.truth is not None:
-        # measured to true is the inverse of the drift of the measured attitude
-        errors = run.campaign.simulated.errors
-        drift = -np.array(errors.star_tracker.thermal.amplitude) * errors.switched_on
-        drawn = (", ".join(f"{v / ARCSEC:.3g}" for v in values_drawn) for values_drawn in (drift, errors.season))
-        truth = " The true amplitudes are {} arcsec, the season's standard deviations {} arcsec.".format(*drawn)
     values = np.array([[run.together.value(f"{p.name} {axis}") for p in run.campaign.passes] for axis in BIAS[:2]])
     spread = float(np.hypot(*values.std(axis=1, ddof=1)))
     metres, largest = spread * run.campaign.passes[0].altitude, max(len(s) for s in run.campaign.spec.schemes)
@@ -282,26 +251,12 @@ def _biases(run: CalibrationRun, data: Mapping[str, Any]) -> Section:
     text = (
         f"The fields lie within {np.degrees(np.ptp(run.latitude[0].latitude)):.0f}° of latitude, where the sine "
         f"changes by {change:.2f}. Beside the drift, the season of each field remains, {remainders}: {seen} at two "
-        f"sigmas.{truth}",
+        "sigmas.",
         f"Roll and pitch of the fields scatter by {spread / ARCSEC:.2f} arcsec together, {metres:.1f} m on the ground. "
         f"The bias of one field therefore causes errors of {np.sqrt(2.0) * metres:.1f} m RMS in plan in another field, "
         f"and the mean bias of {largest} fields {np.sqrt(1.0 + 1.0 / largest) * metres:.1f} m, beside noise.",
     )
     return Section("Biases against latitude", text, (figure, table))
-
-
-def _datum(run: CalibrationRun) -> Section:
-    launch = run.campaign.spec.launch
-    roll, inner = (format_quantity(v, k) for v, k in ((launch.bias[0], ANGLE), (launch.interior, LENGTH)))
-    metres = UNEXPECTED_SIGMAS * launch.bias[0] * run.campaign.passes[0].altitude
-    beyond = ", ".join(f"{s.name} ({s.ratio:.1f}σ)" for s in run.unexpected_changes[:6])
-    text = (
-        "Biases and interior orientation absorb a shift that all control points share; the residuals need not show "
-        f"it. The file expects changes by a launch of {roll} (roll) and {inner} (interior), 1σ. There is a warning "
-        f"above {UNEXPECTED_SIGMAS:g} times these, {metres:.0f} m of shift across the track.",
-        f"Unexpected changes in this run: {beyond or 'none'}.",
-    )
-    return Section("Datum of the control points", text)
 
 
 def prior_dominated(adjustment: Adjustment) -> dict[str, float]:
@@ -335,30 +290,4 @@ def _rank(run: CalibrationRun) -> Section:
         [(adjustment.names[int(i)], adjustment.names[int(j)], float(adjustment.correlation[i, j])) for i, j in pairs],
         (None, None, 4),
     )
-    caption = "Correlations of the simultaneous adjustment, held unknowns excluded."
-    return Section(
-        "Observability",
-        tuple(text),
-        (table, figure_of(run, _correlation_figure, "correlation-matrix", "Correlations", caption)),
-    )
-
-
-def _data(data: Mapping[str, Any]) -> Section:
-    rows: Rows = []
-    for name, field in data["fields"].items():
-        orbit, attitude = (
-            field[f"{key}_third_difference_rms_{unit}"] for key, unit in (("orbit", "m"), ("attitude", "rad"))
-        )
-        cells = [*(orbit or [None] * 3), *([v / ARCSEC for v in attitude] if attitude else [None] * 3)]
-        rows.append((name, float(np.degrees(field["latitude_rad"])), field["p_value"], *cells))
-    table = Table(
-        "third-differences",
-        "Each field by itself, and RMS of third differences",
-        "p-value of the fit of the field. Measured positions in the Earth-fixed frame, metres; measured attitude "
-        "against the orbital frame, arcseconds. White noise of sigma 1 gives the square root of 20. Third differences "
-        "do not contain biases and drifts.",
-        ("field", "latitude [deg]", "p", "x", "y", "z", "roll", "pitch", "yaw"),
-        rows,
-        (None, 1, 3, 4, 4, 4, 4, 4, 4),
-    )
-    return Section("Orbit and attitude data", (), (table,))
+    return Section("Observability", tuple(text), (table,))

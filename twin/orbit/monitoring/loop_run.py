@@ -3,11 +3,6 @@
 Heights come from forward intersection of exact lines of sight with the specified errors of image points, orbit and
 attitude. The lines are traced through the state that the mechanisms have corrected; the intersection uses the lines as
 calibrated, with the corrections of the processing. The truth enters only where errors are computed.
-
-At moments that the file names, pairs of line images can be rendered, matched and intersected. The lens of a line is
-then round and evenly illuminated, with the camera's f-number and the moment's traced defocus as its wavefront; detector
-and band are those of the camera. Points of the second camera's image are matched in the first one's and intersected
-with the lines that the user knows, on the measured trajectory.
 """
 
 from __future__ import annotations
@@ -24,23 +19,13 @@ from analysis.monitor import control_loop
 from analysis.monitor.control_loop import DECAYING, LimitCycle, Margins
 from analysis.monitor.disturbances import FALSE_ALARM
 from analysis.monitor.model_fit import UnobservableMode, error_floor, unobservable_modes
-from analysis.orbit.forward_intersection import check_errors, intersect_pair
 from analysis.statistics import rms
-from optics.numerics.array_math import index_of_value
 from optics.numerics.number_tree import FrozenMap
 from scenes.specs.orbit.monitor import PARAMETERS
-from scenes.specs.orbit.scene import ControlSpec, LineImageSpec
-from scenes.specs.resolved import target_band
-from twin.framework.procedure import Advance, BenchError
-from twin.framework.random_streams import stream
+from twin.framework.procedure import Advance
 from twin.monitor.image_quality import image_quality
 from twin.monitor.monitor_experiment import MonitorExperiment
-from twin.orbit.flight.line_camera import LineCamera, calibrated_line, corrected_line
-from twin.orbit.flight.sensor import NO_EFFECTS, Sensor
-from twin.orbit.flight.trajectory import Trajectory
-from twin.orbit.images.image_points import POINTS_REMEDY, PointsError, tie_points
-from twin.orbit.images.line_optics import LineOptics
-from twin.orbit.images.patch import PatchError, fly_patch, imaged_lines
+from twin.orbit.flight.line_camera import LineCamera, calibrated_line
 from twin.orbit.monitoring import closed_loop, pair_flight
 from twin.orbit.monitoring.closed_loop import FOCUS_FIELDS, Corrector, LoopCourse, LoopModel, defocus
 
@@ -49,145 +34,6 @@ if TYPE_CHECKING:
     from scenes.specs.orbit.setup import MonitorSetup
 
 
-@dataclass(frozen=True, eq=False)
-class ImagedPair:
-    """Ground points matched in one pair of rendered line images and intersected.
-
-    Attributes
-    ----------
-    moment : int
-        Index of the reading after which the images are taken.
-    errors : (n, 3) ndarray for n points
-        Intersected minus true coordinates of the matched points: east, north, up, in metres.
-    misplaced : (n, 2) ndarray
-        Matched minus true position in the first camera's image, in lines and pixels.
-    sigma : (2,) ndarray
-        Median standard deviation predicted by the matching, in lines and pixels.
-    sought : int
-        Number of points for which matches were searched.
-    """
-
-    moment: int
-    errors: np.ndarray
-    misplaced: np.ndarray
-    sigma: np.ndarray
-    sought: int
-
-    @property
-    def height(self) -> tuple[float, float]:
-        """Mean error in height and its standard deviation from the scatter of the points, in metres."""
-        up = self.errors[:, 2]
-        return float(up.mean()), float(up.std(ddof=1) / np.sqrt(len(up)))
-
-    @property
-    def matching(self) -> np.ndarray:
-        """RMS error of the matched positions in the first camera's image, in lines and pixels, (2,)."""
-        return np.sqrt(np.mean(self.misplaced**2, axis=0))
-
-
-def imaged_pair(
-    setup: MonitorSetup,
-    flight: pair_flight.PairFlight,
-    moment: int,
-    nominal: Mapping[str, LineCamera],
-    changes: Mapping[str, np.ndarray],
-    foci: Mapping[str, float],
-    flown: tuple[Trajectory, Trajectory],
-    seed: np.random.SeedSequence,
-) -> ImagedPair:
-    """Render a pair of line images, match points in them, and intersect the points to ground coordinates.
-
-    Parameters
-    ----------
-    setup : MonitorSetup
-        Resolved test file and instrument.
-    flight : PairFlight
-        True lines, and calibrated lines as the analysis models them.
-    moment : int
-        Index of the reading.
-    nominal : Mapping[str, LineCamera]
-        Camera -> its line as calibrated.
-    changes : Mapping[str, ndarray]
-        Camera -> (4,) change that the processing corrects.
-    foci : Mapping[str, float]
-        Camera -> its defocus, in metres.
-    flown : tuple of Trajectory
-        True and measured orbit and attitude.
-    seed : np.random.SeedSequence
-        Seed of ground and frames.
-
-    Raises
-    ------
-    BenchError
-        A line cannot image the patch, or too few points are matched.
-    """
-    spec, pair, images = setup.test, setup.pair, setup.test.loop.images
-    assert images is not None
-    time, lines, calibrated = spec.times[moment], flight.lines[moment], flight.calibrated
-    earth = flown[0].orbit.earth
-    begin, count = time - pair_flight.HALF_SPAN, int(2.0 * pair_flight.HALF_SPAN / spec.line_time)
-
-    def sensor(line: LineCamera, measured: bool) -> Sensor:
-        return Sensor(line, flown[measured], earth, spec.line_time, begin, count, NO_EFFECTS)
-
-    true = {name: sensor(lines[name], False) for name in pair}
-    users = {name: sensor(corrected_line(nominal[name], calibrated[name], changes[name]), True) for name in pair}
-    optics = {name: _optics(setup, name, foci[name]) for name in pair}
-    middle = 0.5 * (spec.ground.first + spec.ground.last)
-    height = images.ground.terrain.height
-    at = pair_flight.second_view([true[name] for name in pair], time, middle, height)
-    point = true[pair[1]].ground(np.array([(at - begin) / spec.line_time]), np.array([middle]), height)
-    longitude, latitude, _ = earth.geodetic(point[0])
-    recording = imaged_lines(true, users, optics, stream(seed, 0))
-    try:
-        position, size = (float(longitude), float(latitude)), (images.side, images.side)
-        patch = fly_patch(recording, position, size, images.ground, ControlSpec(), stream(seed, 1))
-        ties = tie_points(patch, images.points, source=pair[1])
-    except (PatchError, PointsError) as error:
-        raise BenchError(f"line images: {error}", ("mechanisms", "images"), POINTS_REMEDY) from error
-    good = ties.in_all
-    if np.count_nonzero(good) < _FEWEST:
-        problem = f"line images: only {np.count_nonzero(good)} of {len(good)} points were matched"
-        raise BenchError(problem, ("mechanisms", "images"), POINTS_REMEDY)
-    ground = patch.true_point(pair[1], *ties.lines[pair[1]].position[good].T)
-    should = np.stack(true[pair[0]].image(ground), axis=1)
-    points = [ties.lines[name].image[good] for name in pair]
-    a, b = (calibrated[name].corrected(changes[name]) for name in pair)
-    first, second = (
-        pair_flight.sightings(users[n], users[n].trajectory, *p.T) for n, p in zip(pair, points, strict=True)
-    )
-    errors = check_errors(intersect_pair(a, b, first, second).ground, ground).error
-    return ImagedPair(moment, errors, points[0] - should, ties.lines[pair[0]].median_sigma, len(good))
-
-
-_FEWEST = 8
-"""Smallest number of matched points from which a mean height error and its scatter are computed."""
-_TRANSMISSION = 0.8
-"""Transmission of the lens of a rendered line image, mean over the spectrum: the default of payloads."""
-
-
-def _optics(setup: MonitorSetup, name: str, defocus: float) -> LineOptics:
-    camera = setup.cameras[setup.instrument.cameras[name].camera]
-    band = camera.bands[target_band(camera)]
-    f_number = camera.focal_length / camera.entrance_pupil
-    # rms wavefront of a defocus over a round pupil
-    image = LineImageSpec.model_construct(
-        f_number=f_number,
-        transmission=_TRANSMISSION,
-        wavefront={"Z4": defocus / (16.0 * np.sqrt(3.0) * f_number**2)},
-        obstruction=(),
-        spectrum=band.spectrum.ends,
-        detector=band.detector,
-        diffusion=band.diffusion,
-        tdi=band.tdi,
-    )
-    assert setup.line_detectors is not None
-    sheet = setup.line_detectors[setup.instrument.cameras[name].camera]
-    return LineOptics.from_specs(image, band.pixels, band.pitch, setup.test.line_time, sheet)
-
-
-_IMAGES = 100_000
-"""Number of the random stream of line images; the streams of the check points have the indices of the readings."""
 GAIN_MARGIN, PHASE_MARGIN_DEG = 1.5, 30.0
 """Gain margin (a factor) and phase margin (degrees) below which a loop is barely stable: it amplifies disturbances near
 its crossover frequency by a factor of two or more. For an integrator with a delay, both margins are the same limit
@@ -226,8 +72,6 @@ class LoopOutcome:
         positive where the angle increases.
     mtf : Mapping[str, (T, 2) ndarray]
         Camera -> MTF at Nyquist along the line and along the track, mean over the fields.
-    images : tuple of ImagedPair
-        Pairs of line images, at the moments that the file names.
     """
 
     course: LoopCourse
@@ -237,7 +81,6 @@ class LoopOutcome:
     slopes: np.ndarray
     angle: np.ndarray
     mtf: Mapping[str, np.ndarray]
-    images: tuple[ImagedPair, ...] = ()
 
     def posterior(self, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return posterior mean and sigma of a linear combination of the P quantities at T moments, (T,) each.
@@ -491,18 +334,7 @@ def _outcome_of(
         name: np.stack([of.mtf_along_line.mean(axis=1), of.mtf_along_track.mean(axis=1)], axis=1)
         for name, of in quality.cameras.items()
     }
-    images = []
-    times = test.loop.images.times if test.loop.images is not None else ()
-    for done, time in enumerate(times):
-        advance("line images", done, len(times))
-        k = index_of_value(time, test.times)
-        assert k is not None  # the file was checked
-        now = {name: values[k] for name, values in changes.items()}
-        foci = {name: float(quantities[k, model.row(name, "defocus")]) for name in pair}
-        images.append(
-            imaged_pair(setup, flight, k, nominal, now, foci, pair_flight.fly(test, seed), stream(seed, _IMAGES, k))
-        )
-    return LoopOutcome(course, flight, quantities, flight.case(changes), slopes, angle, FrozenMap(mtf), tuple(images))
+    return LoopOutcome(course, flight, quantities, flight.case(changes), slopes, angle, FrozenMap(mtf))
 
 
 def height_rms(outcome: LoopOutcome) -> float:

@@ -247,22 +247,6 @@ MOMENTS: Record[loop_run.LoopOutcome] = Record(
 )
 
 
-IMAGES: Record[tuple[loop_run.LoopOutcome, loop_run.ImagedPair]] = Record(
-    "Points of a pair of rendered line images, matched and intersected.",
-    Quantity("time_s", lambda of: float(of[0].course.times[of[1].moment]), "time of the reading before", "time", 0),
-    Quantity("points", lambda of: len(of[1].errors), "number of matched points", "points"),
-    Quantity("sought", lambda of: of[1].sought, "number of points sought"),
-    Quantity("height_m", lambda of: of[1].height[0], "mean height error of the points", "height", 3),
-    Quantity("height_m_sigma", lambda of: of[1].height[1], "sigma from the scatter of the points", "σ", 3),
-    Quantity("drawn_height_m", lambda of: of[0].heights.bias[of[1].moment], "by drawn points", "drawn points", 3),
-    Quantity("camera_height_m", lambda of: of[0].heights.camera[of[1].moment], "by cameras alone", "by the cameras", 3),
-    Quantity("matching_lines_px", lambda of: float(of[1].matching[0]), "RMS across the line", "matching across", 3),
-    Quantity("matching_pixels_px", lambda of: float(of[1].matching[1]), "RMS along the line", "along", 3),
-    Quantity("stated_lines_px", lambda of: float(of[1].sigma[0]), "sigma predicted by matching", "predicted across", 3),
-    Quantity("stated_pixels_px", lambda of: float(of[1].sigma[1]), "sigma predicted by matching", "along", 3),
-)
-
-
 def _foci(of: tuple[loop_run.LoopRun, loop_run.LoopOutcome]) -> float:
     return rms(np.concatenate([_defocus((*of, name)) for name in of[0].pair]))
 
@@ -297,7 +281,6 @@ PASS: Record[tuple[loop_run.LoopRun, loop_run.LoopOutcome]] = Record(
     Quantity("heights", lambda of: SUMMARY(of[1].heights), "errors at the check points", converted=False),
     Quantity("focus", lambda of: {name: (*of, name) for name in of[0].model.cameras}, "by camera", record=FOCUS),
     Quantity("series", lambda of: of[1], "over the moments", record=MOMENTS),
-    Quantity("images", lambda of: [(of[1], pair) for pair in of[1].images] or None, record=IMAGES, where_known=True),
     Quantity("chi_square", lambda of: float(of[1].course.chi_square.sum()), "chi-square of all readings"),
     Quantity("degrees_of_freedom", lambda of: of[1].course.degrees, "degrees of freedom of chi-square"),
     Quantity("chi_square_limit", lambda of: of[1].course.limit, "limit of chi-square"),

@@ -1,7 +1,7 @@
 """Report of a monitored orbit, without or with a closed loop, and its figures.
 
 Figures: the angle, heights with and without monitoring, the interval and the remaining errors; for a closed loop, the
-remaining errors over the orbit, the positions of the mechanisms and the open loop.
+remaining errors over the orbit and the positions of the mechanisms.
 """
 
 from __future__ import annotations
@@ -16,7 +16,6 @@ from matplotlib.figure import Figure
 
 from analysis.arrays import ARCSEC
 from analysis.monitor import disturbances
-from analysis.monitor.control_loop import open_loop, rejection
 from analysis.monitor.model_fit import UnobservableMode
 from analysis.monitor.monitor_formulas import PER_SI
 from analysis.statistics import rms
@@ -210,34 +209,6 @@ def _positions_figure(run: LoopRun) -> Figure:
     return figure
 
 
-def _loop_figure(run: LoopRun) -> Figure:
-    """Draw the open loop's frequency response in the complex plane, and the drift that remains with the loop closed."""
-    figure = svg.new_figure(4.2)
-    left, right = figure.subplots(1, 2)
-    svg.gridded(left)
-    svg.gridded(right)
-    step, frequency = run.setup.test.step, np.geomspace(1e-3, 0.5, 400)
-    circle = np.exp(1j * np.linspace(0.0, 2.0 * np.pi, 200))
-    left.plot(circle.real, circle.imag, color=svg.LIGHT, lw=1.0)
-    left.plot([-1.0], [0.0], "x", color=svg.INK, ms=7)
-    drawn: dict[tuple[float, int], list[str]] = {}
-    for name, loop in run.loops.items():
-        if loop.loop_gain:
-            drawn.setdefault((loop.loop_gain, loop.corrector.spec.delay), []).append(name)
-    for k, ((gain, delay), names) in enumerate(drawn.items()):
-        colour, at = _COLOURS[k % len(_COLOURS)], open_loop(gain, delay, frequency)
-        left.plot(at.real, at.imag, color=colour, lw=1.2, label=f"gain {gain:.3g}, delay {delay}")
-        share = np.maximum(rejection(gain, delay, frequency), 1e-4)
-        right.loglog(frequency / step * 3600.0, share, color=colour, lw=1.2, label=", ".join(names))
-    left.set(xlim=(-2.5, 1.5), ylim=(-2.5, 1.5), xlabel="real part of L", ylabel="imaginary part of L", aspect="equal")
-    right.axhline(1.0, color=svg.GREY, lw=0.7)
-    right.set(xlabel="frequency of the drift [1/h]", ylabel="remaining share", ylim=(1e-3, 5.0))
-    if drawn:
-        left.legend(loc="lower right")
-        right.legend(loc="lower right")
-    return figure
-
-
 def monitor_report(run: MonitorRun | LoopRun) -> Report:
     """Return the report of a monitored orbit: heights with and without monitoring, their errors and warnings."""
     if isinstance(run, LoopRun):
@@ -246,7 +217,7 @@ def monitor_report(run: MonitorRun | LoopRun) -> Report:
             *_loop_verdict(run),
             _facts(run),
             _loop_summary(run),
-            (_orbit(run), *_images(run), _loops(run), _unobservable(run)),
+            (_orbit(run), _loops(run), _unobservable(run)),
             warnings=(*numbers.LOOP.warnings(run), *_worse_warnings(run), *_loop_warnings(run)),
         )
     smoothed = (_smoothed(run),) if run.smoothing else ()
@@ -531,27 +502,6 @@ def _orbit(run: LoopRun) -> Section:
     return Section("Over the orbit", text, (course, mechanisms, CsvFile("moments", "All numbers", "", rows)))
 
 
-def _images(run: LoopRun) -> tuple[Section, ...]:
-    if not run.closed.images:
-        return ()
-    rows = {
-        f"{label}, {moment(float(outcome.course.times[pair.moment]))}": numbers.IMAGES((outcome, pair))
-        for label, outcome in (("open", run.open), ("closed", run.closed))
-        for pair in outcome.images
-    }
-    table = numbers.IMAGES.table(
-        "images",
-        "Heights from rendered line images",
-        "Points of the second camera's image, matched in the first one's: mean height error with σ from their scatter; "
-        "the same for drawn points over the whole swath, and by the cameras alone; RMS error of the matched positions, "
-        "and its predicted σ.",
-        rows,
-        numbers.IMAGES.headed[1:],
-        "loop, after",
-    )
-    return (Section("Line images", (), (table,)),)
-
-
 def _loops(run: LoopRun) -> Section:
     rows = {name: numbers.CORRECTION((run, name, loop)) for name, loop in run.loops.items()}
     for row in rows.values():
@@ -570,12 +520,7 @@ def _loops(run: LoopRun) -> Section:
         "name",
     )
     text = (f"The spectral radius of all loops together, with the coupling between mechanisms, is {run.radius:.3f}.",)
-    caption = (
-        "Left: open loop L in the complex plane, with the point −1. Right: share of a sinusoidal drift that remains "
-        "when images are taken."
-    )
-    figure = _figure("open-loop", "Open loop, and rejection of a drift", caption, _loop_figure, run)
-    return Section("Stability", text, (table, figure))
+    return Section("Stability", text, (table,))
 
 
 def _unobservable(run: LoopRun) -> Section:
