@@ -9,7 +9,6 @@ import numpy as np
 
 from analysis.arrays import ARCSEC
 from analysis.orientation.interior import design
-from analysis.spots.centroid import mean_frames
 from analysis.statistics import gain, rms
 from optics.numerics.number_tree import FrozenMap
 from scenes.specs.camera_tests import MeasuredDistortionSpec
@@ -17,7 +16,7 @@ from scenes.yaml.units import ANGLE, LENGTH, format_quantity
 from twin.framework.artefact import FAR, Artefact, Cell, DecimalNumber, SvgFigure, Table, decimals_for
 from twin.framework.data_files import FrameFacts
 from twin.framework.report import Report, Section, answer
-from twin.framework.svg import BLUE, GREY, INK, LIGHT, ORANGE, VERMILION, drawn, new_figure, plain_axes
+from twin.framework.svg import BLUE, GREY, INK, LIGHT, ORANGE, drawn, new_figure, plain_axes
 from twin.laboratory import distortion_run, turntable_run
 from twin.laboratory.distortion_run import DISTORTION, ESTIMATE, POINTS, TRUTH, DistortionRun, SimulatedDistortion
 from twin.laboratory.turntable_report import FIT_NAMES, rejected_table
@@ -94,10 +93,6 @@ def _facts(run: DistortionRun, data: Mapping[str, Any]) -> tuple[tuple[str, str]
                 f"{format_quantity(test.pinhole, LENGTH)} in a collimator of "
                 f"{format_quantity(test.collimator.focal_length, LENGTH)}: {run.bench.images.width:.1f} pixels in the "
                 "image",
-            ),
-            (
-                "spots along the track",
-                f"range {data['truth']['row_smile_um']:.0f} µm, from smile of the mapping and tilt of the axis",
             ),
         ]
     return (*facts, ("description", run.test.description))
@@ -354,19 +349,11 @@ def _estimates(run: DistortionRun, data: Mapping[str, Any]) -> Section:
         pairs = [(estimate, run.true_estimates[name]) for name, estimate in run.estimates.items()]
         errors = [(1e3 * (e.f - t.f), 1e3 * (e.p - t.p), 1e6 * rms(e.distortion - t.distortion)) for e, t in pairs]
         rows = [(*row, *error) for row, error in zip(rows, errors, strict=True)]
-    terms = [name.replace("_", " ") for name in data["covariance_terms"]]
-    title, note = (
-        "Equations (1) to (4) and fits with a constant",
-        "Square millimetres, from specified noise and observed scatter.",
-    )
-    covariance: list[tuple[Cell, ...]] = [(n, *row) for n, row in zip(terms, data["covariance_mm2"], strict=True)]
+    title = "Equations (1) to (4) and fits with a constant"
     return Section(
         "Estimators and observability",
         (*text, _typeset(run.compensated.fit.point.sentence)),
-        (
-            Table("distortion-estimates", title, caption, heads, rows, digits),
-            Table("distortion-covariance", "Covariance of constant, f and p", note, ("", *terms), covariance),
-        ),
+        (Table("distortion-estimates", title, caption, heads, rows, digits),),
     )
 
 
@@ -397,23 +384,6 @@ def _noise(run: DistortionRun, data: Mapping[str, Any]) -> Section:
             (None, 4, 1),
         )
     ]
-    if isinstance(run, SimulatedDistortion):
-        repeatability = run.setup.turntable.dividing_error.repeatability
-        text.append(
-            f"The table's repeatability, {format_quantity(repeatability, ANGLE)}, contributes "
-            f"{1e6 * run.compensated.fit.value('principal_distance') * repeatability:.2f} µm of the scatter between "
-            f"the sets; {data['truth']['gross_errors']} exposures had a gross error. Non-uniformity of the line's "
-            f"columns shifts a spot by {noise['centroid_columns_um']:.3f} µm."
-        )
-        artefacts.append(
-            SvgFigure(
-                "distortion-spot",
-                "A spot, enlarged",
-                "Mean of the frames of one exposure in the middle of the field. Cross: energy centroid; "
-                "circle: its window.",
-                drawn("distortion-spot", _spot_figure, run),
-            )
-        )
     for record, key, what in (
         (distortion_run.REJECTED, "rejected_readings", "Readings"),
         (turntable_run.REJECTED, "rejected_comparisons", "Comparisons of the turntable"),
@@ -451,37 +421,12 @@ def _curve_figure(run: DistortionRun) -> Figure:
     return figure
 
 
-def _spot_figure(run: SimulatedDistortion) -> Figure:
-    """Draw the spot in the middle of the field, and the row through its centre."""
-    figure = new_figure(3.6)
-    picture, profile = figure.subplots(1, 2, width_ratios=(1.0, 1.5))
-    point = len(run.record.column) // 2
-    image = mean_frames(run.record.frames[point, 0])
-    pitch = run.bench.ccd.band.pitch
-    column = run.spots.position[point, 0] + run.bench.design_offset[point]
-    column = column / pitch + run.bench.middle_column - run.record.column[point, 0]
-    row = run.spots.row[point, 0]
-    shown = picture.imshow(image, cmap="gray", interpolation="nearest", origin="upper")
-    picture.plot(column, row, "+", color=VERMILION, ms=12, mew=1.4)
-    angle = np.linspace(0.0, 2.0 * np.pi, 181)
-    radius = run.bench.radius
-    picture.plot(column + radius * np.cos(angle), row + radius * np.sin(angle), color=BLUE, lw=0.9)
-    picture.set(xlabel="column, along the line", ylabel="row, along the track")
-    figure.colorbar(shown, ax=picture, label="DN")
-    values = image[round(row)]
-    profile.step(np.arange(len(values)), values, where="mid", color=BLUE, lw=1.0, label="row through the centre")
-    profile.axvline(column, color=VERMILION, lw=0.9, label="energy centroid")
-    profile.set(xlabel="column", ylabel="DN")
-    _dress(profile, columns=1)
-    return figure
-
-
-def _dress(axes: Axes, columns: int = 3) -> None:
-    """Add a light grid to axes, and a legend of some columns with room above the data."""
+def _dress(axes: Axes) -> None:
+    """Add a light grid to axes, and a legend with room above the data."""
     low, high = axes.get_ylim()
     # room for the legend above the data
     axes.set_ylim(low, high + 0.18 * (high - low))
     axes.grid(axis="y", color=LIGHT, lw=0.6)
     axes.set_axisbelow(True)
-    axes.legend(loc="upper right" if columns == 1 else "upper center", ncols=columns)
+    axes.legend(loc="upper center", ncols=3)
     plain_axes(axes)

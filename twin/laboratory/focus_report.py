@@ -158,21 +158,6 @@ def mtf_figure(run: SimulatedFocus) -> Figure:
     return figure
 
 
-def edges_figure(run: SimulatedFocus) -> Figure:
-    """Draw the recorded edges of the first and the last band."""
-    bench, state = run.bench, run.states[-1]
-    bands = list(bench.ccds)[:: max(len(bench.ccds) - 1, 1)]
-    figure = svg.new_figure(2.9)
-    panels = figure.subplots(1, 2 * len(bands), squeeze=False)[0]
-    for k, band in enumerate(bands):
-        number = _middle(run, band)
-        for axes, edge in zip(panels[2 * k : 2 * k + 2], DIRECTIONS, strict=True):
-            axes.imshow(state.focus[number].frames[edge][0], cmap="gray", interpolation="none")
-            axes.set_title(f"{band}, measures\n{DIRECTION_NAMES[edge]}")
-            axes.set(xlabel="pixel along the line", ylabel="line" if edge == ALONG and k == 0 else "")
-    return figure
-
-
 MOVED = {"image": "image, along the light", "target": "target, along the light", "focal_plane": "CCD, along the light"}
 """Description in reports of the part that was moved through focus, by its name in the file."""
 
@@ -446,15 +431,7 @@ def _curve_section(run: FocusRun) -> Section:
         without_edge = [{**focus_run.ROW_FAULT(row), "file": Path(row.file).name} for row in run.readings.no_edge]
         title, note = "Images without a measurable edge", "These images have no weight."
         artefacts.insert(1, focus_run.ROW_FAULT.table("no-edge", title, note, without_edge))
-    text: tuple[str, ...] = ()
-    if isinstance(run, SimulatedFocus):
-        ratio = run.bench.sites[0].nominal_per_shift
-        difference_percent = 100 * abs(ratio[TRACK] / ratio[ALONG] - 1.0)
-        text = (
-            f"Per shift of the target the image moves by {difference_percent:.1f}% more in one direction than in the "
-            "other.",
-        )
-    return Section("Through focus", text, tuple(artefacts), folded=1)
+    return Section("Through focus", (), tuple(artefacts), folded=1)
 
 
 def _mtf_section(run: SimulatedFocus, data: Mapping[str, Any]) -> Section:
@@ -501,12 +478,6 @@ def _mtf_section(run: SimulatedFocus, data: Mapping[str, Any]) -> Section:
                 "Measured from the slanted edge, with two sigma; dashed: the traced pupil times the detector's "
                 "factors. Dotted: Nyquist frequency.",
                 svg.drawn("mtf-curves", mtf_figure, run),
-            ),
-            SvgFigure(
-                "edges",
-                "Recorded edges",
-                "First frame in the middle of the field.",
-                svg.drawn("edges", edges_figure, run),
             ),
         ),
     )

@@ -206,16 +206,6 @@ def _fits(run: TurntableRun, result: Mapping[str, Any]) -> Section:
         f"{FIT_NAMES[chosen]}{held_out_text}."
         + ("" if held is None or best == chosen else f" The {FIT_NAMES[best]} has the smallest residual there.")
     ]
-    if model is not None:
-        subdivision = model.spec.dividing_error.subdivision
-        periods = model.spec.calibration.step / subdivision.period
-        if abs(periods - round(periods)) < 1e-6:
-            text.append(
-                f"A step of the calibration is {round(periods)} whole periods of the grating's signal "
-                f"({subdivision.period / ARCSEC:.4g} arcsec), so that all calibration points lie at one phase and do "
-                "not show the subdivision error. The held-out readings lie at all phases, as the readings in use do: "
-                "their residuals include what no fit can represent."
-            )
     text += [f"The {FIT_NAMES[name]} failed: {failure}." for name, failure in result["failed"].items()]
     drawn = "the chosen fit" if model is None else "the chosen fit and the true curve without its subdivision error"
     artefacts: list[Artefact] = [
@@ -237,7 +227,7 @@ def _fits(run: TurntableRun, result: Mapping[str, Any]) -> Section:
                 svg.drawn("turntable-residuals", residual_figure, run),
             )
         )
-    artefacts += [_ranking(result), _left(run, result), _chi_square(result)]
+    artefacts += [_ranking(result), _left(run, result)]
     rejected = result.get("rejected_readings")
     if rejected:
         artefacts.append(rejected_table(turntable_run.REJECTED, "turntable-rejected", "Comparisons", rejected))
@@ -282,17 +272,6 @@ def _left(run: TurntableRun, result: Mapping[str, Any]) -> Table:
     lines = [noise, *turntable_run.COMPENSATION.lines(result["compensation"])]
     title = "Remaining error of a compensated angle"
     return Table("turntable-sigma", title, "Without the repeatability of one comparison.", ("part", "σ"), lines)
-
-
-def _chi_square(result: Mapping[str, Any]) -> Table:
-    """Return the table of chi-square of the chosen fit and its degrees of freedom."""
-    keys = ["fit_chi_square", "fit_degrees_of_freedom", "heldout_chi_square", "heldout_degrees_of_freedom"]
-    lines = TURNTABLE.lines(result, keys if result["heldout_degrees_of_freedom"] else keys[:2])
-    note = (
-        "Chi-square of the means against their sigmas, and of held-out readings against the compensation's covariance. "
-        "Far above the degrees of freedom, the fit has errors beyond noise, which the misfits cover."
-    )
-    return Table("turntable-chi-square", "Chi-square of the chosen fit", note, ("", ""), lines)
 
 
 def turntable_report(run: TurntableRun) -> Report:
