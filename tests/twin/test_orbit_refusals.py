@@ -50,7 +50,7 @@ from tests.twin import dimap_bench, orbit_files
 from tests.twin import orbit_file_bench as bench
 from tests.twin.commands import edited_copy, invoke, refused
 from tests.twin.orbit_files import REFUSALS
-from tests.twin.pushbroom_bench import lines, lost
+from tests.twin.pushbroom_bench import lost
 from twin.framework.cli import InputErrorText
 from twin.framework.cluster import ClusterError
 from twin.framework.data_files import FrameFacts, tiff
@@ -82,7 +82,7 @@ from twin.orbit.measured.ground_files import read_ground_points
 from twin.orbit.measured.maps import UserMap
 from twin.orbit.measured.pass_measurements import GroundPoints
 from twin.orbit.measured.platform_files import platform_table, read_platform, read_scene
-from twin.orbit.monitoring import closed_loop, loop_run, monitoring_run
+from twin.orbit.monitoring import closed_loop, monitoring_run
 from twin.orbit.monitoring.monitor_series import MonitorSeries
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -480,36 +480,6 @@ def test_images_that_matching_cannot_use_are_told(good, monkeypatch: pytest.Monk
     with pytest.raises(BenchError, match=r"^the images cannot be matched: no spline$") as caught:
         READERS["match"][1](folder, spec)
     assert (caught.value.key, caught.value.remedy) == (("images",), "images of the map's ground")
-
-
-LINE_IMAGES: Any = Ns(images=Ns(ground=Ns(terrain=Ns(height=0.0)), side=9, points=None))
-PAIR: Any = Ns(
-    pair=("forward", "backward"),
-    test=Ns(loop=LINE_IMAGES, times=[0.0], line_time=1e-3, ground=Ns(first=5999.0, last=6001.0)),
-)
-FEW: dict[str, Any] = {
-    "corrected_line": lambda line, *_: line,
-    "_optics": lambda *_: None,
-    "Sensor": lambda *_: lines()["nadir"].sensor,
-    "imaged_lines": lambda *_: None,
-    "fly_patch": lambda *_: None,
-    "tie_points": lambda *_, **__: Ns(in_all=np.arange(20) < 7),
-}
-
-
-def test_line_images_with_too_few_points_are_told(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(loop_run.pair_flight, "second_view", lambda *_: 0.0)
-    for part, made in FEW.items():
-        monkeypatch.setattr(loop_run, part, made)
-    known = dict.fromkeys(PAIR.pair)
-    flight, flown = Ns(lines=[known], calibrated=known), (Ns(orbit=Ns(earth=Earth())),) * 2
-    with pytest.raises(BenchError, match=r"^line images: only 7 of 20 points were matched$") as caught:
-        loop_run.imaged_pair(PAIR, flight, 0, known, known, known, flown, np.random.SeedSequence(1))
-    assert caught.value.key == ("mechanisms", "images")
-    monkeypatch.setattr(loop_run, "tie_points", lambda *_, **__: Ns(in_all=np.arange(20) < 8))
-    monkeypatch.setattr(loop_run, "fly_patch", lambda *_: Ns(true_point=lambda *_: 1 // 0))
-    with pytest.raises(AttributeError):  # eight are taken, which have no lines here
-        loop_run.imaged_pair(PAIR, flight, 0, known, known, known, flown, np.random.SeedSequence(1))
 
 
 # --- the ten-line examples of docs/orbit_files.md, which can be read --------------------------------------------------

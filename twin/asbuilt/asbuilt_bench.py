@@ -76,6 +76,9 @@ _REACHED = 0.5
 _ANOTHER = 3.0
 """Distance of two estimates in posterior standard deviations from which they are different states."""
 
+_FOLLOWED = 5
+"""Largest number of draws, the most probable first, from which an estimate starts until one converges."""
+
 _SHARE = 1e-2
 """Step of the numerical derivatives with respect to an actuator, as a fraction of the actuator's range."""
 
@@ -302,8 +305,10 @@ class AsBuiltBench(Site):
         """Return the estimate nearest to the most probable of many draws from the exact posterior, with its draws."""
         prior = self.parameters.prior
         unit, costs = posterior_draws(prior, lambda states: self._chi_squares(kinds, data, states))
-        best = unit[np.argmin(costs + np.sum(unit**2, axis=1))]
-        state = self._estimate(kinds, data, prior.mean + prior.root @ best)
+        for best in unit[np.argsort(costs + np.sum(unit**2, axis=1))[:_FOLLOWED]]:
+            state = self._estimate(kinds, data, prior.mean + prior.root @ best)
+            if state.converged:
+                break
         if state.excluded or state.variance_factor > 1.0:
 
             def judged(states: np.ndarray) -> np.ndarray:
