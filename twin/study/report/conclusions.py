@@ -8,7 +8,7 @@ from twin.framework.artefact import decimals_for, fixed, significant
 from twin.framework.report import answer
 from twin.study.report import study_statistics
 from twin.study.report.sensitivity_indices import MANY_FAILED, RESAMPLES, Indices, NoIndices
-from twin.study.report.study_analysis import GOALS, Convergence, Requirement, StudyAnalysis
+from twin.study.report.study_analysis import Requirement, StudyAnalysis
 
 BAD_MODEL = 0.8
 """Cross-validated R² below which the report calls the polynomial chaos model of a response poor."""
@@ -106,43 +106,6 @@ def _model_text(name: str, part: Indices) -> str:
     return f"{text}."
 
 
-def convergence_texts(analysis: StudyAnalysis, names: list[str]) -> list[str]:
-    """Return sentences on whether the number of runs determines the statistics accurately enough."""
-    goals = (
-        f"A statistic counts as known when half its 95% interval is below {GOALS['mean']:g}σ (mean, standard "
-        f"deviation) or {GOALS['p95']:g}σ (quantiles)."
-    )
-    out = [goals]
-    if analysis.runs.kind != GRID and SAMPLERS[analysis.runs.kind].even:
-        out.append(
-            "The intervals are those of independent runs; this design is more uniform and determines the mean better."
-        )
-    for name in names:
-        convergences = analysis.convergences[name]
-        good = [c.name for c in convergences if c.enough]
-        bad = [f"{c.name}{_needed(c)}" for c in convergences if not c.enough]
-        n = int(convergences[0].counts[-1])
-        if not bad:
-            out.append(f"{name}: {n} runs are enough for {listed(good)}.")
-        else:
-            enough = f"enough for {listed(good)}, " if good else ""
-            out.append(f"{name}: {n} runs are {enough}too few for {listed(bad)}.")
-    return out
-
-
-def _needed(convergence: Convergence) -> str:
-    if convergence.needed is None:
-        return ""
-    how = "about" if convergence.relative is not None else "at least"
-    return f" ({how} {_round_up(convergence.needed)} runs)"
-
-
-def _round_up(count: int) -> int:
-    """Return a number of runs rounded up to two significant digits."""
-    step = 10 ** max(len(str(count)) - 2, 0)
-    return -(-count // step) * step
-
-
 LEAST_SHARE = 0.02
 """Fraction of a response's variance below which a factor is not named in the conclusions."""
 LINEAR = 0.5
@@ -182,15 +145,9 @@ def verdict(analysis: StudyAnalysis) -> tuple[str, tuple[str, ...]]:
         )
     elif runs.responses:
         first.append(f"Response {_contributors(analysis, runs.responses[0])}")
-    short = [
-        name
-        for name, statistics in analysis.convergences.items()
-        if not all(convergence.enough for convergence in statistics)
-    ]
+    short = [r.name for r in runs.responses if runs.sampled and not r.constant and analysis.few_runs(r.name)]
     if short:
-        first.append(
-            f"the runs are too few for some statistics of {plural(len(short), 'response')}: see the convergence"
-        )
+        first.append(f"the runs are too few for some statistics of {plural(len(short), 'response')}: see the intervals")
     return answer(*(part for text in first for part in text.split(". ")))
 
 
@@ -374,22 +331,3 @@ def listed(texts: Sequence[str]) -> str:
 def plural(count: int, noun: str) -> str:
     """Return a count with its noun, such as "1 run" and "2 runs"."""
     return f"{count} {noun}{'' if count == 1 else 's'}"
-
-
-def normality_text(response: study_statistics.Response, about: study_statistics.Description) -> str | None:
-    """Return a sentence on whether a response is normally distributed; None if it was not tested."""
-    if about.normality is None or about.mean is None or about.std is None:
-        return None
-    test = about.normality
-    p = "below 0.0001" if test.p < 1e-4 else number(test.p, 2)
-    shape = f"skewness {fixed(test.skewness, 2, sign=True)}, excess kurtosis {fixed(test.kurtosis, 2, sign=True)}"
-    if test.normal:
-        return f"{response.name}: normality is not rejected ({shape}, p = {p})."
-    text = f"{response.name} is not normal ({shape}, p {'= ' if test.p >= 1e-4 else ''}{p})"
-    if about.tails is None:
-        return f"{text}; the 0.135% and 99.865% quantiles need 741 runs, and there are {about.count}."
-    low, high = ((tail - about.mean.value) / about.std.value for tail in about.tails)
-    return (
-        f"{text}: 99.73% of the runs lie from {fixed(low, 2, sign=True)}σ to {fixed(high, 2, sign=True)}σ of the mean, "
-        f"from {with_unit(about.tails[0], response.unit)} to {with_unit(about.tails[1], response.unit)}."
-    )

@@ -1,4 +1,4 @@
-"""Figures of a study: distributions, response curves, effects, pairs, convergence and Pareto fronts."""
+"""Figures of a study: distributions, response curves, effects, pairs and Pareto fronts."""
 
 from collections.abc import Iterator, Sequence
 from typing import Any
@@ -7,11 +7,10 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
-from scipy import stats
 
 from twin.framework import svg
 from twin.framework.artefact import plain
-from twin.framework.svg import BLUE, GREEN, GREY, INK, LIGHT, ORANGE, PURPLE, SKY, VERMILION
+from twin.framework.svg import BLUE, GREEN, GREY, INK, ORANGE, PURPLE, SKY, VERMILION
 from twin.study.report.sensitivity_indices import Indices
 from twin.study.report.study_analysis import StudyAnalysis
 from twin.study.report.study_statistics import Description, Factor, Response, Series, mean_interval, typeset
@@ -134,14 +133,6 @@ def _histogram(axes: Axes, response: Response, about: Description, sampled: bool
     if sampled:
         for k, position in enumerate((mean - 3.0 * std, mean + 3.0 * std)):
             axes.axvline(position, color=VERMILION, lw=1.2, ls="--", label="mean ± 3σ" if k == 0 else None)
-        normal = about.normality is None or about.normality.normal
-        if not normal and about.tails is not None:
-            for k, position in enumerate(about.tails):
-                axes.axvline(position, color=GREEN, lw=1.4, ls=":", label="0.135% and 99.865%" if k == 0 else None)
-        if normal and about.normality is not None:
-            x = np.linspace(mean - 3.5 * std, mean + 3.5 * std, 200)
-            bell = np.exp(-0.5 * ((x - mean) / std) ** 2) / (np.sqrt(2.0 * np.pi) * std)
-            axes.plot(x, bell * len(values) * (edges[1] - edges[0]), color=GREEN, lw=1.1, label="normal distribution")
     finish(axes)
     axes.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=3, fontsize=7.5, columnspacing=1.0)
 
@@ -151,30 +142,6 @@ def _bin_count(values: np.ndarray) -> int:
     low, high = np.quantile(values, (0.25, 0.75))
     width = 2.0 * (high - low) / len(values) ** (1.0 / 3.0)
     return int(np.clip(np.ceil(np.ptp(values) / width), 5, 50)) if width > 0.0 else 10
-
-
-_TITLES = {"mean": "mean", "sigma": "standard deviation", "p95": "95% quantile", "p99.7": "99.7% quantile"}
-
-
-def convergence_figure(analysis: StudyAnalysis, response: Response) -> Figure:
-    """Plot mean, sigma and the upper quantiles of the first n runs against n, with their confidence intervals."""
-    convergences = analysis.convergences[response.name]
-    figure, grid = svg.panels([2.8] * len(convergences), len(convergences))
-    for axes, convergence in zip(grid, convergences, strict=True):
-        finite = np.isfinite(convergence.low) & np.isfinite(convergence.high)
-        axes.fill_between(
-            convergence.counts, convergence.low, convergence.high, where=finite, color=SKY, alpha=0.4, lw=0
-        )
-        axes.plot(convergence.counts, convergence.values, color=BLUE, lw=1.3)
-        axes.set_xscale("log")
-        axes.set(title=f"{_TITLES[convergence.name]} of {response.name}", xlabel="runs")
-        if not finite.any():
-            axes.text(
-                0.03, 0.04, f"no upper limit below {convergence.needed} runs", transform=axes.transAxes, fontsize=7.5
-            )
-        finish(axes, None, 5)
-    grid[0].set_ylabel(typeset(response.unit) or response.name)
-    return figure
 
 
 MOST_LINES = 6
@@ -458,86 +425,3 @@ def indices_figure(analysis: StudyAnalysis) -> Figure:
         axes.set_xticks([0.0, 0.2, 0.4, 0.6, 0.8, 1.0])
         axes.legend(loc="lower right")
     return figure
-
-
-MOST_RESPONSES, MOST = 3, 6
-
-
-def chosen(analysis: StudyAnalysis) -> list[Series]:
-    """Return the quantities shown in the scatter matrix.
-
-    They are the first three varying responses and the most influential factors.
-    """
-    responses = [r for r in analysis.runs.responses if not r.constant][:MOST_RESPONSES]
-    weight = {factor.name: 0.0 for factor in analysis.runs.factors}
-    for response in responses:
-        influence = analysis.influence(response.name)
-        for name, value in influence.items():
-            weight[name] = max(weight[name], value)
-    factors = [factor for factor in analysis.runs.factors if len(factor.levels) > 1]
-    best = sorted(factors, key=lambda factor: -weight[factor.name])[: MOST - len(responses)]
-    return [*(factor for factor in analysis.runs.factors if factor in best), *responses]
-
-
-def matrix_figure(analysis: StudyAnalysis) -> Figure:
-    """Plot a matrix of all pairs of the chosen quantities.
-
-    Scatter plots are below the diagonal, rank correlations above it, and histograms on it.
-    """
-    variables = chosen(analysis)
-    n = len(variables)
-    figure = svg.new_figure(min(1.65 * n + 0.6, 10.2), {"h_pad": 0.03, "w_pad": 0.03, "hspace": 0.02, "wspace": 0.02})
-    grid = figure.subplots(n, n, squeeze=False)
-    seed = analysis.runs.study.design.seed
-    for i, row in enumerate(variables):
-        for j, column in enumerate(variables):
-            axes = grid[i, j]
-            if j > i:
-                _correlation(axes, column, row)
-                continue
-            if i == j:
-                values = positions(row)
-                count = len(row.levels) if isinstance(row, Factor) and len(row.levels) < 20 else 20
-                axes.hist(values[np.isfinite(values)], bins=count, color=SKY, edgecolor="white", linewidth=0.3)
-                axes.set_yticks([])
-                svg.plain_axes(axes)
-                axes.xaxis.set_major_locator(MaxNLocator(3))
-            else:
-                x, y = positions(column) + jitter(column, seed), positions(row) + jitter(row, seed + 1)
-                shown = thinned(np.isfinite(x) & np.isfinite(y), 300)
-                axes.plot(x[shown], y[shown], ".", color=BLUE, ms=2.0, alpha=0.6)
-                finish(axes, 3, 3)
-                name_texts(axes, row, "y")
-            name_texts(axes, column, "x")
-            if i < n - 1:
-                axes.tick_params(labelbottom=False)
-                axes.xaxis.offsetText.set_visible(False)
-            if j > 0:
-                axes.tick_params(labelleft=False)
-                axes.yaxis.offsetText.set_visible(False)
-    for k, variable in enumerate(variables):
-        label = variable.label.replace(", ", ",\n")
-        grid[n - 1, k].set_xlabel(label)
-        grid[k, 0].set_ylabel(label)
-    return figure
-
-
-def _correlation(axes: Axes, x: Series, y: Series) -> None:
-    axes.set_xticks([])
-    axes.set_yticks([])
-    axes.spines[:].set_color(LIGHT)
-    if any(not series.numeric for series in (x, y)):
-        axes.set_axis_off()
-        return
-    good = np.isfinite(x.values) & np.isfinite(y.values)
-    if good.sum() < 3 or np.ptp(x.values[good]) == 0.0 or np.ptp(y.values[good]) == 0.0:
-        return
-    rank = float(stats.spearmanr(x.values[good], y.values[good]).statistic) + 0.0
-    strong = abs(rank) > 0.3
-    text = f"{rank:+.2f}".replace("-", "\N{MINUS SIGN}")
-    colour = INK if strong else GREY
-    axes.text(0.5, 0.5, text, transform=axes.transAxes, ha="center", va="center", color=colour, fontsize=9 + 4 * strong)
-    edge = VERMILION if rank < 0 else GREEN
-    if strong:
-        axes.spines[:].set_color(edge)
-        axes.spines[:].set_linewidth(0.6 + 1.4 * abs(rank))

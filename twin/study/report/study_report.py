@@ -160,7 +160,7 @@ MOST_FRONT = 50
 def sections(analysis: StudyAnalysis) -> list[Section]:
     """Return all sections of the report that have contents, in the order of the page."""
     several = sum(len(factor.levels) > 1 for factor in analysis.runs.factors) > 1
-    makers = [_requirements, _distributions, _influences, _indices, _curves, _pairs, _fronts, _convergence]
+    makers = [_requirements, _distributions, _influences, _indices, _curves, _pairs, _fronts]
     if not several:  # a study of one factor begins with the response to it
         makers.insert(1, makers.pop(makers.index(_curves)))
     return [section for make in makers if (section := make(analysis)) is not None]
@@ -244,14 +244,11 @@ def _distributions(analysis: StudyAnalysis) -> Section | None:
     names = [name for name in names if analysis.descriptions[name].count > 0]
     if not names:
         return None
-    texts = [words.normality_text(r, analysis.descriptions[r.name]) for r in analysis.runs.responses if r.name in names]
-    remarks = tuple(text for text in texts if text is not None)
     caption = "Number of runs by value."
     if analysis.runs.sampled:
-        caption += " Dashed: three standard deviations from the mean. Dotted, if the distribution is not normal: the "
-        caption += "0.135% and 99.865% quantiles, from 741 runs on."
+        caption += " Dashed: three standard deviations from the mean."
     figure = _figure("histograms", "Histograms", caption, lambda: plots.histogram_figure(analysis, names))
-    return Section("Distributions", remarks, (figure,))
+    return Section("Distributions", (), (figure,))
 
 
 def _influences(analysis: StudyAnalysis) -> Section | None:
@@ -363,20 +360,11 @@ def _curves(analysis: StudyAnalysis) -> Section | None:
 
 
 def _pairs(analysis: StudyAnalysis) -> Section | None:
-    figures = []
     pairs = analysis.runs.study.report.scatter
-    if pairs:
-        draw = partial(plots.scatter_figure, analysis, pairs)
-        figures.append(_figure("scatter", "Requested pairs", "Every point is a run.", draw))
-    variables = plots.chosen(analysis)
-    if len(variables) > 2:
-        factors = sum(isinstance(variable, Factor) for variable in variables)
-        caption = (
-            f"The {factors} most important factors and {len(variables) - factors} responses. Below the diagonal up to "
-            "300 runs, above it Spearman's rank correlation, large and framed (green +, red −) beyond 0.3."
-        )
-        figures.append(_figure("matrix", "Scatter matrix", caption, lambda: plots.matrix_figure(analysis)))
-    return Section("Pairs", (), tuple(figures)) if figures else None
+    if not pairs:
+        return None
+    draw = partial(plots.scatter_figure, analysis, pairs)
+    return Section("Pairs", (), (_figure("scatter", "Requested pairs", "Every point is a run.", draw),))
 
 
 def _fronts(analysis: StudyAnalysis) -> Section | None:
@@ -413,18 +401,3 @@ def _cell(factor: Factor, run: int) -> Cell:
     value: Cell = factor.values[run].item()
     whole = factor.numeric and bool(np.all(factor.levels == np.rint(factor.levels)))
     return int(value) if whole and isinstance(value, float) else value
-
-
-def _convergence(analysis: StudyAnalysis) -> Section | None:
-    names = [name for name, convergences in analysis.convergences.items() if convergences][:MOST_FIGURES]
-    if not names:
-        return None
-    caption = "Statistic of the first n runs, with its 95% interval where both ends exist."
-    figures = []
-    responses = [r for r in analysis.runs.responses if r.name in names]
-    for k, r in enumerate(responses):
-        figures.append(
-            _figure(f"convergence-{k + 1}", r.label, caption, partial(plots.convergence_figure, analysis, r))
-        )
-        caption = "As above."
-    return Section("Convergence", tuple(words.convergence_texts(analysis, names)), tuple(figures))
