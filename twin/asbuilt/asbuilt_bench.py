@@ -276,13 +276,14 @@ class AsBuiltBench(Site):
 
         Images of stars in one focus hardly depend on the sign of even aberrations. A second estimate therefore starts
         at the state whose even aberrations are reversed; it is returned where it converges to another state. Values of
-        MTF are the same at several foci and bend between them: the estimate has draws from its exact posterior.
+        MTF are the same at several foci and bend between them: without images of stars, which determine the focus, the
+        estimate has draws from its exact posterior.
         """
         kinds = tuple(kind.about(values) for kind, values in zip(self.kinds, data, strict=True))
-        if start is None and any(isinstance(kind, MtfReadings) and kind.has_several_foci for kind in kinds):
-            return (self._sampled(kinds, data),)
         if start is None and any(isinstance(kind, ImageReadings) for kind in kinds):
             start = self._nearby(kinds, data)
+        elif start is None and any(isinstance(kind, MtfReadings) and kind.has_several_foci for kind in kinds):
+            return (self._sampled(kinds, data),)
         state = self._estimate(kinds, data, start)
         expecting = [kind.expecting(self.view(state.mean[None], after)) for kind, after in self._pairs(kinds)]
         if not any(expecting):

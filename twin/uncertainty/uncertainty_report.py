@@ -83,7 +83,7 @@ def limits_section(
 def uncertainty_report(run: UncertaintyRun) -> Report:
     """Return the report of ``python -m twin.uncertainty``."""
     limits, coverage = run.limits, run.coverage
-    sections = [limits_section(limits, LINES, 0), _prior_section(limits), _before(limits)]
+    sections = [limits_section(limits, LINES, 0), _prior_section(limits)]
     if coverage is not None:
         sections.append(_states(coverage))
     warnings = [*run.warnings, *([_loss_text(limits)] if limits.outside > RARE else [])]
@@ -207,25 +207,8 @@ def _ledger(limits: MonitorLimits, lines: int) -> Table:
     return Table("limits-motions", title, caption, heads, rows, (None, None, 2, 2), 3)
 
 
-def _before(limits: MonitorLimits) -> Section:
-    """Return the section on each motion's contribution to the variances other than the posterior's.
-
-    They are those before a measurement, and after it by the other estimators.
-    """
-    rows: list[Sequence[Cell]] = []
-    for q, quantity in enumerate(limits.quantities):
-        for name in ("", *(name for name in limits.splits if name != BEST)):
-            first = [f"{body_text(motion)} {100 * share:.0f}%" for motion, share in limits.lines(name, q)[:FEW]]
-            rows.append((quantity_text(quantity), name or "before", ", ".join(first)))
-    caption = "Before the measurement, and after it with the estimators other than the posterior."
-    heads = ("quantity", "estimator", "motions")
-    table = Table("limits-others", "The largest shares of the variance", caption, heads, rows)
-    text = ("uncertainty.json has the ten largest contributions of each.",)
-    return Section("Before the measurement, and the other estimators", text, (table,))
-
-
 def _prior_section(limits: MonitorLimits) -> Section:
-    """Return the section on the sigmas' dependence on the prior: elasticities, and errors under heavy tails."""
+    """Return the section on the sigmas' dependence on the prior: elasticities."""
     rows: list[Sequence[Cell]] = []
     for q, quantity in enumerate(limits.quantities):
         largest = sorted(limits.elasticities, key=lambda elasticity: -float(elasticity.elasticity[q]))[:FEW]
@@ -244,25 +227,7 @@ def _prior_section(limits: MonitorLimits) -> Section:
         (None, None, None, 3, None, None),
         3,
     )
-    tail, split = limits.heavy_tail, limits.splits[BEST]
-    heavy: list[Sequence[Cell]] = []
-    for q, quantity in enumerate(limits.quantities):
-        share, sigma = 100.0 * float(limits.from_prior[q]), float(split.sigma[q])
-        widths = (float(tail.rms[q]), *(float(width) for width in tail.half_widths[:, q]))
-        heavy.append((quantity_text(quantity), sigma, share, *widths, 100.0 * float(tail.beyond[q])))
-    tails = Table(
-        "limits-heavy-tails",
-        "Part that rests on the prior, and errors with heavy tails",
-        "From the prior: share of the posterior's variance that remains without image noise. Then the errors if each "
-        "number of the prior is the scale of Student's t distribution with "
-        f"{tail.degrees:g} degrees of freedom, common to all its motions: rms, half-widths that contain as many "
-        "errors as 1, 2 and 3 sigma of a normal error, and the probability of an error beyond 3 sigma (0.27 % if "
-        "normal).",
-        ("quantity", "sigma", "from the prior [%]", "rms", "68.3%", "95.4%", "99.7%", "beyond 3 sigma [%]"),
-        heavy,
-        (None, None, 2, None, None, None, None, 2),
-        3,
-    )
+    split = limits.splits[BEST]
     most = max(limits.elasticities, key=lambda elasticity: float(elasticity.elasticity[_headline(limits)]))
     q = _headline(limits)
     unit = unit_text(limits.quantities[q])
@@ -272,7 +237,7 @@ def _prior_section(limits: MonitorLimits) -> Section:
         f"elasticity of {float(most.elasticity[q]):.2f}: if it is twice as large, σ is "
         f"{significant(float(most.doubled[q]), 2)} {unit} instead of {significant(float(split.sigma[q]), 2)} {unit}."
     )
-    return Section("Sensitivity to the prior", (text,), (numbers, tails))
+    return Section("Sensitivity to the prior", (text,), (numbers,))
 
 
 def _remedies(limits: MonitorLimits) -> Table:
