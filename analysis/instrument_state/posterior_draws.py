@@ -13,7 +13,7 @@ from analysis.instrument_state.state_estimate import StatePrior
 _STAGE = 0.5
 """Effective share of the draws that each raise of the likelihood's exponent leaves (Kong, Liu & Wong, J. Am. Stat.
 Assoc. 89, 278, 1994)."""
-_MOVES, _LAST = 4, 12
+_MOVES, _LAST = 6, 18
 """Numbers of moves of every draw after a raise of the exponent, and after the last one."""
 _ACCEPTED = 0.3
 """Share of accepted moves for which the length of the moves is adapted."""

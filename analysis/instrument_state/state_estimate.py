@@ -309,7 +309,8 @@ class StateEstimate:
     def with_draws(self, draws: Array) -> StateEstimate:
         """Return the estimate with a covariance from draws (N, U) of the exact posterior, about the same state."""
         apart = (draws - self.unit) / np.sqrt(self.variance_factor)
-        return replace(self, draws=draws, root=np.linalg.cholesky(apart.T @ apart / len(draws)))
+        # steps along a bent valley settle slowly, which the draws do not mind
+        return replace(self, draws=draws, root=np.linalg.cholesky(apart.T @ apart / len(draws)), settled=0.0)
 
     @property
     def excluded_blocks(self) -> dict[str, list[str]]:

@@ -353,7 +353,7 @@ def _accuracy(excluded: tuple[str, ...], adjustment: BlockAdjustment, reference:
         role = adjustment.assembly.block.points.role
         ties = np.flatnonzero((role == "tie") & np.isfinite(adjustment.ground).all(axis=1))
         if not len(ties):
-            raise BlockError("block: no check or tie points remain to judge: give some points the role `check` or `tie`")
+            raise BlockError("block: no check or tie points remain: give some points the role `check` or `tie`")
         return SensorContribution(
             excluded, predicted(adjustment.ground[ties], adjustment.point_covariance(ties)), None, None
         )
