@@ -22,8 +22,8 @@ from twin.framework.artefact import (
 from twin.framework.report import Report, Section, answer
 from twin.framework.svg import BLUE, GREY, INK, ORANGE, VERMILION, look, new_figure, plain_axes, shared_legend, to_svg
 from twin.tolerance.merit_models import FARTHEST
-from twin.tolerance.monitor_merit import merit_head, merit_unit, readings_of
-from twin.tolerance.tolerance_run import EXACT, LEVELS, MeritResult, ToleranceRun, Yield
+from twin.tolerance.monitor_merit import merit_head, merit_unit
+from twin.tolerance.tolerance_run import MeritResult, ToleranceRun, Yield
 
 _FEW = 3
 """Number of tolerances that the verdict names."""
@@ -44,7 +44,6 @@ def tolerance_report(run: ToleranceRun) -> Report:
     test = run.setup.test
     with look("tolerance"):
         curves = to_svg(_yield_figure(run))
-        bars = to_svg(_share_figure(run))
     verdict, more = answer(_designed(run), _verdict(run), *_causes(run), _loose(run), *_further(run))
     sections = (
         Section(
@@ -53,7 +52,7 @@ def tolerance_report(run: ToleranceRun) -> Report:
                 "Cumulative share of the cameras over the value of each merit, by exact traces and by the models; the "
                 "red line is the requirement.",
             ),
-            (SvgFigure("yield", "Merits over all cameras", "", curves), _levels_table(run)),
+            (SvgFigure("yield", "Merits over all cameras", "", curves),),
             name="yield",
         ),
         Section(
@@ -62,7 +61,7 @@ def tolerance_report(run: ToleranceRun) -> Report:
                 "Share of the variance of each merit that vanishes without the tolerance. For merits that are the "
                 "worst of several fields the shares need not add up to 100 %.",
             ),
-            (SvgFigure("shares", "Share of each tolerance", "", bars), _shares_table(run)),
+            (_shares_table(run),),
             name="shares",
         ),
         Section(
@@ -86,7 +85,6 @@ def tolerance_report(run: ToleranceRun) -> Report:
         ),
         *_allocation_sections(run),
         *_figure_sections(run),
-        *_monitor_sections(run),
         *_compensator_sections(run),
         Section(
             "Worst cameras",
@@ -238,21 +236,6 @@ def _summary(run: ToleranceRun) -> Table:
     return Table("merits", "Merits", caption, heads, rows)
 
 
-def _levels_table(run: ToleranceRun) -> Table:
-    rows: list[list[Cell]] = []
-    for result in run.merits:
-        for k, share in enumerate(LEVELS):
-            values = (result.levels[k], result.quadratic[k], result.linear[k])
-            rows.append(
-                [merit_head(result.merit), f"{100 * share:.0f} %", *(_scaled(value, result) for value in values)]
-            )
-        shares = result.passing.share, *reversed(result.model_passing)
-        rows.append([merit_head(result.merit), "yield", *map(_percent, shares)])
-    caption = "Value of each merit that a share of the cameras meet, by exact traces of every camera and by the models."
-    heads = ("merit", "share", "exact", "quadratic", "linear")
-    return Table("levels", "Exact, quadratic and linear", caption, heads, rows)
-
-
 def _shares_table(run: ToleranceRun) -> Table:
     worst = _importance(run)
     order = sorted(worst, key=lambda name: -worst[name])
@@ -272,10 +255,11 @@ def _sensitivity_table(run: ToleranceRun) -> Table:
         for m, result in enumerate(run.merits):
             cells += [_scaled(float(run.sensitivity.values[e, end, m]), result) for end in (0, 1)]
         shares = [
-            _unless_rounding(float(run.sensitivity.moves[e, end, c]) / (compensator.range_si or 1.0))
+            float(run.sensitivity.moves[e, end, c]) / (compensator.range_si or 1.0)
             for c, compensator in enumerate(adjusted.values())
             for end in (0, 1)
         ]
+        shares = [0.0 if abs(share) < _ROUNDING else share for share in shares]
         ranges = [compensator.range for compensator in adjusted.values() for _ in (0, 1)]
         limits_and_shares = list(zip(ranges, shares, strict=True))
         rows.append([*cells, *(_scaled_limit(limit, x) if np.isfinite(x) else "" for limit, x in limits_and_shares)])
@@ -318,11 +302,6 @@ def _inverse_table(run: ToleranceRun) -> Table:
         loss, name = float(run.inverse.losses[m]) / size, result.merit.name
         heads.append(f"{name}: loss {loss:.3g} {unit_for_reports(unit)}".rstrip() if np.isfinite(loss) else name)
     return Table("inverse", "Limits for a loss", "In the unit of the limit.", heads, rows)
-
-
-def _unless_rounding(share: float) -> float:
-    """Return a move as a fraction of the compensator's range, or 0 if it is below the rounding of the adjustment."""
-    return 0.0 if abs(share) < _ROUNDING else share
 
 
 def _scaled_limit(limit: str | float, share: float) -> str:
@@ -409,28 +388,6 @@ def _compensator_sections(run: ToleranceRun) -> tuple[Section, ...]:
     return (Section("Compensators", (), tables, name="compensators"),)
 
 
-def _monitor_sections(run: ToleranceRun) -> tuple[Section, ...]:
-    if not run.interpolation_errors or run.bench.monitor is None:
-        return ()
-    prior_name = run.bench.monitor.disturbances.name
-    rows: list[list[Cell]] = []
-    for result in run.merits:
-        if result.merit.name in run.interpolation_errors:
-            readings = ", ".join(readings_of(result.merit.spec, tuple(run.bench.instrument.cameras)))
-            error = run.interpolation_errors[result.merit.name]
-            names = merit_head(result.merit), readings, result.merit.spec.estimator
-            rows.append([*names, _scaled(result.nominal, result), error])
-    text = (
-        f"Standard deviations of the monitor's readings under the disturbances {prior_name}, with the derivatives "
-        "and the noise of each camera as it is built and adjusted; its area CCDs have been set to its spots. "
-        f"Derivatives are interpolated between those of the tolerances; in {EXACT} of the cameras they were also "
-        "traced for comparison.",
-    )
-    heads = ("merit", "reading", "estimator", "designed", "relative difference of traced derivatives")
-    table = Table("monitor", "Accuracy of the monitor's readings", "", heads, rows, (None, None, None, None, 7))
-    return (Section("Monitor", text, (table,), name="monitor"),)
-
-
 def _yield_figure(run: ToleranceRun) -> Figure:
     """Plot the cumulative fraction of cameras against the value of each merit."""
     shown = run.merits[:_MOST_CURVES]
@@ -463,24 +420,3 @@ def _curve(ax: Axes, run: ToleranceRun, result: MeritResult) -> None:
     ax.set_ylabel("cameras [%]")
     ax.set_ylim(0.0, 102.0)
     plain_axes(ax)
-
-
-def _share_figure(run: ToleranceRun) -> Figure:
-    """Plot the fractions of each merit's variance due to the most important tolerances."""
-    worst = _importance(run)
-    order = sorted(worst, key=lambda name: -worst[name])[:12][::-1]
-    figure = new_figure(0.9 + 0.32 * len(order))
-    ax = figure.subplots()
-    shown = run.merits[:_MOST_CURVES]
-    colours = (BLUE, ORANGE, VERMILION, GREY, INK, "#009E73")
-    step = 0.8 / max(1, len(shown))
-    for k, result in enumerate(shown):
-        at = np.arange(len(order)) + 0.4 - (k + 0.5) * step
-        ax.barh(
-            at, [100.0 * result.shares[name] for name in order], 0.9 * step, color=colours[k], label=result.merit.name
-        )
-    ax.set_yticks(np.arange(len(order)), order)
-    ax.set_xlabel("share of the variance [%]")
-    shared_legend(figure, ax)
-    plain_axes(ax)
-    return figure

@@ -1,14 +1,13 @@
-"""Conclusions of a study as sentences, formatting of its numbers, and its warnings."""
+"""Verdict and warnings of a study, and the formatting of its numbers."""
 
 from collections import Counter
-from collections.abc import Sequence
 
 from scenes.specs.study import GRID, SAMPLERS
 from twin.framework.artefact import decimals_for, fixed, significant
 from twin.framework.report import answer
 from twin.study.report import study_statistics
 from twin.study.report.sensitivity_indices import MANY_FAILED, RESAMPLES, Indices, NoIndices
-from twin.study.report.study_analysis import GOALS, Convergence, Requirement, StudyAnalysis
+from twin.study.report.study_analysis import Requirement, StudyAnalysis
 
 BAD_MODEL = 0.8
 """Cross-validated R² below which the report calls the polynomial chaos model of a response poor."""
@@ -39,9 +38,8 @@ def warnings(analysis: StudyAnalysis) -> list[str]:
         disagreeing = [index for index in part.axes if index.agrees is False] if isinstance(part, Indices) else []
         if disagreeing:
             out.append(
-                f"{name}: the Sobol indices of {listed([index.name for index in disagreeing])} by polynomial chaos and "
-                "by "
-                "RBD-FAST do not agree, so that neither is reliable: use more runs."
+                f"{name}: the Sobol indices of {', '.join(index.name for index in disagreeing)} by polynomial chaos "
+                "and by RBD-FAST do not agree, so that neither is reliable: use more runs."
             )
     doubts = [text for text in runs.doubts if text]
     if doubts:
@@ -71,13 +69,12 @@ def _reason(doubt: str) -> str:
     return head.removeprefix("σ does not hold: ").partition(" (")[0]
 
 
-def indices_texts(analysis: StudyAnalysis) -> list[str]:
-    """Return sentences on how the sensitivity indices were computed, and how accurate they are."""
+def index_remarks(analysis: StudyAnalysis) -> list[str]:
+    """Return sentences on how the sensitivity indices were computed, and for which responses they are doubtful."""
     if analysis.runs.sampled:
         out = [
             f"From the runs ({design_title(analysis.runs.kind)}) by polynomial chaos, with intervals from {RESAMPLES} "
-            "bootstrap resamples. Events in less than "
-            f"{percent(3.7 / max(analysis.runs.count, 4), 1)} of the "
+            f"bootstrap resamples. Events in less than {percent(3.7 / max(analysis.runs.count, 4), 1)} of the "
             "factors' distribution may be missed by all runs, and no interval covers them."
         ]
     else:
@@ -85,79 +82,13 @@ def indices_texts(analysis: StudyAnalysis) -> list[str]:
     for name, part in analysis.indices.items():
         if isinstance(part, NoIndices):
             out.append(f"{name}: {part.reason}.")
-        elif part.method == "chaos":
-            out.append(_model_text(name, part))
-        elif part.noise is not None and part.noise > 0.01:
-            out.append(f"{name}: the runs report {percent(part.noise)} of the variance as noise.")
+        elif part.held_out is not None and part.held_out < BAD_MODEL and part.rest - (part.noise or 0.0) >= 0.05:
+            out.append(f"{name}: such a poor model gives at best the order of importance (R² of held-out runs).")
     return out
-
-
-def _model_text(name: str, part: Indices) -> str:
-    assert part.held_out is not None
-    text = (
-        f"{name}: polynomial of degree {part.degree}, {plural(part.terms, 'term')}, R² of its predictions of held-out "
-        f"runs {part.held_out:.4f}, {percent(part.rest)} of the variance not explained"
-    ).replace("-", "\N{MINUS SIGN}" if part.held_out < 0 else "-")
-    if part.noise is not None:
-        text += f" (reported noise: {percent(part.noise)})"
-    explained = part.rest - (part.noise or 0.0) < 0.05
-    if part.held_out < BAD_MODEL and not explained:
-        text += "; such a poor model gives at best the order of importance"
-    return f"{text}."
-
-
-def convergence_texts(analysis: StudyAnalysis, names: list[str]) -> list[str]:
-    """Return sentences on whether the number of runs determines the statistics accurately enough."""
-    goals = (
-        f"A statistic counts as known when half its 95% interval is below {GOALS['mean']:g}σ (mean, standard "
-        f"deviation) or {GOALS['p95']:g}σ (quantiles)."
-    )
-    out = [goals]
-    if analysis.runs.kind != GRID and SAMPLERS[analysis.runs.kind].even:
-        out.append(
-            "The intervals are those of independent runs; this design is more uniform and determines the mean better."
-        )
-    for name in names:
-        convergences = analysis.convergences[name]
-        good = [c.name for c in convergences if c.enough]
-        bad = [f"{c.name}{_needed(c)}" for c in convergences if not c.enough]
-        n = int(convergences[0].counts[-1])
-        if not bad:
-            out.append(f"{name}: {n} runs are enough for {listed(good)}.")
-        else:
-            enough = f"enough for {listed(good)}, " if good else ""
-            out.append(f"{name}: {n} runs are {enough}too few for {listed(bad)}.")
-    return out
-
-
-def _needed(convergence: Convergence) -> str:
-    if convergence.needed is None:
-        return ""
-    how = "about" if convergence.relative is not None else "at least"
-    return f" ({how} {_round_up(convergence.needed)} runs)"
-
-
-def _round_up(count: int) -> int:
-    """Return a number of runs rounded up to two significant digits."""
-    step = 10 ** max(len(str(count)) - 2, 0)
-    return -(-count // step) * step
 
 
 LEAST_SHARE = 0.02
-"""Fraction of a response's variance below which a factor is not named in the conclusions."""
-LINEAR = 0.5
-"""Coefficient of determination (R²) of the linear model below which the report says that the model is poor."""
-
-
-def conclusions(analysis: StudyAnalysis) -> list[str]:
-    """Return the sentences at the top of the report, the requirements first."""
-    out = [_requirement_text(analysis)] if analysis.requirements else []
-    out += [_knee(analysis, k) for k in range(len(analysis.fronts))]
-    out += [_contributors(analysis, response) for response in analysis.runs.responses]
-    # the reported sigmas of a grid count as responses; among drawn runs they hardly vary
-    if not analysis.runs.sampled:
-        out += [_contributors(analysis, sigma) for sigma in analysis.runs.sigmas]
-    return [text for text in out if text]
+"""Fraction of a response's variance below which a factor is not named among the main factors."""
 
 
 def verdict(analysis: StudyAnalysis) -> tuple[str, tuple[str, ...]]:
@@ -181,7 +112,7 @@ def verdict(analysis: StudyAnalysis) -> tuple[str, tuple[str, ...]]:
             f"{name} {are} met by {worst.met} of {plural(worst.count, 'run')} with a finite value{least}{whatever}"
         )
     elif runs.responses:
-        first.append(f"Response {_contributors(analysis, runs.responses[0])}")
+        first.append(f"Response {_response_text(analysis, runs.responses[0])}")
     short = [
         name
         for name, statistics in analysis.convergences.items()
@@ -192,19 +123,6 @@ def verdict(analysis: StudyAnalysis) -> tuple[str, tuple[str, ...]]:
             f"the runs are too few for some statistics of {plural(len(short), 'response')}: see the convergence"
         )
     return answer(*(part for text in first for part in text.split(". ")))
-
-
-def _requirement_text(analysis: StudyAnalysis) -> str:
-    texts = []
-    for r in analysis.requirements:
-        name = f"{r.name} ({r.text})" if r.name else "All requirements together"
-        if r.share is None:
-            texts.append(f"{name}: the value is NaN in all runs.")
-            continue
-        of = f" (95% interval {span(r.interval)})" if r.interval is not None else " of the grid"
-        are = "is" if r.name else "are"
-        texts.append(f"{name} {are} met by {percent(r.share)} of the runs, {r.met} of {r.count}{of}{_open_range(r)}.")
-    return " ".join(texts)
 
 
 def _open_range(r: Requirement) -> str:
@@ -218,81 +136,32 @@ def _open_range(r: Requirement) -> str:
     return f", or by {r.met} to {r.most} of all {r.runs} runs, whatever the others would have given{interval}"
 
 
-def _contributors(analysis: StudyAnalysis, response: study_statistics.Response) -> str:
-    about = analysis.descriptions[response.name]
-    name = response.name
-    if about.count == 0:
-        return f"{name}: the value is NaN in all runs."
+def _response_text(analysis: StudyAnalysis, response: study_statistics.Response) -> str:
+    about, factors = analysis.descriptions[response.name], main_factors(analysis, response)
     if response.constant:
-        return f"{name} is the same in all {plural(about.count, 'run')}: {with_unit(about.low, response.unit, 6)}."
-    assert about.mean is not None
-    assert about.std is not None
-    mean = with_unit(about.mean.value, response.unit)
-    std = with_unit(about.std.value, response.unit)
+        return f"{response.name} {factors}: {with_unit(about.low, response.unit, 6)}."
+    mean, std = (with_unit(e.value if e else None, response.unit) for e in (about.mean, about.std))
     where = "" if analysis.runs.sampled else " over the grid"
-    text = f"{name}: mean {mean}, standard deviation {std}{where}."
-    indices = analysis.indices.get(name)
-    if isinstance(indices, Indices):
-        big = [index for index in indices.axes if index.total.value >= LEAST_SHARE][:3]
-        parts = [f"{index.name} {percent(index.total.value, 0)}" for index in big]
-        if parts:
-            together = sum(index.first.value for index in indices.axes) < 0.5 and indices.rest < 0.5
-            text += f" Total Sobol indices: {listed(parts)}{', mostly by interaction' if together else ''}."
-        rest = indices.rest
-        if indices.method == "chaos" and rest > 0.05:
-            text += f" {percent(rest, 0)} of the variance is not explained by the factors ({_rest_reason(indices)})."
-        return text
-    if analysis.effects[name]:
-        unit = study_statistics.typeset(response.unit)
-        parts = [f"{e.factor} {number(e.swing, 3)}" for e in analysis.effects[name][:3] if e.swing > 0.0]
-        if parts:
-            text += f" Largest main effects: {listed(parts)}{' ' + unit if unit else ''}."
-        return text
-    model = analysis.linear[name]
-    if model is None:
-        return f"{text} {plural(about.count, 'run')} are too few to find its main factors."
-    sure = [e for e in model.effects if _sure(e.swing.interval)]
-    share = max(model.adjusted, 0.0)
-    if share < LINEAR and about.count >= study_statistics.LEAST:
-        return f"{text} It is hardly linear in the factors (adjusted R² {percent(share, 0)}): see its response curves."
-    if not sure:
-        text += " No linear effect of a factor exceeds the scatter."
-    else:
-        parts = [f"{e.factor} {with_unit(e.swing.value, response.unit)}" for e in sure[:3]]
-        text += f" Largest changes over the middle 90% of a factor: {listed(parts)}."
-    text += f" All factors together explain {percent(share, 0)} of its variance linearly."
-    if about.count < study_statistics.LEAST:
-        text += f" With {about.count} runs this is only a first indication."
-    return text
+    text = f"{response.name}: mean {mean}, standard deviation {std}{where}."
+    return f"{text} Main factors: {factors}." if factors else text
 
 
-def _sure(interval: tuple[float | None, float | None]) -> bool:
-    low, high = interval
-    return low is not None and high is not None and (low > 0.0 or high < 0.0)
+def main_factors(analysis: StudyAnalysis, response: study_statistics.Response) -> str:
+    """Return up to three factors with the shares of a response's variance that they explain, or why there are none.
 
-
-def _rest_reason(indices: Indices) -> str:
-    if indices.noise is None:
-        return "noise, or a shape that the model does not fit"
-    if indices.noise > 0.7 * indices.rest:
-        return f"noise: the runs report {percent(indices.noise, 0)}"
-    return f"the runs report only {percent(indices.noise, 0)} as noise; the model does not fit the rest"
-
-
-def _knee(analysis: StudyAnalysis, k: int) -> str:
-    front = analysis.fronts[k]
-    x, y = analysis.runs.find(front.spec.x), analysis.runs.find(front.spec.y)
-    pair = f"{x.name} against {y.name}"
-    if len(front.runs) == 0:
-        return f"{pair}: no run has both values."
-    if front.knee is None:
-        if len(front.runs) == 1:
-            return f"{pair}: run {front.runs[0]} is best in both; they do not compete."
-        return f"{pair}: the Pareto front has {len(front.runs)} runs and no knee."
-    run = int(front.runs[front.knee])
-    x_text = with_unit(float(front.x[front.knee]), x.unit)
-    position = f"{x.name} {x_text}, {y.name} {with_unit(float(front.y[front.knee]), y.unit)}"
-    return f"{pair}: of {len(front.runs)} runs on the Pareto front run {run} is the knee ({position})."
+    The shares are total Sobol indices if the study asks for them, otherwise those of the main effects of a grid or of
+    the linear model, whose factors count only where their effect exceeds its 95% interval.
+    """
+    count, model = analysis.descriptions[response.name].count, analysis.linear[response.name]
+    if response.constant:
+        return f"is the same in all {plural(count, 'run')}" if count else "the value is NaN in all runs"
+    sure = set(analysis.runs.study.factors)
+    if analysis.runs.sampled and model is not None and not isinstance(analysis.indices.get(response.name), Indices):
+        ends = {e.factor: e.swing.interval for e in model.effects}
+        sure = {name for name, (low, high) in ends.items() if (low or 0.0) > 0.0 or (high or 0.0) < 0.0}
+    shares = analysis.influence(response.name).items()
+    named = [(name, value) for name, value in shares if value >= LEAST_SHARE and name in sure]
+    return ", ".join(f"{name} {percent(min(value, 1.0), 0)}" for name, value in named[:3])
 
 
 DASH = "\N{EN DASH}"
@@ -366,30 +235,6 @@ def span(interval: tuple[float, float] | None) -> str:
     return DASH if interval is None else f"{percent(interval[0])} … {percent(interval[1])}"
 
 
-def listed(texts: Sequence[str]) -> str:
-    """Return texts joined as in "a, b and c"."""
-    return texts[0] if len(texts) == 1 else f"{', '.join(texts[:-1])} and {texts[-1]}"
-
-
 def plural(count: int, noun: str) -> str:
     """Return a count with its noun, such as "1 run" and "2 runs"."""
     return f"{count} {noun}{'' if count == 1 else 's'}"
-
-
-def normality_text(response: study_statistics.Response, about: study_statistics.Description) -> str | None:
-    """Return a sentence on whether a response is normally distributed; None if it was not tested."""
-    if about.normality is None or about.mean is None or about.std is None:
-        return None
-    test = about.normality
-    p = "below 0.0001" if test.p < 1e-4 else number(test.p, 2)
-    shape = f"skewness {fixed(test.skewness, 2, sign=True)}, excess kurtosis {fixed(test.kurtosis, 2, sign=True)}"
-    if test.normal:
-        return f"{response.name}: normality is not rejected ({shape}, p = {p})."
-    text = f"{response.name} is not normal ({shape}, p {'= ' if test.p >= 1e-4 else ''}{p})"
-    if about.tails is None:
-        return f"{text}; the 0.135% and 99.865% quantiles need 741 runs, and there are {about.count}."
-    low, high = ((tail - about.mean.value) / about.std.value for tail in about.tails)
-    return (
-        f"{text}: 99.73% of the runs lie from {fixed(low, 2, sign=True)}σ to {fixed(high, 2, sign=True)}σ of the mean, "
-        f"from {with_unit(about.tails[0], response.unit)} to {with_unit(about.tails[1], response.unit)}."
-    )

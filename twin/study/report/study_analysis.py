@@ -227,28 +227,18 @@ QUANTILES = {"p95": 0.95, "p99.7": 0.997}
 """Name of each quantile whose convergence is reported -> its probability."""
 GOALS = {"mean": 0.1, "sigma": 0.1, "p95": 0.2, "p99.7": 0.2}
 """Statistic -> half-width of its 95 % interval, in units of sigma, below which it is considered well determined."""
-POINTS = 40
-"""Number of points of a convergence curve."""
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True)
 class Convergence:
-    """Convergence of a statistic with the number of runs.
-
-    Array dimensions: m points of the curve.
+    """Accuracy of a statistic of the runs.
 
     Attributes
     ----------
     name : str
         ``mean``, ``sigma``, ``p95`` or ``p99.7``.
-    counts : (m,) ndarray of int
-        Numbers of runs.
-    values : (m,) ndarray
-        The statistic of the first runs.
-    low, high : (m,) ndarray
-        Ends of the statistic's confidence interval, NaN where open.
     relative : float or None
-        Half-width of the last interval in units of sigma; None if it is open.
+        Half-width of the confidence interval in units of sigma; None if it is open.
     enough : bool
         True if ``relative`` is below the goal.
     needed : int or None
@@ -256,49 +246,31 @@ class Convergence:
     """
 
     name: str
-    counts: np.ndarray
-    values: np.ndarray
-    low: np.ndarray
-    high: np.ndarray
     relative: float | None
     enough: bool
     needed: int | None
 
 
 def convergences(values: np.ndarray) -> tuple[Convergence, ...]:
-    """Return the convergence of the statistics of (n,) finite values; none below 20 runs and for constant values.
+    """Return the accuracy of the statistics of (n,) finite values; none below 20 runs and for constant values.
 
     Array dimensions: n runs.
     """
     n = len(values)
     if n < 20 or np.ptp(values) == 0.0:
         return ()
-    counts = np.unique(np.rint(np.geomspace(10, n, POINTS)).astype(int))
-    sigma = float(np.std(values, ddof=1))
-    rows: dict[str, list[tuple[float, statistics.Interval]]] = {name: [] for name in GOALS}
-    for count in counts:
-        part = values[:count]
-        ordered = np.sort(part)
-        rows["mean"].append((float(np.mean(part)), statistics.mean_interval(part)))
-        rows["sigma"].append((float(np.std(part, ddof=1)), statistics.std_interval(part)))
-        for name, q in QUANTILES.items():
-            rows[name].append((float(np.quantile(ordered, q)), statistics.quantile_interval(ordered, q)))
-    return tuple(_convergence(name, counts, row, sigma) for name, row in rows.items())
-
-
-def _convergence(
-    name: str, counts: np.ndarray, row: list[tuple[float, statistics.Interval]], sigma: float
-) -> Convergence:
-    low = np.array([math.nan if ends[0] is None else ends[0] for _, ends in row])
-    high = np.array([math.nan if ends[1] is None else ends[1] for _, ends in row])
-    half = 0.5 * (high[-1] - low[-1]) / sigma
-    relative = float(half) if math.isfinite(half) else None
-    n, goal = int(counts[-1]), GOALS[name]
-    enough = relative is not None and relative <= goal
-    needed = n if enough else None if relative is None else math.ceil(n * (relative / goal) ** 2)
-    if relative is None and name in QUANTILES:
-        needed = statistics.runs_for_quantile(QUANTILES[name])
-    return Convergence(name, counts, np.array([value for value, _ in row]), low, high, relative, enough, needed)
+    sigma, ordered = float(np.std(values, ddof=1)), np.sort(values)
+    intervals = {"mean": statistics.mean_interval(values), "sigma": statistics.std_interval(values)}
+    intervals |= {name: statistics.quantile_interval(ordered, q) for name, q in QUANTILES.items()}
+    out = []
+    for name, (low, high) in intervals.items():
+        relative = None if low is None or high is None else 0.5 * (high - low) / sigma
+        enough = relative is not None and relative <= GOALS[name]
+        needed = n if enough else None if relative is None else math.ceil(n * (relative / GOALS[name]) ** 2)
+        if relative is None and name in QUANTILES:
+            needed = statistics.runs_for_quantile(QUANTILES[name])
+        out.append(Convergence(name, relative, enough, needed))
+    return tuple(out)
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,4 +1,4 @@
-"""Figures of a study: distributions, response curves, effects, pairs, convergence and Pareto fronts."""
+"""Figures of a study: distributions, response curves, effects, pairs and Pareto fronts."""
 
 from collections.abc import Iterator, Sequence
 from typing import Any
@@ -7,12 +7,10 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
-from scipy import stats
 
 from twin.framework import svg
 from twin.framework.artefact import plain
-from twin.framework.svg import BLUE, GREEN, GREY, INK, LIGHT, ORANGE, PURPLE, SKY, VERMILION
-from twin.study.report.sensitivity_indices import Indices
+from twin.framework.svg import BLUE, GREEN, GREY, INK, ORANGE, PURPLE, SKY, VERMILION
 from twin.study.report.study_analysis import StudyAnalysis
 from twin.study.report.study_statistics import Description, Factor, Response, Series, mean_interval, typeset
 
@@ -151,30 +149,6 @@ def _bin_count(values: np.ndarray) -> int:
     low, high = np.quantile(values, (0.25, 0.75))
     width = 2.0 * (high - low) / len(values) ** (1.0 / 3.0)
     return int(np.clip(np.ceil(np.ptp(values) / width), 5, 50)) if width > 0.0 else 10
-
-
-_TITLES = {"mean": "mean", "sigma": "standard deviation", "p95": "95% quantile", "p99.7": "99.7% quantile"}
-
-
-def convergence_figure(analysis: StudyAnalysis, response: Response) -> Figure:
-    """Plot mean, sigma and the upper quantiles of the first n runs against n, with their confidence intervals."""
-    convergences = analysis.convergences[response.name]
-    figure, grid = svg.panels([2.8] * len(convergences), len(convergences))
-    for axes, convergence in zip(grid, convergences, strict=True):
-        finite = np.isfinite(convergence.low) & np.isfinite(convergence.high)
-        axes.fill_between(
-            convergence.counts, convergence.low, convergence.high, where=finite, color=SKY, alpha=0.4, lw=0
-        )
-        axes.plot(convergence.counts, convergence.values, color=BLUE, lw=1.3)
-        axes.set_xscale("log")
-        axes.set(title=f"{_TITLES[convergence.name]} of {response.name}", xlabel="runs")
-        if not finite.any():
-            axes.text(
-                0.03, 0.04, f"no upper limit below {convergence.needed} runs", transform=axes.transAxes, fontsize=7.5
-            )
-        finish(axes, None, 5)
-    grid[0].set_ylabel(typeset(response.unit) or response.name)
-    return figure
 
 
 MOST_LINES = 6
@@ -363,11 +337,6 @@ MOST_BARS = 10
 """Largest number of bars (factors) in one panel of a tornado or sensitivity figure."""
 
 
-def _bar_panels(rows: Sequence[int]) -> tuple[Figure, list[Axes]]:
-    """Return a figure with two columns of panels whose heights fit their numbers of bars."""
-    return svg.panels([0.95 + 0.3 * max(row, 2) for row in rows], min(2, len(rows)))
-
-
 def with_tornado(analysis: StudyAnalysis) -> list[Response]:
     """Return the responses and reported sigmas that have at least one bar in the tornado figure."""
     return [r for r in analysis.runs.everything if analysis.effects[r.name] or analysis.linear[r.name] is not None]
@@ -376,19 +345,12 @@ def with_tornado(analysis: StudyAnalysis) -> list[Response]:
 def tornado_figure(analysis: StudyAnalysis) -> Figure:
     """Plot for each response its change over the range of each factor, the largest first, as bars."""
     responses = with_tornado(analysis)
-    rows = [min(len(analysis.effects[r.name]) or _effects(analysis, r.name), MOST_BARS) for r in responses]
-    figure, grid = _bar_panels(rows)
+    effects = [analysis.effects[r.name] or getattr(analysis.linear[r.name], "effects", ()) for r in responses]
+    heights = [0.95 + 0.3 * max(min(len(bars), MOST_BARS), 2) for bars in effects]
+    figure, grid = svg.panels(heights, min(2, len(heights)))
     for axes, response in zip(grid, responses, strict=True):
-        if analysis.runs.sampled:
-            _swings(axes, analysis, response)
-        else:
-            _main_effects(axes, analysis, response)
+        (_swings if analysis.runs.sampled else _main_effects)(axes, analysis, response)
     return figure
-
-
-def _effects(analysis: StudyAnalysis, name: str) -> int:
-    model = analysis.linear[name]
-    return len(model.effects) if model is not None else 0
 
 
 def _swings(axes: Axes, analysis: StudyAnalysis, response: Response) -> None:
@@ -428,116 +390,3 @@ def _name_bars(axes: Axes, names: Sequence[str], label: str) -> None:
     axes.set_ylim(-0.7, max(len(names), 2) - 0.3)
     finish(axes, 5, None)
     axes.grid(False, axis="y")
-
-
-def with_indices(analysis: StudyAnalysis) -> list[Response]:
-    """Return the responses and sigmas that have sensitivity indices."""
-    return [r for r in analysis.runs.everything if isinstance(analysis.indices.get(r.name), Indices)]
-
-
-def indices_figure(analysis: StudyAnalysis) -> Figure:
-    """Plot the first-order and the total sensitivity index of each factor, for each response."""
-    responses = with_indices(analysis)
-    parts = [analysis.indices[r.name] for r in responses]
-    rows = [min(2 * len(part.axes), 2 * MOST_BARS) for part in parts if isinstance(part, Indices)]
-    figure, grid = _bar_panels([int(0.7 * row) + 1 for row in rows])
-    for axes, response, part in zip(grid, responses, parts, strict=True):
-        assert isinstance(part, Indices)
-        shown = part.axes[:MOST_BARS][::-1]
-        y = np.arange(len(shown))
-        for shift, colour, label, estimates in (
-            (0.19, BLUE, "first order", [index.first for index in shown]),
-            (-0.19, SKY, "total", [index.total for index in shown]),
-        ):
-            values = np.array([e.value for e in estimates])
-            axes.barh(y + shift, values, 0.36, color=colour, label=label)
-            if part.method == "chaos":
-                svg.interval_bars(axes, values, y + shift, [e.interval for e in estimates], "x", capsize=2.0)
-        _name_bars(axes, [index.name for index in shown], f"share of the variance of {response.name}")
-        axes.set_xlim(0.0, 1.08)
-        axes.set_xticks([0.0, 0.2, 0.4, 0.6, 0.8, 1.0])
-        axes.legend(loc="lower right")
-    return figure
-
-
-MOST_RESPONSES, MOST = 3, 6
-
-
-def chosen(analysis: StudyAnalysis) -> list[Series]:
-    """Return the quantities shown in the scatter matrix.
-
-    They are the first three varying responses and the most influential factors.
-    """
-    responses = [r for r in analysis.runs.responses if not r.constant][:MOST_RESPONSES]
-    weight = {factor.name: 0.0 for factor in analysis.runs.factors}
-    for response in responses:
-        influence = analysis.influence(response.name)
-        for name, value in influence.items():
-            weight[name] = max(weight[name], value)
-    factors = [factor for factor in analysis.runs.factors if len(factor.levels) > 1]
-    best = sorted(factors, key=lambda factor: -weight[factor.name])[: MOST - len(responses)]
-    return [*(factor for factor in analysis.runs.factors if factor in best), *responses]
-
-
-def matrix_figure(analysis: StudyAnalysis) -> Figure:
-    """Plot a matrix of all pairs of the chosen quantities.
-
-    Scatter plots are below the diagonal, rank correlations above it, and histograms on it.
-    """
-    variables = chosen(analysis)
-    n = len(variables)
-    figure = svg.new_figure(min(1.65 * n + 0.6, 10.2), {"h_pad": 0.03, "w_pad": 0.03, "hspace": 0.02, "wspace": 0.02})
-    grid = figure.subplots(n, n, squeeze=False)
-    seed = analysis.runs.study.design.seed
-    for i, row in enumerate(variables):
-        for j, column in enumerate(variables):
-            axes = grid[i, j]
-            if j > i:
-                _correlation(axes, column, row)
-                continue
-            if i == j:
-                values = positions(row)
-                count = len(row.levels) if isinstance(row, Factor) and len(row.levels) < 20 else 20
-                axes.hist(values[np.isfinite(values)], bins=count, color=SKY, edgecolor="white", linewidth=0.3)
-                axes.set_yticks([])
-                svg.plain_axes(axes)
-                axes.xaxis.set_major_locator(MaxNLocator(3))
-            else:
-                x, y = positions(column) + jitter(column, seed), positions(row) + jitter(row, seed + 1)
-                shown = thinned(np.isfinite(x) & np.isfinite(y), 300)
-                axes.plot(x[shown], y[shown], ".", color=BLUE, ms=2.0, alpha=0.6)
-                finish(axes, 3, 3)
-                name_texts(axes, row, "y")
-            name_texts(axes, column, "x")
-            if i < n - 1:
-                axes.tick_params(labelbottom=False)
-                axes.xaxis.offsetText.set_visible(False)
-            if j > 0:
-                axes.tick_params(labelleft=False)
-                axes.yaxis.offsetText.set_visible(False)
-    for k, variable in enumerate(variables):
-        label = variable.label.replace(", ", ",\n")
-        grid[n - 1, k].set_xlabel(label)
-        grid[k, 0].set_ylabel(label)
-    return figure
-
-
-def _correlation(axes: Axes, x: Series, y: Series) -> None:
-    axes.set_xticks([])
-    axes.set_yticks([])
-    axes.spines[:].set_color(LIGHT)
-    if any(not series.numeric for series in (x, y)):
-        axes.set_axis_off()
-        return
-    good = np.isfinite(x.values) & np.isfinite(y.values)
-    if good.sum() < 3 or np.ptp(x.values[good]) == 0.0 or np.ptp(y.values[good]) == 0.0:
-        return
-    rank = float(stats.spearmanr(x.values[good], y.values[good]).statistic) + 0.0
-    strong = abs(rank) > 0.3
-    text = f"{rank:+.2f}".replace("-", "\N{MINUS SIGN}")
-    colour = INK if strong else GREY
-    axes.text(0.5, 0.5, text, transform=axes.transAxes, ha="center", va="center", color=colour, fontsize=9 + 4 * strong)
-    edge = VERMILION if rank < 0 else GREEN
-    if strong:
-        axes.spines[:].set_color(edge)
-        axes.spines[:].set_linewidth(0.6 + 1.4 * abs(rank))

@@ -9,7 +9,7 @@ import xarray as xr
 from matplotlib.figure import Figure
 from matplotlib.text import Text
 
-from scenes.specs.study import FactorSpec, StudySpec
+from scenes.specs.study import SAMPLERS, FactorSpec, StudySpec
 from scenes.yaml.errors import key_text
 from twin.framework import page, run_folder, svg
 from twin.framework.artefact import Cell, SvgFigure, Table, Undrawn, fixed, plain
@@ -19,7 +19,7 @@ from twin.study.report import conclusions as words
 from twin.study.report import study_analysis
 from twin.study.report import study_plots as plots
 from twin.study.report.sensitivity_indices import Indices
-from twin.study.report.study_analysis import StudyAnalysis
+from twin.study.report.study_analysis import GOALS, StudyAnalysis
 from twin.study.report.study_statistics import Estimate, Factor, StudyRuns, typeset
 from twin.study.runs.base_job import one_line
 from twin.study.runs.plan import Plan
@@ -97,7 +97,6 @@ def report_files(
         (),
         _response_table(analysis),
         (Section("Factors", (), (_factor_table(runs),)), *sections(analysis)),
-        conclusions=tuple(words.conclusions(analysis)),
     )
     undrawn = tuple(artefact.note for artefact in report.artefacts if isinstance(artefact, Undrawn))
     report = replace(report, warnings=(*input_warnings, *undrawn, *words.warnings(analysis)))
@@ -168,21 +167,28 @@ def sections(analysis: StudyAnalysis) -> list[Section]:
 
 def _response_table(analysis: StudyAnalysis) -> Table:
     """Return the table of mean, standard deviation, quantiles and range of each response and of its reported sigma."""
-    heads = ("response", "unit", "runs", "mean", "std", "median", "95%", "99.7%", "min", "max")
+    sampled = analysis.runs.sampled
+    heads = ["response", "unit", "runs", "mean", "std", "median", "95%", "99.7%", "min", "max"]
+    heads += ["p, normal"] * sampled + ["main factors"]
     rows: list[list[Cell]] = []
     for r in analysis.runs.everything:
         d = analysis.descriptions[r.name]
         estimates = [words.with_limits(e) for e in (d.mean, d.std, d.median, d.p95, d.p997)]
-        rows.append([r.name, typeset(r.unit), d.count, *estimates, words.number(d.low), words.number(d.high)])
-    if analysis.runs.sampled:
+        normal = [words.DASH if d.normality is None else f"{d.normality.p:.2g}"] * sampled
+        ends = words.number(d.low), words.number(d.high)
+        rows.append([r.name, typeset(r.unit), d.count, *estimates, *ends, *normal, words.main_factors(analysis, r)])
+    if sampled:
         how = (
             "In brackets 95% confidence intervals: Student's for the mean, from the kurtosis for the standard "
             "deviation, order statistics for the quantiles; a question mark is an end that needs more runs, > a "
-            "quantile with a lower limit alone."
+            "quantile with a lower limit alone. p: test of D'Agostino and Pearson for a normal distribution."
         )
     else:
         how = "Over all combinations of the grid with equal weights; a grid is not a sample, so there are no intervals."
-    caption = f"Over the runs with a finite value; the columns 95% and 99.7% are quantiles. {how}"
+    caption = (
+        f"Over the runs with a finite value; the columns 95% and 99.7% are quantiles. {how} Main factors: shares of "
+        "the variance by total Sobol indices, otherwise by main effects of the grid or the linear model."
+    )
     return Table("responses", "Responses", caption, heads, rows, within=STATISTICS)
 
 
@@ -244,14 +250,12 @@ def _distributions(analysis: StudyAnalysis) -> Section | None:
     names = [name for name in names if analysis.descriptions[name].count > 0]
     if not names:
         return None
-    texts = [words.normality_text(r, analysis.descriptions[r.name]) for r in analysis.runs.responses if r.name in names]
-    remarks = tuple(text for text in texts if text is not None)
     caption = "Number of runs by value."
     if analysis.runs.sampled:
         caption += " Dashed: three standard deviations from the mean. Dotted, if the distribution is not normal: the "
         caption += "0.135% and 99.865% quantiles, from 741 runs on."
     figure = _figure("histograms", "Histograms", caption, lambda: plots.histogram_figure(analysis, names))
-    return Section("Distributions", remarks, (figure,))
+    return Section("Distributions", (), (figure,))
 
 
 def _influences(analysis: StudyAnalysis) -> Section | None:
@@ -312,15 +316,13 @@ def _maybe(estimate: Estimate | None, sampled: bool) -> str:
 def _indices(analysis: StudyAnalysis) -> Section | None:
     if not analysis.runs.study.report.sobol:
         return None
-    remarks = words.indices_texts(analysis)
-    responses = plots.with_indices(analysis)
-    if not responses:
-        return Section("Sobol indices", tuple(remarks))
+    remarks = words.index_remarks(analysis)
     chaos = analysis.runs.sampled
     rows: list[list[Cell]] = []
-    for r in responses:
+    for r in analysis.runs.everything:
         part = analysis.indices[r.name]
-        assert isinstance(part, Indices)
+        if not isinstance(part, Indices):
+            continue
         for index in part.axes:
             check = words.DASH if index.check is None else fixed(index.check, 2)
             rows.append(
@@ -331,10 +333,7 @@ def _indices(analysis: StudyAnalysis) -> Section | None:
     if chaos:
         caption += " RBD-FAST (SALib) needs no model and checks the first order; its own error is some 0.03 to 0.1."
     table = Table("sobol", "Indices", caption, heads, rows, within=STATISTICS)
-    intervals = "with 95% intervals" if chaos else "exact for the grid"
-    figure = _figure("sobol-indices", "First order and total", f"Shares of the variance, {intervals}.",
-                     lambda: plots.indices_figure(analysis))  # fmt: skip
-    return Section("Sobol indices", tuple(remarks), (figure, table))
+    return Section("Sobol indices", tuple(remarks), (table,) if rows else ())
 
 
 def _curves(analysis: StudyAnalysis) -> Section | None:
@@ -363,20 +362,11 @@ def _curves(analysis: StudyAnalysis) -> Section | None:
 
 
 def _pairs(analysis: StudyAnalysis) -> Section | None:
-    figures = []
     pairs = analysis.runs.study.report.scatter
-    if pairs:
-        draw = partial(plots.scatter_figure, analysis, pairs)
-        figures.append(_figure("scatter", "Requested pairs", "Every point is a run.", draw))
-    variables = plots.chosen(analysis)
-    if len(variables) > 2:
-        factors = sum(isinstance(variable, Factor) for variable in variables)
-        caption = (
-            f"The {factors} most important factors and {len(variables) - factors} responses. Below the diagonal up to "
-            "300 runs, above it Spearman's rank correlation, large and framed (green +, red −) beyond 0.3."
-        )
-        figures.append(_figure("matrix", "Scatter matrix", caption, lambda: plots.matrix_figure(analysis)))
-    return Section("Pairs", (), tuple(figures)) if figures else None
+    if not pairs:
+        return None
+    draw = partial(plots.scatter_figure, analysis, pairs)
+    return Section("Pairs", (), (_figure("scatter", "Requested pairs", "Every point is a run.", draw),))
 
 
 def _fronts(analysis: StudyAnalysis) -> Section | None:
@@ -416,15 +406,18 @@ def _cell(factor: Factor, run: int) -> Cell:
 
 
 def _convergence(analysis: StudyAnalysis) -> Section | None:
-    names = [name for name, convergences in analysis.convergences.items() if convergences][:MOST_FIGURES]
-    if not names:
+    rows: list[list[Cell]] = [
+        [name, _STATISTICS[c.name], words.number(c.relative, 2), GOALS[c.name], "yes" if c.enough else "no", c.needed]
+        for name, convergences in analysis.convergences.items()
+        for c in convergences
+    ]
+    if not rows:
         return None
-    caption = "Statistic of the first n runs, with its 95% interval where both ends exist."
-    figures = []
-    responses = [r for r in analysis.runs.responses if r.name in names]
-    for k, r in enumerate(responses):
-        figures.append(
-            _figure(f"convergence-{k + 1}", r.label, caption, partial(plots.convergence_figure, analysis, r))
-        )
-        caption = "As above."
-    return Section("Convergence", tuple(words.convergence_texts(analysis, names)), tuple(figures))
+    heads = ("response", "statistic", "half-width [σ]", "goal [σ]", "enough", "runs needed")
+    caption = "Half of the statistic's 95% interval, in sigmas of the response, and about how many runs reach the goal."
+    if SAMPLERS[analysis.runs.kind].even:
+        caption += " The intervals are those of independent runs; this design determines the mean better."
+    return Section("Convergence", (), (Table("convergence", "", caption, heads, rows, within=STATISTICS),))
+
+
+_STATISTICS = {"mean": "mean", "sigma": "standard deviation", "p95": "95% quantile", "p99.7": "99.7% quantile"}
