@@ -259,14 +259,6 @@ _WEIGHTS = {2: {1: 1.0 / 2.0}, 4: {1: 8.0 / 12.0, 2: -1.0 / 12.0}, 6: {1: 45.0 /
 
 The weights are those of Fornberg, Math. Comp. 51, 699, 1988.
 """
-_JUMP = {4: {1: 4.0 / 3.0, 2: -1.0 / 3.0}, 6: {1: 1.5, 2: -0.6, 3: 0.1}}
-"""Order -> number k of steps -> weight of the second difference f(k h) + f(-k h) - 2 f(0), to detect jumps of f.
-
-f is a function of a layout parameter and h the step. The weighted sum is extrapolated by even powers of h and tends to
-zero for a smooth f. If f has a jump J anywhere within the steps, the sum keeps a part of J that, divided by h, is an
-upper limit for the effect of J on the central difference. For order 6 the part and the effect (times h) are J and 0.62
-J for a jump within the first step, J/2 and 0.13 J within the second, J/10 and 0.02 J within the third.
-"""
 
 
 @dataclass(frozen=True)
@@ -317,8 +309,6 @@ class Slope:
         Reason why they cannot be computed, empty if they can; the other attributes are then empty.
     values : dict
         Disturbances -> quantity -> d(sigma)/d(parameter), SI units.
-    errors : dict
-        Numerical error of each derivative, in the same form; empty for differences of second order.
     brightest : (C,) ndarray
         Derivatives, per SI unit, of the signal of the brightest pixel of each of C spots as a fraction of its capacity.
     """
@@ -326,7 +316,6 @@ class Slope:
     number: LayoutNumber
     refused: str = ""
     values: Mapping[str, Mapping[str, float]] = field(default_factory=FrozenMap)
-    errors: Mapping[str, Mapping[str, float]] = field(default_factory=FrozenMap)
     brightest: np.ndarray = field(default_factory=lambda: np.zeros(0))
 
 
@@ -385,32 +374,21 @@ def slope_of(bench: LayoutBench, number: LayoutNumber) -> Slope:
         Parameter of a layout.
     """
     low, high = ranges(bench.setup)[number.name]
-    step, high_order, low_order = STEP * (high - low), _WEIGHTS[number.order], _WEIGHTS.get(number.order - 2, {})
+    step = STEP * (high - low)
     try:
         centre = _known_here(bench, number.beams)
-        best, lower, jump = ({name: _Sum.none(info) for name, info in centre.items()} for _ in range(3))
-        jumps = _JUMP.get(number.order, {})
-        for name, info in centre.items():
-            jump[name].add(-2.0 * sum(jumps.values()) / step, info)
-        for k, weight in high_order.items():
+        sums = {name: _Sum.none(info) for name, info in centre.items()}
+        for k, weight in _WEIGHTS[number.order].items():
             for sign in (1.0, -1.0):
                 for name, info in known_of(bench, number.moved(bench, sign * k * step)).items():
-                    best[name].add(sign * weight / step, info)
-                    lower[name].add(sign * low_order.get(k, 0.0) / step, info)
-                    jump[name].add(jumps.get(k, 0.0) / step, info)
+                    sums[name].add(sign * weight / step, info)
     except (InputError, AimError, BeamMissedError, ValueError) as error:
         return Slope(number, refused=str(error))
-    values: dict[str, dict[str, float]] = {}
-    errors: dict[str, dict[str, float]] = {}
-    for name, info in centre.items():
-        slopes = {key: info.slopes(key) for key in info.quantities if info.sigma(key) > 0.0}
-        values[name] = {key: best[name].along(*slope) for key, slope in slopes.items()}
-        if low_order:
-            errors[name] = {
-                key: abs(values[name][key] - lower[name].along(*slope)) + abs(jump[name].along(*slope))
-                for key, slope in slopes.items()
-            }
-    return Slope(number, values=values, errors=errors, brightest=next(iter(best.values())).brightest)
+    values = {
+        name: {key: sums[name].along(*info.slopes(key)) for key in info.quantities if info.sigma(key) > 0.0}
+        for name, info in centre.items()
+    }
+    return Slope(number, values=values, brightest=next(iter(sums.values())).brightest)
 
 
 @dataclass(eq=False)

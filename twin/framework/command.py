@@ -21,7 +21,7 @@ from scenes.specs.file_kinds import read_for
 from scenes.specs.procedures import PROCEDURES
 from scenes.yaml.standard_output import FAILURE, Terminal, print_error, print_json, to_stdout
 from twin.framework import cli, durable
-from twin.framework.owned_files import first_names
+from twin.framework.durable import first_names
 from twin.framework.procedure import Advance, Session, performed, seeded
 
 if TYPE_CHECKING:
