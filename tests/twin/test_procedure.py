@@ -26,7 +26,7 @@ from scenes.specs.resolved import ExperimentSetup
 from scenes.yaml.spec import Name, Number, Seed, Spec, Whole
 from tests.twin.commands import files, invoke
 from tests.twin.test_blurred_cameras import gf7_with
-from twin.framework import cli, reference_frames
+from twin.framework import cli, record
 from twin.framework.artefact import PngFigure, SvgFigure, Table
 from twin.framework.cli import heartbeat
 from twin.framework.command import add_tests, progress_shown
@@ -140,8 +140,8 @@ LEVEL = Procedure("level", LevelSetup, measure, numbers, report, about="Read a l
 
 def program(monkeypatch: pytest.MonkeyPatch, **changes: Any) -> typer.Typer:
     """Return a program with the test as its command, but for what is changed."""
-    frames = {**reference_frames.FRAMES, "level": {"readings_arcsec": "about the level's own axis"}}
-    monkeypatch.setattr(reference_frames, "FRAMES", FrozenMap(frames))
+    frames = {**record.FRAMES, "level": {"readings_arcsec": "about the level's own axis"}}
+    monkeypatch.setattr(record, "FRAMES", FrozenMap(frames))
     monkeypatch.setitem(PROCEDURES, "bench level", replace(LEVEL, **changes))
     app = typer.Typer()
     app.callback()(lambda: None)

@@ -14,9 +14,9 @@ from scenes.specs.study import ParetoSpec
 from tests.twin.study_bench import TEXTS
 from tests.twin.study_data import columns, dataset, study_of
 from twin.study.report import study_statistics as estimates
-from twin.study.report.conclusions import main_factors, warnings
 from twin.study.report.sensitivity_indices import NoIndices, axis_functions, sensitivity_indices
 from twin.study.report.study_analysis import STATISTICS, StudyAnalysis, convergences, pareto_front, ranks_of
+from twin.study.report.study_report import main_factors, warnings
 from twin.study.report.study_statistics import linear_model
 from twin.study.runs.plan import quantiles
 

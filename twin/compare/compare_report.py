@@ -286,7 +286,7 @@ def differences(reference: Run, other: Run, rtol: float, sigmas: float | None) -
     for name in (*results, *images):
         diff = difference.file_difference(name, reference.file(name), other.file(name))
         count += diff.common_arrays
-        arrays += [array for array in diff.arrays if not _same_array(array, rtol)]
+        arrays += [a for a in diff.arrays if not a.finite or (a.largest or 0.0) > rtol * (a.peak or 0.0)]
         if name in results:
             count += diff.common_numbers
             numbers += [number for number in diff.numbers if not _same_number(number, rtol, sigmas)]
@@ -318,11 +318,6 @@ def _same_number(number: NumberDifference, rtol: float, sigmas: float | None) ->
     if math.isclose(float(number.reference or 0), float(number.other or 0), rel_tol=rtol):
         return True
     return sigmas is not None and number.sigma is not None and abs(number.difference) <= sigmas * number.sigma
-
-
-def _same_array(array: ArrayDifference, rtol: float) -> bool:
-    """Return whether two arrays differ by at most ``rtol`` times the largest absolute value of the reference."""
-    return array.finite and (array.largest or 0.0) <= rtol * (array.peak or 0.0)
 
 
 @dataclass(frozen=True, eq=False)

@@ -135,7 +135,9 @@ def refined(
     for _ in range(steps):
         current = path[-1]
         slopes = ask(f"{part}: slopes", [replace(number, beams=current.beams) for number in numbers])
-        slopes = [slope for slope in slopes if not slope.refused and _benefit(bench, current, slope) > LEAST_BENEFIT]
+        least = LEAST_BENEFIT * _largest(current, bench)
+        feasible = [slope for slope in slopes if not slope.refused]
+        slopes = [slope for slope in feasible if np.max(np.abs(_slopes_of(bench, current, slope))) > least]
         if not slopes:
             break
         # parameters without effect on any goal here have none a step away either
@@ -180,11 +182,6 @@ def _slopes_of(bench: LayoutBench, facts: LayoutFacts, slope: Slope) -> np.ndarr
         value = slope.values[name].get(key, 0.0)
         out.append(value * (high - low) / goal[key.rpartition("/")[2]])
     return np.array(out)
-
-
-def _benefit(bench: LayoutBench, facts: LayoutFacts, slope: Slope) -> float:
-    """Return the largest change of a ratio of sigma to goal over a parameter's range, relative to the largest ratio."""
-    return float(np.max(np.abs(_slopes_of(bench, facts, slope)))) / _largest(facts, bench)
 
 
 def _step(bench: LayoutBench, facts: LayoutFacts, slopes: Sequence[Slope], box: float) -> tuple[np.ndarray, float]:
@@ -841,7 +838,7 @@ class _SingleSearch:
             feasible = (
                 candidate
                 for candidate in promising
-                if candidate.beams in self.built or self._is_possible(candidate.beams)
+                if candidate.beams in self.built or (self._within(candidate.beams) and self._fits(candidate.beams))
             )
             level = [*islice(feasible, width + len(self.built))]
             levels.append(level)
@@ -861,9 +858,6 @@ class _SingleSearch:
                         )
             self.compared[beams] = worst
         return Candidate(beams, self.compared[beams])
-
-    def _is_possible(self, beams: Sequence[int]) -> bool:
-        return self._within(beams) and self._fits(beams)
 
     def _alike(self, beams: Sequence[int]) -> bool:
         """Return True if all beams have the same kinds of reflectors and the same area CCD.

@@ -86,6 +86,7 @@ def tolerance_report(run: ToleranceRun) -> Report:
         *_allocation_sections(run),
         *_figure_sections(run),
         *_compensator_sections(run),
+        Section("Limits", (), (_tol_table(run),), name="tol"),
         Section(
             "Worst cameras",
             ("The worst cameras as jobs, with their adjustments: `python -m twin.camera FILE` shows each.",),
@@ -96,7 +97,6 @@ def tolerance_report(run: ToleranceRun) -> Report:
     )
     facts = (
         ("camera", run.bench.camera),
-        ("light", _light(run)),
         ("tolerances", str(len(test.tolerances))),
         ("compensators", str(len(test.compensators)) or "none"),
         ("cameras drawn", str(len(run.samples.problems))),
@@ -105,14 +105,6 @@ def tolerance_report(run: ToleranceRun) -> Report:
     title = f"Tolerances of {run.bench.camera}"
     unmet = any(result.passing.judged(result.merit.spec.probability) == "missed" for result in run.merits)
     return Report(title, verdict, more, facts, _summary(run), sections, warnings=run.warnings, unmet=unmet)
-
-
-def _light(run: ToleranceRun) -> str:
-    """Return a text on the wavelengths at which wavefronts and MTFs are evaluated."""
-    colours = 1e9 * run.bench.colours
-    if len(colours) == 1:
-        return f"{colours[0]:.4g} nm"
-    return f"{colours.min():.4g} to {colours.max():.4g} nm, {len(colours)} wavelengths"
 
 
 def _percent(share: float) -> str:
@@ -331,7 +323,7 @@ def _allocation_sections(run: ToleranceRun) -> tuple[Section, ...]:
         f"{_percent(allocation.predicted[0])} to {_percent(allocation.predicted[1])}; independent cameras, traced "
         f"exactly, give {_interval(judged)}.",
     )
-    return (Section("Allocation", text, (table, _tol_table(run)), name="allocation"),)
+    return (Section("Allocation", text, (table,), name="allocation"),)
 
 
 def _tol_table(run: ToleranceRun) -> Table:
@@ -371,7 +363,7 @@ def _figure_sections(run: ToleranceRun) -> tuple[Section, ...]:
 
 def _compensator_sections(run: ToleranceRun) -> tuple[Section, ...]:
     if not run.bench.compensators:
-        return () if run.allocation is not None else (Section("Limits", (), (_tol_table(run),), name="tol"),)
+        return ()
     moves = run.samples.moves
     rows: list[list[Cell]] = []
     for c, (name, spec) in enumerate(run.setup.test.compensators.items()):
@@ -384,8 +376,7 @@ def _compensator_sections(run: ToleranceRun) -> tuple[Section, ...]:
         rows.append([name, spec.motion, str(spec.range), str(spec.step or ""), str(spec.accuracy or ""), *size])
     heads = ("compensator", "motion", "range", "step", "accuracy", "std of moves", "largest move")
     table = Table("compensators", "Adjustments", "Over all cameras.", heads, rows)
-    tables = (table,) if run.allocation is not None else (table, _tol_table(run))
-    return (Section("Compensators", (), tables, name="compensators"),)
+    return (Section("Compensators", (), (table,), name="compensators"),)
 
 
 def _yield_figure(run: ToleranceRun) -> Figure:

@@ -17,7 +17,7 @@ from rich.console import Console
 from scenes.models.camera_sharpness import blur_warnings
 from scenes.specs.file_kinds import read_for
 from scenes.yaml.errors import key_text
-from twin.framework import cli, command, page, procedure, provenance, reference_frames, run_folder, svg
+from twin.framework import cli, command, page, procedure, provenance, record, run_folder, svg
 from twin.framework.artefact import Cell, SvgFigure, Table, plain, significant
 from twin.framework.record import Quantity, Record
 from twin.framework.report import Report, Section, answer
@@ -299,7 +299,7 @@ def _work(setup: StudySetup, session: procedure.Session) -> command.Result:
     notes = [f"{DOUBTFUL_TEXT}: {'; '.join(bad)}"] if bad else []
     warnings = (*blur_warnings(base, session.backend), *coarse_warnings(base), *notes)
     summary = {"verdict": verdict(gradient)[0], "warnings": list(warnings)}
-    numbers = reference_frames.described("gradient", {**GRADIENT(gradient), **summary})
+    numbers = record.described("gradient", {**GRADIENT(gradient), **summary})
     folder.write_text("config.yaml", setup.to_yaml())
     folder.write_json("gradient.json", numbers)
     folder.write_bytes("gradient.csv", _whole_table(gradient).content())

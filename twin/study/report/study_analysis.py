@@ -259,12 +259,9 @@ def convergences(values: np.ndarray) -> tuple[Convergence, ...]:
     n = len(values)
     if n < 20 or np.ptp(values) == 0.0:
         return ()
-    sigma, ordered = float(np.std(values, ddof=1)), np.sort(values)
-    intervals = {"mean": statistics.mean_interval(values), "sigma": statistics.std_interval(values)}
-    intervals |= {name: statistics.quantile_interval(ordered, q) for name, q in QUANTILES.items()}
-    out = []
-    for name, (low, high) in intervals.items():
-        relative = None if low is None or high is None else 0.5 * (high - low) / sigma
+    about, sigma, out = statistics.describe(values, True), float(np.std(values, ddof=1)), []
+    for name, estimate in zip(GOALS, (about.mean, about.std, about.p95, about.p997), strict=True):
+        relative = None if estimate is None or estimate.half_width is None else estimate.half_width / sigma
         enough = relative is not None and relative <= GOALS[name]
         needed = n if enough else None if relative is None else math.ceil(n * (relative / GOALS[name]) ** 2)
         if relative is None and name in QUANTILES:
@@ -361,13 +358,10 @@ class StudyAnalysis:
             model = self.linear[response]
             for effect in model.effects if model is not None else ():
                 # a swing over 90% of a text's values is some 3 sigma
-                size = effect.coefficient.value if effect.coefficient is not None else _swing_in_sigmas(effect, std)
+                share = effect.swing.value / (2.0 * std.value) if std is not None and std.value > 0.0 else 0.0
+                size = effect.coefficient.value if effect.coefficient is not None else share
                 out[effect.factor] = size**2
         return dict(sorted(out.items(), key=lambda item: -item[1]))
-
-
-def _swing_in_sigmas(effect: Any, std: Estimate | None) -> float:
-    return float(effect.swing.value) / (2.0 * std.value) if std is not None and std.value > 0.0 else 0.0
 
 
 def _finite(value: float | None) -> float | None:
