@@ -309,7 +309,7 @@ def test_a_search_without_a_layout_that_stands_is_refused(setup: MonitorDesignSe
     found = SimpleNamespace(layouts=(), refused={"dark": 2, "in the way": 7}, total=counts.__getitem__)
     monkeypatch.setattr(monitor_design, "LayoutBench", lambda *_: None)
     monkeypatch.setattr(monitor_design, "_check_start", lambda *_: None)
-    monkeypatch.setattr(monitor_design, "Search", lambda *_: SimpleNamespace(run=lambda: found))
+    monkeypatch.setattr(monitor_design, "search", lambda *_: found)
     with pytest.raises(
         BenchError, match=r"none of 5 beams and 4 layouts is feasible; most frequent reason \(7 times\): in the"
     ):

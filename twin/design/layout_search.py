@@ -653,8 +653,8 @@ def _answer(bench: LayoutBench, item: Any) -> Any:
         return slope_of(bench, item) if isinstance(item, LayoutNumber) else bench.try_layout(item)
 
 
-class Search:
-    """Search for layouts with all its starts.
+def search(bench: LayoutBench, workers: int, seed: int, journal: Path | None, advance: Advance) -> SearchResult:
+    """Search for layouts from the instrument and from random beams.
 
     Parameters
     ----------
@@ -669,27 +669,15 @@ class Search:
     advance : Advance
         Callback that reports progress.
     """
-
-    def __init__(self, bench: LayoutBench, workers: int, seed: int, journal: Path | None, advance: Advance) -> None:
-        self.bench, self.seed = bench, seed
-        store = journal_of(journal, f"{seed}\n{bench.setup.to_yaml()}")
-        self.workers = Workers(bench, workers, store, advance)
-
-    def run(self) -> SearchResult:
-        """Run the searches from the instrument and from random beams, and return their results."""
-        begun, setup = time.monotonic(), self.bench.setup
-        beams = start_beams(setup)
-        start = self.bench.judged(beams, self.bench.start, limited=False)
-        with self.workers as workers:
-            ends = [_SingleSearch(self.bench, workers.ask, self._rng(0), "").run(beams)]
-            for number in range(1, setup.test.search.starts + 1):
-                name = f"start {number}"
-                ends.append(_SingleSearch(self.bench, workers.ask, self._rng(number), name).run(()))
-        layouts = sorted((f for end in ends for f in end.layouts), key=lambda layout: merit(layout.sigmas, self.bench))
-        return SearchResult(start, tuple(layouts), tuple(ends), time.monotonic() - begun)
-
-    def _rng(self, number: int) -> np.random.Generator:
-        return np.random.default_rng(np.random.SeedSequence([self.seed, number]))
+    begun, beams = time.monotonic(), start_beams(bench.setup)
+    start, ends = bench.judged(beams, bench.start, limited=False), []
+    store = journal_of(journal, f"{seed}\n{bench.setup.to_yaml()}")
+    with Workers(bench, workers, store, advance) as processes:
+        for number in range(bench.setup.test.search.starts + 1):
+            rng, name = np.random.default_rng(np.random.SeedSequence([seed, number])), f"start {number}" * bool(number)
+            ends.append(_SingleSearch(bench, processes.ask, rng, name).run(() if number else beams))
+    layouts = sorted((f for end in ends for f in end.layouts), key=lambda layout: merit(layout.sigmas, bench))
+    return SearchResult(start, tuple(layouts), tuple(ends), time.monotonic() - begun)
 
 
 def _promise(candidate: Candidate) -> tuple[float, tuple[int, ...]]:
