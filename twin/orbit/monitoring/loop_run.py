@@ -31,8 +31,7 @@ from optics.numerics.number_tree import FrozenMap
 from scenes.specs.orbit.monitor import PARAMETERS
 from scenes.specs.orbit.scene import ControlSpec, LineImageSpec
 from scenes.specs.resolved import target_band
-from twin.framework.procedure import Advance, BenchError
-from twin.framework.random_streams import stream
+from twin.framework.procedure import Advance, BenchError, stream
 from twin.monitor.image_quality import image_quality
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.orbit.flight.line_camera import LineCamera, calibrated_line, corrected_line
