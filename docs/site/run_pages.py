@@ -21,8 +21,7 @@ from scenes.yaml.yaml_file import read_yaml
 from tests.golden.digest import sorts
 from tests.golden.golden import golden_file
 from tests.golden.jobs import ALL
-from twin.framework.record import Record
-from twin.framework.reference_frames import FRAMES
+from twin.framework.record import FRAMES, Record
 from twin.framework.run_folder import Manifest
 
 ROOT = Path(__file__).resolve().parents[2]

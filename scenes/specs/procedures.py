@@ -54,7 +54,7 @@ class Procedure:
     about : str
         Text of ``--help`` in Markdown; its first paragraph is shown in the list of subcommands.
     frames : Mapping[str, str]
-        Quantity of KIND.json -> its reference frame, where `twin.framework.reference_frames` has none.
+        Quantity of KIND.json -> its reference frame, where `twin.framework.record` has none.
     """
 
     kind: str

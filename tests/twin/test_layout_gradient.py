@@ -97,10 +97,8 @@ def agrees_with_rebuilt_layouts(bench: LayoutBench, number: LayoutNumber) -> Non
     for key in ("angle", "forward/d_f", "backward/d_f"):
         one, two = ((up.sigma(key) - down.sigma(key)) / (2.0 * k * h) for (up, down), k in ((near, 1.0), (far, 2.0)))
         plain, noise = (4.0 * one - two) / 3.0, 2e-9 * here.sigma(key) / h
-        value, error = slope.values[STATED_NAME][key], slope.errors[STATED_NAME][key]
-        assert abs(value - plain) <= 1e-5 * abs(plain) + noise + error, (number.name, key)
-        # what it says of itself is no excuse
-        assert error <= 1e-5 * abs(value) + noise, (number.name, key)
+        value = slope.values[STATED_NAME][key]
+        assert abs(value - plain) <= 1e-5 * abs(plain) + noise, (number.name, key)
 
 
 @pytest.mark.second
@@ -311,7 +309,7 @@ def test_a_search_without_a_layout_that_stands_is_refused(setup: MonitorDesignSe
     found = SimpleNamespace(layouts=(), refused={"dark": 2, "in the way": 7}, total=counts.__getitem__)
     monkeypatch.setattr(monitor_design, "LayoutBench", lambda *_: None)
     monkeypatch.setattr(monitor_design, "_check_start", lambda *_: None)
-    monkeypatch.setattr(monitor_design, "Search", lambda *_: SimpleNamespace(run=lambda: found))
+    monkeypatch.setattr(monitor_design, "search", lambda *_: found)
     with pytest.raises(
         BenchError, match=r"none of 5 beams and 4 layouts is feasible; most frequent reason \(7 times\): in the"
     ):

@@ -26,8 +26,7 @@ from twin.asbuilt.__main__ import app as asbuilt_app
 from twin.camera.first_order_data import obscuration
 from twin.framework.console import parser
 from twin.new import __main__ as program
-from twin.new.camera_numbers import CameraNumbers
-from twin.new.template_text import numbers_of
+from twin.new.camera_numbers import CameraNumbers, numbers_of
 from twin.operate.__main__ import app as operate_app
 from twin.render import app as render_app
 from twin.show import app as show_app

@@ -20,7 +20,7 @@ from scenes.specs.orbit.calibration import CameraDriftSpec
 from scenes.specs.orbit.flight import ThermalDriftSpec
 from scenes.specs.orbit.setup import CalibrationSetup
 from tests.twin.strip_prediction import predicted
-from twin.framework.random_streams import stream
+from twin.framework.procedure import stream
 from twin.orbit.calibration import campaign_adjustment
 from twin.orbit.calibration.calibration_numbers import CALIBRATION
 from twin.orbit.calibration.calibration_report import calibration_report

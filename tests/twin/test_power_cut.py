@@ -29,7 +29,7 @@ import pytest
 
 from tests.twin import record_bench, replacing
 from tests.twin.commands import invoke
-from twin.framework import owned_files
+from twin.framework import durable
 from twin.framework.journal import Journal
 from twin.framework.run_folder import KeptWork, RunFolder, RunFolderError, read_manifest, remove_run, write_manifest
 from twin.operate.__main__ import app
@@ -228,7 +228,7 @@ def check_run(base: Path, inputs: Path, steps: tuple[str, ...], again: bool) -> 
     if again:
         replacing.replace_run(target, "again", 1e-6)
         assert replacing.standing(target) == "again"
-        owned_files.sweep(target.parent, remove_run)
+        durable.sweep(target.parent, remove_run)
         assert [path.name for path in target.parent.iterdir()] == ["run"]
 
 
@@ -368,7 +368,7 @@ def second_command(scenario: str, base: Path) -> str:
         if scenario == "record":
             return invoke(app, "init", base / "record", "gf7_pair", "--simulated").stderr
         if scenario == "run":
-            owned_files.sweep(base / "runs", remove_run)
+            durable.sweep(base / "runs", remove_run)
         else:
             KeptWork(base / "out", "out", "samples", resume=True).begin()
     except RunFolderError as error:

@@ -18,7 +18,7 @@ import xarray as xr
 
 from tests.twin.study_bench import ROOT
 from twin.framework import durable, run_folder
-from twin.framework.owned_files import MANIFEST, PARTIAL, make_unfinished
+from twin.framework.durable import MANIFEST, PARTIAL, make_unfinished
 from twin.framework.provenance import versions
 from twin.framework.run_folder import KeptWork, Numbered, RunFolder, RunFolderError, is_run_folder
 
@@ -349,7 +349,7 @@ def kill_a_run(target: Path, act: str = "") -> None:
 @pytest.mark.second
 def test_what_a_killed_run_left_is_removed_by_the_next(tmp_path):
     kill_a_run(tmp_path / "other")
-    assert [path.suffix for path in tmp_path.iterdir()] == [f".{PARTIAL}"]
+    assert [path.suffix for path in tmp_path.iterdir()] == [PARTIAL]
     (tmp_path / ".mine.partial").mkdir()
     (tmp_path / ".mine.01234567.partial").touch()
     a_run(tmp_path / "run")
@@ -374,7 +374,7 @@ def test_a_run_that_has_changed_places_with_the_old_one(tmp_path):
     target = a_run(tmp_path / "run")
     act = "from twin.framework import run_folder as r; (folder.target / 'late.txt').write_text('mine'); "
     act += "r.write_manifest(folder, 'twin.test', 1.0, 1.0); "
-    act += "os.rename(folder.path / r._WAITING, folder.path / r.MANIFEST); r.replace_folder("
+    act += "os.rename(folder.path / r._WAITING, folder.path / r.MANIFEST); r.durable.replace_folder("
     kill_a_run(target, act + "folder.path, folder.target)")
     assert everything(target) == {"half.txt", MANIFEST}
     a_run(tmp_path / "other")

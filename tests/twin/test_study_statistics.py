@@ -4,7 +4,6 @@ import itertools
 import math
 import re
 from collections import Counter
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -15,9 +14,9 @@ from scenes.specs.study import ParetoSpec
 from tests.twin.study_bench import TEXTS
 from tests.twin.study_data import columns, dataset, study_of
 from twin.study.report import study_statistics as estimates
-from twin.study.report.conclusions import conclusions, warnings
 from twin.study.report.sensitivity_indices import NoIndices, axis_functions, sensitivity_indices
-from twin.study.report.study_analysis import STATISTICS, StudyAnalysis, pareto_front, ranks_of
+from twin.study.report.study_analysis import STATISTICS, StudyAnalysis, convergences, pareto_front, ranks_of
+from twin.study.report.study_report import main_factors, warnings
 from twin.study.report.study_statistics import linear_model
 from twin.study.runs.plan import quantiles
 
@@ -54,6 +53,7 @@ def test_ranks_by_the_binomial_distribution() -> None:
     low, high = estimates.quantile_interval(np.arange(100.0), 0.5)
     # textbook: for the median of 100 the 40th and the 61st value
     assert (low, high) == (39, 60)
+    assert estimates.runs_for_quantile(0.997) == 1228
     assert estimates.quantile_interval(np.arange(1227.0), 0.997)[1] is None
     assert estimates.quantile_interval(np.arange(1228.0), 0.997)[1] == 1227
     for met, count in ((0, 10), (3, 17), (10, 10), (500, 1000)):
@@ -193,9 +193,14 @@ def test_statistics_of_few_runs_are_those_of_scipy() -> None:
         assert np.log(found.std.interval) == pytest.approx(log, rel=1e-12)
         assert (found.low, found.high) == (values.min(), values.max())
         assert (found.median.value, found.p95.value) == pytest.approx(np.percentile(values, (50.0, 95.0)), rel=1e-12)
+        shape = found.normality
+        assert (shape is None) == (n < 20)
+    expected = (stats.skew(values), stats.kurtosis(values), stats.normaltest(values).pvalue)
+    assert (shape.skewness, shape.kurtosis, shape.p) == pytest.approx(expected, rel=1e-12)
     many = draws(40_000)
     found = estimates.describe(many, sampled=True)
-    assert found.p997.value == pytest.approx(np.percentile(many, 99.7), rel=1e-12)
+    places = np.percentile(many, (99.7, 0.135, 99.865))
+    assert (found.p997.value, *found.tails) == pytest.approx(places, rel=1e-12)
     ends = np.sqrt((len(many) - 1) / stats.chi2.ppf((0.975, 0.025), len(many) - 1)) * np.std(many, ddof=1)
     # a sample's kurtosis is 3 +- 0.025
     assert np.ptp(estimates.std_interval(many)) == pytest.approx(np.ptp(ends), rel=0.03)
@@ -309,7 +314,6 @@ def test_methods_that_disagree_are_said() -> None:
     assert wrong.check > 0.8
     assert wrong.agrees is False
     told = warnings(StudyAnalysis.of(runs))
-    assert [text.split()[0] for text in conclusions(StudyAnalysis.of(runs))] == ["y:"]
     assert any("of a by polynomial chaos and by RBD-FAST do not agree" in text for text in told)
     for seed in range(4):
         _, good = indices_of(lambda x: x["a"] * (1.0 + x["b"]) + 0.3 * x["c"], 100, seed)
@@ -321,8 +325,9 @@ def test_a_grid_is_taken_apart_exactly() -> None:
     study = study_of(factors, "{kind: grid}", STATED, report="{sobol: true}")
     x = columns(study)
     data = dataset(study, {"y": 3.0 * x["a"] + x["b"] + x["a"] * x["b"], "y_sigma_noise": 2.0 + x["b"]})
-    said = conclusions(StudyAnalysis.of(estimates.StudyRuns.of(data, study)))
-    assert [text.split()[0] for text in said] == ["y:", "y_sigma_noise:"]
+    analysis = StudyAnalysis.of(estimates.StudyRuns.of(data, study))
+    said = {r.name: main_factors(analysis, r) for r in analysis.runs.everything}
+    assert {name: text.split()[0] for name, text in said.items()} == {"y": "a", "y_sigma_noise": "b"}
     found = summary(data, study)["responses"]["y"]
     # variances of -1, 0, 1 and of -2 ... 2
     a, b = 9.0 * 2.0 / 3.0, 2.0
@@ -337,11 +342,15 @@ def test_a_grid_is_taken_apart_exactly() -> None:
     np.testing.assert_allclose(found["main_effects"][0]["means"], [-3.0, 0.0, 3.0], atol=1e-12)
 
 
+@pytest.mark.second
 def test_enough_runs() -> None:
-    """The mean to 0.1 sigma needs 384 normal runs, its 99.7 % quantile with both ends 1228."""
-    for count, few in ((200, True), (1200, True), (20_000, False)):
-        about = {"y": estimates.describe(draws(count), sampled=True)}
-        assert StudyAnalysis.few_runs(SimpleNamespace(descriptions=about), "y") is few
+    few, many = ({c.name: c for c in convergences(draws(n))} for n in (100, 20_000))
+    assert not few["mean"].enough
+    # 1.96/sqrt(n) = 0.1 needs 384 runs; Student's factor and the sample's sigma change it by a few percent
+    assert few["mean"].needed == pytest.approx(384, rel=0.05)
+    assert few["p99.7"].needed == 1228
+    assert all(course.enough for course in many.values())
+    assert convergences(np.ones(50)) == ()
 
 
 def test_requirements_count_runs_with_numbers() -> None:

@@ -22,7 +22,7 @@ from twin.compare.__main__ import app as compare_app
 from twin.compare.folder_difference import file_difference
 from twin.compare.verification import DIFFERENT, EXCLUDED, GONE, NEW, ROUNDED, SAME, file_state, folder_state, obstacle
 from twin.framework.data_files import FrameFacts, netcdf, preview_png, tiff
-from twin.framework.owned_files import MANIFEST
+from twin.framework.durable import MANIFEST
 from twin.framework.run_folder import RunFolder, write_manifest
 from twin.study.runs.base_job import BlockResult
 from twin.study.runs.blocks import BLOCKS, Engine, journal_of

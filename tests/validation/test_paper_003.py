@@ -24,7 +24,7 @@ from analysis.orbit import calibration_parameters, forward_intersection
 from analysis.orbit.forward_intersection import CheckErrors
 from optics.numerics.backend import load_backend
 from tests.validation.mutated import break_it, with_fields
-from twin.framework.random_streams import stream
+from twin.framework.procedure import stream
 from twin.orbit.calibration import schemes as calibration_schemes
 from twin.orbit.calibration.campaign_adjustment import calibrated_alone
 from twin.validation import registry

@@ -23,8 +23,7 @@ from twin.asbuilt.asbuilt_bench import AsBuiltBench, nan_where_lost, selected_mo
 from twin.asbuilt.next_step import Advice, advice
 from twin.asbuilt.star_images import STAR, StarResidual
 from twin.framework.memory import Lowered, require_memory
-from twin.framework.procedure import Advance, silent
-from twin.framework.random_streams import stream
+from twin.framework.procedure import Advance, silent, stream
 from twin.framework.record import Quantity, Record
 from twin.tolerance.monitor_merit import Merit, merit_unit, shown_merit
 

@@ -13,7 +13,7 @@ from optics.geometry import zernike
 from optics.numerics.array_math import check_at_most, check_close, check_range
 from scenes.yaml.errors import Problem
 from scenes.yaml.units import ANGLE, Kind, parse_quantity, split_row
-from twin.framework.reference_frames import frames_text
+from twin.framework.record import frames_text
 
 if TYPE_CHECKING:  # takes half a second with pandas, and only who asks for a data set needs it
     import xarray as xr

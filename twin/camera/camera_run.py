@@ -36,8 +36,7 @@ from twin.camera.colour import COLOURS, Colours, colour_data, evaluate_colours
 from twin.camera.first_order_data import FIRST_ORDER, FirstOrderData, first_order_data
 from twin.camera.refocus import Refocus, find_focus, refocused_state
 from twin.framework.procedure import Advance, silent
-from twin.framework.record import Quantity, Record
-from twin.framework.reference_frames import frames_text
+from twin.framework.record import Quantity, Record, frames_text
 from twin.monitor.image_quality import CameraQuality, image_quality
 from twin.monitor.truth import trace_truth
 

@@ -16,13 +16,11 @@ from scenes.yaml.units import split_quantity, unit_ratio
 from scenes.yaml.yaml_file import read_yaml
 from twin.compare import folder_difference as difference
 from twin.compare.folder_difference import NOISE, ArrayDifference, Leaf, NumberDifference, is_sigma
-from twin.framework.artefact import Artefact, Cell, PngFigure, SvgFigure, Table, plain, significant
+from twin.framework.artefact import Artefact, Cell, PngFigure, Table, plain, significant
 from twin.framework.report import Report, Section, answer
 from twin.framework.run_folder import Manifest, finished_manifest
-from twin.framework.svg import BLUE, GREY, look, new_figure, plain_axes, signed_map, to_png, to_svg
+from twin.framework.svg import look, new_figure, signed_map, to_png
 
-MOST_BARS = 30
-"""Largest number of changes in the bar chart, which shows the most significant ones."""
 _MOST_IMAGES = 8
 """Largest number of differing images that the report shows."""
 
@@ -100,16 +98,16 @@ def _artefacts(reference: Run, run: Run, diff: Differences, names: tuple[str, st
     """
     out: list[Artefact] = []
     if diff.inputs:
-        rows: list[list[Cell]] = [[_text(value) for value in entry.values()] for entry in diff.inputs]
+        rows: list[list[Cell]] = [
+            ["\N{EM DASH}" if value is None else str(value) for value in entry.values()] for entry in diff.inputs
+        ]
         out.append(Table(f"inputs-{k}", "Inputs", "Keys of config.yaml.", ("key", *names), rows))
-    figure = _changes(diff, names, k)
-    if figure is not None:
-        out.append(figure)
     if diff.numbers:
         rows = [
-            [n.file, n.key, _value(n.reference), _value(n.other), n.difference, n.sigma, n.sigma_of, n.in_sigma]
-            for n in sorted(diff.numbers, key=lambda entry: entry.file != "truth.json")
+            [n.file, n.key, *values, n.difference, n.sigma, n.sigma_of, n.in_sigma]
+            for n in sorted(diff.numbers, key=lambda entry: (entry.file != "truth.json", -abs(entry.in_sigma or 0.0)))
             if not is_sigma(n.key)
+            for values in [[str(v) if isinstance(v, bool) else v for v in (n.reference, n.other)]]
         ]
         columns = ("file", "key", *names, "difference", "sigma", "sigma from", "in sigma")
         about = "The keys end in their units. Sigma is that of the difference of two independent measurements: from "
@@ -126,45 +124,10 @@ def _artefacts(reference: Run, run: Run, diff: Differences, names: tuple[str, st
     return tuple(out)
 
 
-def _text(value: Leaf) -> str:
-    """Return the value of an input key as text for a table."""
-    return "\N{EM DASH}" if value is None else str(value)
-
-
-def _value(value: Leaf) -> Cell:
-    """Return a value of a result as a cell of a table."""
-    return str(value) if isinstance(value, bool) else value
-
-
 def _shape(array: ArrayDifference) -> str:
     """Return the shapes of the arrays of both runs as text."""
     here, there = ("none" if s is None else " x ".join(map(str, s)) for s in (array.shape, array.other_shape))
     return here if here == there else f"{here}, {there}"
-
-
-def _changes(diff: Differences, names: tuple[str, str], k: int) -> SvgFigure | None:
-    """Return a bar chart of the most significant changes of results, in sigmas; None if no number has a sigma."""
-    with_sigma = [number for number in diff.numbers if number.in_sigma is not None]
-    chosen = sorted(with_sigma, key=lambda number: -abs(number.in_sigma or 0.0))[:MOST_BARS]
-    if not chosen:
-        return None
-    with look(f"changes-{k}"):
-        figure = new_figure(0.9 + 0.19 * len(chosen))
-        axes = figure.subplots()
-        heights = np.arange(len(chosen))[::-1]
-        axes.barh(heights, [number.in_sigma or 0.0 for number in chosen], color=BLUE, height=0.6)
-        axes.axvline(0.0, color=GREY, lw=0.7)
-        axes.set_xscale("symlog", linthresh=10.0)
-        axes.set_yticks(heights, [number.key for number in chosen])
-        axes.set_xlabel("change in sigma, logarithmic beyond 10")
-        axes.margins(y=0.02)
-        plain_axes(axes)
-        drawn = to_svg(figure)
-    caption = f"{names[1]} minus {names[0]}, divided by the sigma of the difference of two independent measurements "
-    caption += "(from image noise if the runs state it)."
-    if len(with_sigma) > len(chosen):
-        caption += f" The {len(chosen)} largest of {len(with_sigma)}."
-    return SvgFigure(f"changes-{k}", "Results that have a sigma", caption, drawn)
 
 
 def _pictures(reference: Run, run: Run, diff: Differences, names: tuple[str, str], k: int) -> list[Artefact]:
@@ -323,7 +286,7 @@ def differences(reference: Run, other: Run, rtol: float, sigmas: float | None) -
     for name in (*results, *images):
         diff = difference.file_difference(name, reference.file(name), other.file(name))
         count += diff.common_arrays
-        arrays += [array for array in diff.arrays if not _same_array(array, rtol)]
+        arrays += [a for a in diff.arrays if not a.finite or (a.largest or 0.0) > rtol * (a.peak or 0.0)]
         if name in results:
             count += diff.common_numbers
             numbers += [number for number in diff.numbers if not _same_number(number, rtol, sigmas)]
@@ -355,11 +318,6 @@ def _same_number(number: NumberDifference, rtol: float, sigmas: float | None) ->
     if math.isclose(float(number.reference or 0), float(number.other or 0), rel_tol=rtol):
         return True
     return sigmas is not None and number.sigma is not None and abs(number.difference) <= sigmas * number.sigma
-
-
-def _same_array(array: ArrayDifference, rtol: float) -> bool:
-    """Return whether two arrays differ by at most ``rtol`` times the largest absolute value of the reference."""
-    return array.finite and (array.largest or 0.0) <= rtol * (array.peak or 0.0)
 
 
 @dataclass(frozen=True, eq=False)

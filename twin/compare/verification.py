@@ -21,7 +21,7 @@ from scenes.yaml.errors import InputError, Issue
 from twin.compare import folder_difference as difference
 from twin.compare.folder_difference import ArrayDifference, FileDifference, Leaf, NumberDifference
 from twin.framework import provenance, report, run_folder
-from twin.framework.owned_files import MANIFEST, PARTIAL, digest, files_below, first_names
+from twin.framework.durable import MANIFEST, PARTIAL, digest, files_below, first_names
 from twin.framework.provenance import Provenance
 from twin.framework.run_folder import Manifest
 from twin.monitor.calibration_cache import recomputed
@@ -120,7 +120,7 @@ def _manifest(folder: Path) -> Manifest:
     if manifest is not None:
         return manifest
     remedy = "the folder of a finished run, as a command of the twin leaves it"
-    broken = folder.name.startswith(".") and folder.name.endswith(f".{PARTIAL}")
+    broken = folder.name.startswith(".") and folder.name.endswith(PARTIAL)
     if not folder.is_dir():
         issue = Issue("is not a folder" if folder.exists() else "no such folder", str(folder), allowed=remedy)
     elif (folder / MANIFEST).exists():

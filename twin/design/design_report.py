@@ -12,7 +12,7 @@ from scenes.models.camera_design import prescription_of
 from twin.design.design_run import DESIGN, DesignRun, difference_text, verdict
 from twin.framework.artefact import CameraFile, SvgFigure, Table
 from twin.framework.report import Report, Section, answer
-from twin.framework.svg import BLUE, GREY, INK, ORANGE, look, new_figure, plain_axes, to_svg
+from twin.framework.svg import GREY, INK, ORANGE, look, new_figure, plain_axes, to_svg
 
 
 def design_report(run: DesignRun) -> Report:
@@ -71,14 +71,13 @@ def design_report(run: DesignRun) -> Report:
     )
     with look("design"):
         layout = to_svg(_layout_figure(design, prescription_of(setup.camera)))
-        errors = to_svg(_error_figure(design))
     sections = (
         Section(
             "Layout",
             ("Chief ray and edges of the beam of the middle of the field, in the plane of symmetry.",),
             (SvgFigure("layout", "Before and after", "To the same scale.", layout), passages),
         ),
-        Section("Image quality", (), (SvgFigure("errors", "Wavefront error over the field", "", errors), by_field)),
+        Section("Image quality", (), (by_field,)),
         Section(
             "Prescription",
             (f"{design.evaluations} Jacobians were traced. The camera's file can be used as it is.",),
@@ -124,9 +123,6 @@ def _numbers(before: Evaluation, after: Evaluation) -> list[list[str | float]]:
     ]
 
 
-_BEFORE, _AFTER = GREY, BLUE
-
-
 def _layout_figure(design: Design, start: Prescription) -> Figure:
     """Plot the beams in the plane of symmetry, before and after, to the same scale."""
     figure = new_figure(4.4)
@@ -162,20 +158,3 @@ def _layout(axes: Axes, design: Design, prescription: Prescription) -> None:
 def _edges(hits: np.ndarray) -> tuple[int, int]:
     """Return the indices of the rays of a beam with the smallest and the largest y, from N hits (x, y), (N, 2)."""
     return int(np.argmin(hits[:, 0])), int(np.argmax(hits[:, 0]))
-
-
-def _error_figure(design: Design) -> Figure:
-    """Plot the wavefront error of every field, before and after."""
-    figure = new_figure(2.9)
-    axes = figure.subplots()
-    fields = np.degrees(design.merit.beams.fields)
-    at = np.arange(len(fields))
-    axes.bar(at - 0.2, design.before.errors, 0.38, color=_BEFORE, label="before")
-    axes.bar(at + 0.2, design.after.errors, 0.38, color=_AFTER, label="after")
-    axes.set_xticks(at, [f"{x:.2f}, {y:+.2f}" for x, y in fields])
-    axes.set_xlabel("field x, y, degrees")
-    axes.set_ylabel("waves rms")
-    axes.legend(frameon=False, ncols=2, loc="upper left")
-    axes.set_ylim(0.0, 1.25 * float(max(design.before.errors.max(), design.after.errors.max())))
-    plain_axes(axes)
-    return figure

@@ -135,7 +135,9 @@ def refined(
     for _ in range(steps):
         current = path[-1]
         slopes = ask(f"{part}: slopes", [replace(number, beams=current.beams) for number in numbers])
-        slopes = [slope for slope in slopes if not slope.refused and _benefit(bench, current, slope) > LEAST_BENEFIT]
+        least = LEAST_BENEFIT * _largest(current, bench)
+        feasible = [slope for slope in slopes if not slope.refused]
+        slopes = [slope for slope in feasible if np.max(np.abs(_slopes_of(bench, current, slope))) > least]
         if not slopes:
             break
         # parameters without effect on any goal here have none a step away either
@@ -180,11 +182,6 @@ def _slopes_of(bench: LayoutBench, facts: LayoutFacts, slope: Slope) -> np.ndarr
         value = slope.values[name].get(key, 0.0)
         out.append(value * (high - low) / goal[key.rpartition("/")[2]])
     return np.array(out)
-
-
-def _benefit(bench: LayoutBench, facts: LayoutFacts, slope: Slope) -> float:
-    """Return the largest change of a ratio of sigma to goal over a parameter's range, relative to the largest ratio."""
-    return float(np.max(np.abs(_slopes_of(bench, facts, slope)))) / _largest(facts, bench)
 
 
 def _step(bench: LayoutBench, facts: LayoutFacts, slopes: Sequence[Slope], box: float) -> tuple[np.ndarray, float]:
@@ -259,14 +256,6 @@ _WEIGHTS = {2: {1: 1.0 / 2.0}, 4: {1: 8.0 / 12.0, 2: -1.0 / 12.0}, 6: {1: 45.0 /
 
 The weights are those of Fornberg, Math. Comp. 51, 699, 1988.
 """
-_JUMP = {4: {1: 4.0 / 3.0, 2: -1.0 / 3.0}, 6: {1: 1.5, 2: -0.6, 3: 0.1}}
-"""Order -> number k of steps -> weight of the second difference f(k h) + f(-k h) - 2 f(0), to detect jumps of f.
-
-f is a function of a layout parameter and h the step. The weighted sum is extrapolated by even powers of h and tends to
-zero for a smooth f. If f has a jump J anywhere within the steps, the sum keeps a part of J that, divided by h, is an
-upper limit for the effect of J on the central difference. For order 6 the part and the effect (times h) are J and 0.62
-J for a jump within the first step, J/2 and 0.13 J within the second, J/10 and 0.02 J within the third.
-"""
 
 
 @dataclass(frozen=True)
@@ -317,8 +306,6 @@ class Slope:
         Reason why they cannot be computed, empty if they can; the other attributes are then empty.
     values : dict
         Disturbances -> quantity -> d(sigma)/d(parameter), SI units.
-    errors : dict
-        Numerical error of each derivative, in the same form; empty for differences of second order.
     brightest : (C,) ndarray
         Derivatives, per SI unit, of the signal of the brightest pixel of each of C spots as a fraction of its capacity.
     """
@@ -326,7 +313,6 @@ class Slope:
     number: LayoutNumber
     refused: str = ""
     values: Mapping[str, Mapping[str, float]] = field(default_factory=FrozenMap)
-    errors: Mapping[str, Mapping[str, float]] = field(default_factory=FrozenMap)
     brightest: np.ndarray = field(default_factory=lambda: np.zeros(0))
 
 
@@ -385,32 +371,21 @@ def slope_of(bench: LayoutBench, number: LayoutNumber) -> Slope:
         Parameter of a layout.
     """
     low, high = ranges(bench.setup)[number.name]
-    step, high_order, low_order = STEP * (high - low), _WEIGHTS[number.order], _WEIGHTS.get(number.order - 2, {})
+    step = STEP * (high - low)
     try:
         centre = _known_here(bench, number.beams)
-        best, lower, jump = ({name: _Sum.none(info) for name, info in centre.items()} for _ in range(3))
-        jumps = _JUMP.get(number.order, {})
-        for name, info in centre.items():
-            jump[name].add(-2.0 * sum(jumps.values()) / step, info)
-        for k, weight in high_order.items():
+        sums = {name: _Sum.none(info) for name, info in centre.items()}
+        for k, weight in _WEIGHTS[number.order].items():
             for sign in (1.0, -1.0):
                 for name, info in known_of(bench, number.moved(bench, sign * k * step)).items():
-                    best[name].add(sign * weight / step, info)
-                    lower[name].add(sign * low_order.get(k, 0.0) / step, info)
-                    jump[name].add(jumps.get(k, 0.0) / step, info)
+                    sums[name].add(sign * weight / step, info)
     except (InputError, AimError, BeamMissedError, ValueError) as error:
         return Slope(number, refused=str(error))
-    values: dict[str, dict[str, float]] = {}
-    errors: dict[str, dict[str, float]] = {}
-    for name, info in centre.items():
-        slopes = {key: info.slopes(key) for key in info.quantities if info.sigma(key) > 0.0}
-        values[name] = {key: best[name].along(*slope) for key, slope in slopes.items()}
-        if low_order:
-            errors[name] = {
-                key: abs(values[name][key] - lower[name].along(*slope)) + abs(jump[name].along(*slope))
-                for key, slope in slopes.items()
-            }
-    return Slope(number, values=values, errors=errors, brightest=next(iter(best.values())).brightest)
+    values = {
+        name: {key: sums[name].along(*info.slopes(key)) for key in info.quantities if info.sigma(key) > 0.0}
+        for name, info in centre.items()
+    }
+    return Slope(number, values=values, brightest=next(iter(sums.values())).brightest)
 
 
 @dataclass(eq=False)
@@ -678,8 +653,8 @@ def _answer(bench: LayoutBench, item: Any) -> Any:
         return slope_of(bench, item) if isinstance(item, LayoutNumber) else bench.try_layout(item)
 
 
-class Search:
-    """Search for layouts with all its starts.
+def search(bench: LayoutBench, workers: int, seed: int, journal: Path | None, advance: Advance) -> SearchResult:
+    """Search for layouts from the instrument and from random beams.
 
     Parameters
     ----------
@@ -694,27 +669,15 @@ class Search:
     advance : Advance
         Callback that reports progress.
     """
-
-    def __init__(self, bench: LayoutBench, workers: int, seed: int, journal: Path | None, advance: Advance) -> None:
-        self.bench, self.seed = bench, seed
-        store = journal_of(journal, f"{seed}\n{bench.setup.to_yaml()}")
-        self.workers = Workers(bench, workers, store, advance)
-
-    def run(self) -> SearchResult:
-        """Run the searches from the instrument and from random beams, and return their results."""
-        begun, setup = time.monotonic(), self.bench.setup
-        beams = start_beams(setup)
-        start = self.bench.judged(beams, self.bench.start, limited=False)
-        with self.workers as workers:
-            ends = [_SingleSearch(self.bench, workers.ask, self._rng(0), "").run(beams)]
-            for number in range(1, setup.test.search.starts + 1):
-                name = f"start {number}"
-                ends.append(_SingleSearch(self.bench, workers.ask, self._rng(number), name).run(()))
-        layouts = sorted((f for end in ends for f in end.layouts), key=lambda layout: merit(layout.sigmas, self.bench))
-        return SearchResult(start, tuple(layouts), tuple(ends), time.monotonic() - begun)
-
-    def _rng(self, number: int) -> np.random.Generator:
-        return np.random.default_rng(np.random.SeedSequence([self.seed, number]))
+    begun, beams = time.monotonic(), start_beams(bench.setup)
+    start, ends = bench.judged(beams, bench.start, limited=False), []
+    store = journal_of(journal, f"{seed}\n{bench.setup.to_yaml()}")
+    with Workers(bench, workers, store, advance) as processes:
+        for number in range(bench.setup.test.search.starts + 1):
+            rng, name = np.random.default_rng(np.random.SeedSequence([seed, number])), f"start {number}" * bool(number)
+            ends.append(_SingleSearch(bench, processes.ask, rng, name).run(() if number else beams))
+    layouts = sorted((f for end in ends for f in end.layouts), key=lambda layout: merit(layout.sigmas, bench))
+    return SearchResult(start, tuple(layouts), tuple(ends), time.monotonic() - begun)
 
 
 def _promise(candidate: Candidate) -> tuple[float, tuple[int, ...]]:
@@ -863,7 +826,7 @@ class _SingleSearch:
             feasible = (
                 candidate
                 for candidate in promising
-                if candidate.beams in self.built or self._is_possible(candidate.beams)
+                if candidate.beams in self.built or (self._within(candidate.beams) and self._fits(candidate.beams))
             )
             level = [*islice(feasible, width + len(self.built))]
             levels.append(level)
@@ -883,9 +846,6 @@ class _SingleSearch:
                         )
             self.compared[beams] = worst
         return Candidate(beams, self.compared[beams])
-
-    def _is_possible(self, beams: Sequence[int]) -> bool:
-        return self._within(beams) and self._fits(beams)
 
     def _alike(self, beams: Sequence[int]) -> bool:
         """Return True if all beams have the same kinds of reflectors and the same area CCD.

@@ -17,7 +17,7 @@ from scenes.specs.instrument import InstrumentSpec, channel_of, prism_of
 from scenes.specs.job import JobSpec
 from scenes.specs.resolved import ResolvedJob
 from twin.design.layout_bench import LayoutBench, LayoutFacts
-from twin.design.layout_search import Search, SearchResult, merit, optima
+from twin.design.layout_search import SearchResult, merit, optima, search
 from twin.framework.procedure import Advance, BenchError, silent
 from twin.framework.record import Quantity, Record
 from twin.monitor.monitor_experiment import MonitorExperiment
@@ -121,7 +121,7 @@ def run_monitor_design(
     """
     bench = LayoutBench(setup, backend)
     _check_start(setup, backend, seed, advance)
-    results = Search(bench, workers, seed, journal, advance).run()
+    results = search(bench, workers, seed, journal, advance)
     if not results.layouts:
         most = max(results.refused.items(), key=lambda item: item[1], default=("", 0))
         text = f"none of {results.total('tried')} beams and {results.total('built')} layouts is feasible"

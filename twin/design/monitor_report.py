@@ -3,7 +3,6 @@
 from math import sqrt
 
 import numpy as np
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle
 
@@ -18,9 +17,6 @@ from twin.framework.svg import BLUE, GREY, INK, LIGHT, ORANGE, SKY, VERMILION, l
 from twin.main_job.light_path_plots import side_view_svg
 from twin.pictures.light_paths import trace_light_paths
 from twin.sensors.area_detector import coarse_warnings
-
-_MOST_CAUSES = 6
-"""Largest number of causes in one panel of the bar chart."""
 
 
 def monitor_design_report(run: MonitorDesignRun) -> Report:
@@ -41,13 +37,12 @@ def monitor_design_report(run: MonitorDesignRun) -> Report:
     best = run.points[0]
     with look("layouts"):
         front = SvgFigure("front", "Sigma against cost", _FRONT, to_svg(_front_figure(run)))
-        causes = SvgFigure("causes", "What limits them", _CAUSES, to_svg(_cause_figure(run)))
         pupils = SvgFigure("pupils", "Beams in the entrance pupil", _PUPILS, to_svg(_pupil_figure(run)))
     drawings = tuple(_drawing(run, point) for point in run.points[:2])
+    remarks = (_search_text(run), *([starts_text(run)] if len(results.ends) > 1 else []))
     sections = (
-        Section("The front", (_search_text(run),), (front, _beams_table(run))),
-        *([Section("Several starts", (starts_text(run),), (_starts_table(run),))] if len(results.ends) > 1 else []),
-        Section("Limiting causes", (), (causes, *(_cause_table(run, name) for name in setup.disturbances))),
+        Section("The front", remarks, (front, _beams_table(run))),
+        Section("Limiting causes", (), tuple(_cause_table(run, name) for name in setup.disturbances)),
         Section("The layouts", (), (pupils, *drawings)),
         Section(
             "The instruments",
@@ -70,8 +65,6 @@ _FRONT = (
     "three."
 )
 """Caption of the figure of accuracy against obstructed pupil fraction and mass."""
-_CAUSES = "Standard deviations by cause: without measurement, with the start and with the best layout."
-"""Caption of the figure of the contributions of causes to the standard deviations."""
 _PUPILS = "Seen along the light into the first camera; X points toward the central prism. Filled: left; open: right."
 """Caption of the figure of the beams' positions in the pupil."""
 
@@ -96,12 +89,7 @@ def _search_text(run: MonitorDesignRun) -> str:
             + "; ".join(f"{reason} ({count})" for reason, count in refused)
             + "."
         )
-    first = results.ends[0]
-    steps = ", ".join(f"{value:.3g}" for value in first.progress)
-    text += f" The best ratio to the goal after the first draw and after each round: {steps}"
-    if first.refined:
-        text += "; then by gradients: " + ", ".join(f"{value:.4g}" for value in first.refined)
-    return f"{text}."
+    return text
 
 
 def starts_text(run: MonitorDesignRun) -> str:
@@ -121,20 +109,6 @@ def starts_text(run: MonitorDesignRun) -> str:
             "are several optima, or the searches were too short to converge"
         )
     return f"{text}; {infeasible} found no feasible layout." if infeasible else f"{text}."
-
-
-def _starts_table(run: MonitorDesignRun) -> Table:
-    rows: list[list[Cell]] = []
-    for end in run.results.ends:
-        if not end.layouts:
-            rows.append([end.name, 0, *[float("nan")] * 3, ""])
-            continue
-        best, ratio = end.layouts[0], end.progress[-1]
-        through = "; ".join(f"{1e3 * beam.pupil_x:.0f}, {1e3 * beam.pupil_y:.0f}" for beam in best.beams)
-        rows.append([end.name, len(best.beams), ratio, run.merit(best), 100.0 * best.pupil_share, through])
-    heads = ("from", "beams per end", "σ / goal before gradients", "σ / goal", "pupil [%]", "pupil x, y [mm]")
-    decimals = (None, None, 4, 4, 1, None)
-    return Table("starts", "Results of all starts", "The best layout of every search.", heads, rows, decimals)
 
 
 def _beams_table(run: MonitorDesignRun) -> Table:
@@ -217,47 +191,6 @@ def _front_figure(run: MonitorDesignRun) -> Figure:
     )
     left.set_ylabel("worst σ relative to the goal")
     return figure
-
-
-def _cause_figure(run: MonitorDesignRun) -> Figure:
-    """Plot the contributions of causes to the standard deviations, one panel per goal.
-
-    They are shown without measurement, with the starting layout, and with the best layout.
-    """
-    goals = tuple(run.setup.test.goal.wanted)
-    figure = new_figure(3.4)
-    panels = figure.subplots(1, len(goals), squeeze=False)[0]
-    for axes, goal in zip(panels, goals, strict=True):
-        _cause_bars(axes, run, goal)
-    handles, labels = panels[0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside upper center", ncols=3)
-    return figure
-
-
-def _cause_bars(axes: Axes, run: MonitorDesignRun, goal: str) -> None:
-    best = run.points[0].facts
-    name = max(
-        best.sigmas, key=lambda disturbances: max(best.sigmas[disturbances][key] for key in run.bench.goals_of(goal))
-    )
-    columns = [
-        ("unmeasured", LIGHT, _causes_of(run, run.results.start, name, goal, False)),
-        (run.setup.instrument.name, SKY, _causes_of(run, run.results.start, name, goal, True)),
-        (run.points[0].name, VERMILION, _causes_of(run, best, name, goal, True)),
-    ]
-    size = {c: max(col.get(c, 0.0) for _, _, col in columns[1:]) for _, _, col in columns for c in col}
-    causes = sorted(size, key=lambda cause: -size[cause])[:_MOST_CAUSES]
-    y = np.arange(len(causes))
-    for k, (label, colour, column) in enumerate(columns):
-        axes.barh(y + 0.27 * (k - 1), [column.get(c, 0.0) for c in causes], 0.25, color=colour, label=label, ec="none")
-    axes.set_yticks(y, [cause.replace("_", " ") for cause in causes])
-    axes.invert_yaxis()
-    values = [column.get(c, 0.0) for _, _, column in columns for c in causes]
-    top = max(values)
-    axes.set(xscale="log", xlim=(max(min((v for v in values if v > 0.0), default=top), 1e-4 * top) / 2, 2.0 * top))
-    axes.set_xlabel(f"{GOAL_NAMES[goal]}, σ [{unit_for_reports(UNITS[goal][0])}] ({name})")
-    axes.grid(axis="x", color=LIGHT, lw=0.4)
-    axes.set_axisbelow(True)
-    plain_axes(axes)
 
 
 def _pupil_figure(run: MonitorDesignRun) -> Figure:

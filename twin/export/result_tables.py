@@ -22,7 +22,7 @@ from optics.numerics.number_tree import FrozenMap
 from scenes.specs.study import unit_of
 from scenes.yaml.input_file import read_json
 from twin.framework.data_files import DataColumn, DataTable
-from twin.framework.owned_files import MANIFEST
+from twin.framework.durable import MANIFEST
 
 POINTS = "artefacts/points.csv"
 NUMBERS = "numbers"

@@ -17,7 +17,6 @@ import typer
 from rich import box, progress
 from rich.console import Console
 from rich.table import Table
-from rich.text import Text
 from typer.core import TyperGroup
 
 from optics.numerics.backend import NAMES
@@ -169,7 +168,7 @@ def end_strictly(errors: Console, numbers: Any) -> None:
     typer.Exit
         A verdict is negative, see `twin.framework.provenance.negative_verdicts`.
     """
-    from twin.framework.owned_files import first_names
+    from twin.framework.durable import first_names
     from twin.framework.provenance import negative_verdicts
 
     if negative := negative_verdicts(numbers):
@@ -380,24 +379,6 @@ def time_text(seconds: float | None) -> str:
     return f"{seconds / 60.0:.0f} min" if seconds < 7200.0 else f"{seconds / 3600.0:.1f} h"
 
 
-class FallingTime(progress.TimeRemainingColumn):
-    """Remaining time of a task, which stays at its shortest estimate where the work becomes slower."""
-
-    def __init__(self) -> None:
-        """Begin without an estimate of any task."""
-        super().__init__()
-        self._shortest: dict[tuple[int, float | None], float] = {}
-
-    def render(self, task: progress.Task) -> Text:
-        """Return the remaining time as text."""
-        if task.time_remaining is None or task.total is None:
-            return super().render(task)
-        key = task.id, task.total
-        shown = self._shortest[key] = min(self._shortest.get(key, math.inf), task.time_remaining)
-        hours, minutes = divmod(int(shown) // 60, 60)
-        return Text(f"{hours}:{minutes:02d}:{int(shown) % 60:02d}", style="progress.remaining")
-
-
 def progress_columns(width: int) -> tuple[progress.ProgressColumn, ...]:
     """Return the columns of a progress display: description of ``width`` letters, bar, elapsed and remaining time."""
     return (
@@ -406,7 +387,7 @@ def progress_columns(width: int) -> tuple[progress.ProgressColumn, ...]:
         progress.BarColumn(),
         progress.TimeElapsedColumn(),
         progress.TextColumn("left"),
-        FallingTime(),
+        progress.TimeRemainingColumn(),
     )
 
 

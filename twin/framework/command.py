@@ -21,7 +21,7 @@ from scenes.specs.file_kinds import read_for
 from scenes.specs.procedures import PROCEDURES
 from scenes.yaml.standard_output import FAILURE, Terminal, print_error, print_json, to_stdout
 from twin.framework import cli, durable
-from twin.framework.owned_files import first_names
+from twin.framework.durable import first_names
 from twin.framework.procedure import Advance, Session, performed, seeded
 
 if TYPE_CHECKING:
@@ -67,16 +67,14 @@ def finished(session: Session, kind: str, report: Report, numbers: Mapping[str, 
     facts : Any
         Fields of `twin.framework.page.RunFacts` beside those known from the session.
     """
-    from twin.framework import reference_frames
+    from twin.framework import record
     from twin.framework.page import RunFacts, write_test
 
     complete = report.with_verdict(numbers)
     known = {"started": session.started, "seconds": session.seconds, "backend": session.backend.name}
     known["checks"] = report.checks
     write_test(kind, complete, report, RunFacts(**{**known, **facts}), session.folder)
-    return Result(
-        reference_frames.described(kind, complete), lambda console: print_report(report, console), code=report.code
-    )
+    return Result(record.described(kind, complete), lambda console: print_report(report, console), code=report.code)
 
 
 Setup = TypeVar("Setup")
@@ -289,15 +287,14 @@ def run_test(
         shown, numbers = with_warnings(made, input_warnings), procedure.numbers(run)
         facts |= {"program": program, "command": command, "options": words}
         result = replace(finished(session, procedure.kind, shown, numbers, **facts), problem=problem)
-        return replace(result, show=partial(_show_with, result.show, exported)) if exported else result
+
+        def show(console: Console) -> None:
+            result.show(console)
+            console.print(exported, markup=False, highlight=False, soft_wrap=True)
+
+        return replace(result, show=show) if exported else result
 
     run_command(file.stem, options, read or partial(read_for, called, file, procedure.resolve), work, storage)
-
-
-def _show_with(show: Callable[[Console], None], exported: str, console: Console) -> None:
-    """Print a result and the line that names the exported files."""
-    show(console)
-    console.print(exported, markup=False, highlight=False, soft_wrap=True)
 
 
 def _export_folder(setup: Any, target: Path, force: bool) -> RunFolder:

@@ -15,7 +15,7 @@ from typing import Any, BinaryIO
 import numpy as np
 
 from optics.numerics.number_tree import FrozenMap
-from twin.framework import durable, owned_files, provenance
+from twin.framework import durable, provenance
 from twin.framework.run_folder import RunFolderError, reason
 
 UNREADABLE = (ValueError, KeyError, TypeError, AttributeError, RecursionError)
@@ -136,7 +136,7 @@ class Journal:
         if changed:
             raise RunFolderError(
                 f"{self.file} was started with another version of the program, and results of two versions do not mix "
-                f"(changed: {owned_files.first_names(changed)}); continue with the former version, or {remedy}"
+                f"(changed: {durable.first_names(changed)}); continue with the former version, or {remedy}"
             )
 
 

@@ -22,7 +22,7 @@ from typing import Any
 from jinja2 import Environment, FileSystemLoader, StrictUndefined, Template
 from markupsafe import Markup, escape
 
-from twin.framework import data_files, provenance, reference_frames, run_folder
+from twin.framework import data_files, provenance, record, run_folder
 from twin.framework.artefact import Artefact, typeset
 from twin.framework.report import Report, further_sections
 
@@ -269,7 +269,7 @@ def write_test(
     """
     report = replace(report, sections=(*report.sections, *further_sections(kind, numbers)))
     folder.write_text("config.yaml", facts.config)
-    folder.write_json(f"{kind}.json", reference_frames.described(kind, numbers))
+    folder.write_json(f"{kind}.json", record.described(kind, numbers))
     write_artefacts(report.artefacts, folder)
     for name, whole in report.files.items():
         folder.write_bytes(name, whole)

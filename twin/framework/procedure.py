@@ -1,4 +1,4 @@
-"""Execution of a test: its progress, its seed, and the errors that name the key to change."""
+"""Execution of a test: its progress, its seed and random streams, and the errors that name the key to change."""
 
 from __future__ import annotations
 
@@ -6,6 +6,8 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
+
+import numpy as np
 
 from optics.numerics.array_math import PhysicalError
 from scenes.yaml.errors import InputError, Issue, KeyPath
@@ -135,3 +137,24 @@ class Session:
     def seconds(self) -> float:
         """Time since the start, in seconds."""
         return time.monotonic() - self.clock
+
+
+def stream(seed: int | np.random.SeedSequence, *number: int) -> np.random.SeedSequence:
+    """Return a numbered random stream of a seed.
+
+    Unlike ``spawn``, this leaves the seed unchanged and can be repeated; streams of streams have longer numbers.
+
+    Parameters
+    ----------
+    seed : int | np.random.SeedSequence
+        Seed of a run, or one of its streams.
+    number : int
+        Number of the stream; without numbers, the stream of the seed itself.
+
+    Returns
+    -------
+    np.random.SeedSequence
+        Random stream.
+    """
+    root = seed if isinstance(seed, np.random.SeedSequence) else np.random.SeedSequence(seed)
+    return np.random.SeedSequence(root.entropy, spawn_key=(*root.spawn_key, *number), pool_size=root.pool_size)

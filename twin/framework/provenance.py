@@ -26,7 +26,7 @@ from threadpoolctl import threadpool_info
 
 from optics.numerics.backend import THREADS_VARIABLE, cores
 from optics.numerics.extension_table import entries
-from twin.framework.owned_files import digest
+from twin.framework.durable import digest
 
 PACKAGES = (
     "space-camera-twin",

@@ -96,8 +96,6 @@ class Report:
         Descriptions of these frames by name; some may be missing.
     code : int
         Exit code of a command whose result is an exit code.
-    conclusions : tuple of str
-        Conclusions from the numbers, one sentence each, shown before all tables.
     files : mapping of str to bytes
         Contents of files that no page shows, by path in the run folder.
     checks : tuple of SelfCheck
@@ -119,7 +117,6 @@ class Report:
     warnings: tuple[str, ...] = ()
     image_facts: Mapping[str, FrameFacts] = field(default_factory=FrozenMap)
     code: int = 0
-    conclusions: tuple[str, ...] = ()
     files: Mapping[str, bytes] = field(default_factory=FrozenMap)
     checks: tuple[SelfCheck, ...] = ()
     glance: Artefact | None = None
@@ -152,7 +149,7 @@ class Report:
 
     def __post_init__(self) -> None:
         """Typeset all sentences; raise ValueError for a verdict of over two sentences, or artefacts of equal names."""
-        for name in ("lead", "warnings", "conclusions"):
+        for name in ("lead", "warnings"):
             object.__setattr__(self, name, tuple(map(typeset, getattr(self, name))))
         object.__setattr__(self, "verdict", typeset(self.verdict))
         if not self.verdict.endswith(".") or len(re.findall(r"[.!?]\s+[A-Z]", self.verdict)) >= MOST_SENTENCES:

@@ -17,12 +17,11 @@ from typing import Annotated, Any, Protocol
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 
 from scenes.yaml.errors import InputError, Issue
-from twin.framework import owned_files
-from twin.framework.durable import PARTIAL_NAME, ending_later, make_folders, replace_folder, sync_folder, sync_tree
-from twin.framework.owned_files import MANIFEST
+from twin.framework import durable
+from twin.framework.durable import MANIFEST, PARTIAL_NAME, make_folders, sync_folder
 from twin.framework.provenance import Checksum, Provenance, versions
 
-_WAITING = f".{MANIFEST}{owned_files.PARTIAL}"
+_WAITING = f".{MANIFEST}{durable.PARTIAL}"
 """Temporary name of the manifest until all files that it lists are on the disk."""
 
 
@@ -121,8 +120,8 @@ class RunFolder:
         """Make the temporary folder."""
         try:
             self._made_parents = make_folders(self.target.parent)
-            owned_files.sweep(self.target.parent, remove_run)
-            self.path, self._lock = owned_files.make_unfinished(self.target)
+            durable.sweep(self.target.parent, remove_run)
+            self.path, self._lock = durable.make_unfinished(self.target)
         except BaseException as error:
             self._remove()
             if isinstance(error, OSError):
@@ -158,13 +157,13 @@ class RunFolder:
     def _publish(self) -> None:
         """Write the folder through to the disk and rename it to the target."""
         assert self._lock is not None
-        sync_tree(self.path)
+        durable.sync_tree(self.path)
         if (self.path / _WAITING).exists():
             os.rename(self.path / _WAITING, self.path / MANIFEST)
             sync_folder(self.path)
-        with ending_later():
+        with durable.ending_later():
             if self.force and self.target.exists():
-                replace_folder(self.path, self.target)
+                durable.replace_folder(self.path, self.target)
                 with suppress(OSError):  # the next run in this folder tries again
                     remove_run(self.path, self.target)
             else:
@@ -232,7 +231,7 @@ class RunFolder:
 
     def checksums(self) -> dict[str, str]:
         """Return the SHA-256 of every file written so far, by its path relative to the folder."""
-        return {name: owned_files.digest(self.path / name) for name in owned_files.files_below(self.path)}
+        return {name: durable.digest(self.path / name) for name in durable.files_below(self.path)}
 
 
 def json_text(data: Any) -> str:
@@ -405,7 +404,7 @@ def altered(folder: Path, manifest: Manifest) -> list[str]:
     OSError
         A file cannot be read.
     """
-    return [name for name, known in manifest.sha256.items() if not owned_files.is_as_written(folder / name, {known})]
+    return [name for name, known in manifest.sha256.items() if not durable.is_as_written(folder / name, {known})]
 
 
 def read_manifest(folder: Path) -> Manifest | None:
@@ -436,7 +435,7 @@ def unlisted(folder: Path) -> list[str] | None:
     Raises OSError.
     """
     manifest = read_manifest(folder)
-    return None if manifest is None else owned_files.changed_or_added_files(folder, manifest.sha256)
+    return None if manifest is None else durable.changed_or_added_files(folder, manifest.sha256)
 
 
 def refuse_others(folder: Path, others: Sequence[str]) -> None:
@@ -458,7 +457,7 @@ def refuse_others(folder: Path, others: Sequence[str]) -> None:
         return
     manifest = read_manifest(folder)
     changed = set(manifest.sha256 if manifest is not None else ())
-    named = owned_files.first_names([f"{name} (changed since)" if name in changed else name for name in others])
+    named = durable.first_names([f"{name} (changed since)" if name in changed else name for name in others])
     raise RunFolderError(
         f"output folder {folder} also holds files that the run did not write: {named}; --force removes only its own "
         "files, so move these away or choose another folder with --out"
@@ -476,13 +475,13 @@ def remove_run(old: Path, new: Path) -> None:
         Folder in its place.
     """
     others = unlisted(old)
-    for name in owned_files.files_below(old) if others is None else others:
+    for name in durable.files_below(old) if others is None else others:
         path = new / name
         while os.path.lexists(path):
             path = path.with_name(f"{path.name}.kept")
         path.parent.mkdir(parents=True, exist_ok=True)
         (old / name).rename(path)
-    owned_files.remove_files(old, set())
+    durable.remove_files(old, set())
 
 
 def reason(error: OSError) -> str:
@@ -492,7 +491,7 @@ def reason(error: OSError) -> str:
 
 JOURNAL = ".journal"
 """Extension of a file with finished pieces of work, see `twin.framework.durable`."""
-_KEPT = re.compile(rf"{re.escape(owned_files.KEPT_LOCK)}|[^/]+{re.escape(JOURNAL)}|{PARTIAL_NAME}")
+_KEPT = re.compile(rf"{re.escape(durable.KEPT_LOCK)}|[^/]+{re.escape(JOURNAL)}|{PARTIAL_NAME}")
 """Pattern of the names of files that commands keep in a folder of intermediate results."""
 
 
@@ -534,7 +533,7 @@ class KeptWork:
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         """Unlock the folder; if an invalid input ended the command before anything was kept, remove it."""
         if self._lock is not None:
-            if kind is not None and self._path and owned_files.files_below(self._path) == [owned_files.KEPT_LOCK]:
+            if kind is not None and self._path and durable.files_below(self._path) == [durable.KEPT_LOCK]:
                 self.finish()
             os.close(self._lock)
 
@@ -551,20 +550,20 @@ class KeptWork:
                 path = self._first.with_name(f"{self._first.name}{'' if number == 1 else f'.{number}'}.{self._ending}")
                 self._refuse_others(path)
                 make_folders(path)
-                self._lock = owned_files.locked(path / owned_files.KEPT_LOCK)
+                self._lock = durable.locked(path / durable.KEPT_LOCK)
                 if self._lock is not None:
                     break
                 if self._chosen:
                     text = f"{path} is in use by another command; wait until it has ended, or choose another --out"
                     raise RunFolderError(text)
-            if not (self._resume or self._force) and owned_files.files_below(path) != [owned_files.KEPT_LOCK]:
+            if not (self._resume or self._force) and durable.files_below(path) != [durable.KEPT_LOCK]:
                 raise RunFolderError(
                     f"{path} holds the finished part of an interrupted run; continue it with --resume, start again "
                     "with --force, or choose another --out"
                 )
             self._path = path
             if not self._resume:
-                owned_files.remove_files(path, {owned_files.KEPT_LOCK})
+                durable.remove_files(path, {durable.KEPT_LOCK})
         except OSError as error:
             raise RunFolderError(f"cannot use {path}: {reason(error)}") from error
         return path
@@ -578,8 +577,8 @@ class KeptWork:
     def finish(self) -> None:
         """Remove the intermediate results; the final ones are in the run folder."""
         if self._path is not None:
-            others = {name for name in owned_files.files_below(self._path) if not _KEPT.fullmatch(name)}
-            owned_files.remove_files(self._path, others)
+            others = {name for name in durable.files_below(self._path) if not _KEPT.fullmatch(name)}
+            durable.remove_files(self._path, others)
 
     def _refuse_others(self, path: Path) -> None:
         """Raise RunFolderError if the path is not a folder of intermediate results."""
@@ -587,9 +586,9 @@ class KeptWork:
             return
         if path.is_symlink() or not path.is_dir():
             raise RunFolderError(f"{path} is needed for the intermediate results of --resume; choose another --out")
-        names = owned_files.files_below(path)
-        known = owned_files.KEPT_LOCK in names
+        names = durable.files_below(path)
+        known = durable.KEPT_LOCK in names
         if others := [name for name in names if not (known and _KEPT.fullmatch(name))]:
-            named = owned_files.first_names(others)
+            named = durable.first_names(others)
             text = f"{path} holds files that this program did not write: {named}; move it, or choose another --out"
             raise RunFolderError(text)

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import AbstractContextManager, contextmanager
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager
 from functools import cache
 from io import BytesIO, StringIO
 from typing import TYPE_CHECKING, Any, Literal
@@ -76,7 +76,7 @@ def _arranged() -> type[Figure]:
     """Return the class of figures that are drawn only once when they are saved.
 
     To save a figure, Matplotlib draws it twice, the first time without output and only for the layout, which takes a
-    quarter of the time. To lay out and draw an axis, it computes the same ticks ten times.
+    quarter of the time.
     """
     from matplotlib.figure import Figure
     from matplotlib.layout_engine import ConstrainedLayoutEngine
@@ -84,54 +84,12 @@ def _arranged() -> type[Figure]:
     class Arranged(Figure):
         def draw(self, renderer: Any) -> None:
             engine = self.get_layout_engine()
-            with _ticks_cached(self):
-                if isinstance(engine, ConstrainedLayoutEngine) and self.canvas.is_saving():
-                    engine.execute(self)  # Matplotlib then removes the engine and draws again
-                else:
-                    super().draw(renderer)
+            if isinstance(engine, ConstrainedLayoutEngine) and self.canvas.is_saving():
+                engine.execute(self)  # Matplotlib then removes the engine and draws again
+            else:
+                super().draw(renderer)
 
     return Arranged
-
-
-@contextmanager
-def _ticks_cached(figure: Figure) -> Iterator[None]:
-    """Compute ticks and label positions only once for each size and view of the axes while the figure is drawn."""
-    x_and_y_axes: list[Any] = [axis for axes in figure.axes for axis in (axes.xaxis, axes.yaxis)]
-    for axis in x_and_y_axes:
-        axis._update_ticks, axis._get_ticklabel_bboxes = _cached_functions(axis)
-    try:
-        yield
-    finally:
-        for axis in x_and_y_axes:
-            del axis._update_ticks, axis._get_ticklabel_bboxes
-
-
-def _cached_functions(axis: Any) -> tuple[Callable[[], Any], Callable[[Any, Any], Any]]:
-    """Return the tick function and the label-box function of an axis, each with a cache of its last result."""
-    update, boxes = axis._update_ticks, axis._get_ticklabel_bboxes
-    cache: dict[str, Any] = {}
-
-    def same() -> bool:
-        now = axis.axes.bbox.bounds, tuple(axis.get_view_interval()), axis.axes.figure.dpi
-        if cache.get("at") == now:
-            return True
-        cache.clear()
-        cache["at"] = now
-        return False
-
-    def ticks() -> Any:
-        if not same() or "ticks" not in cache:
-            cache["ticks"] = update()
-        return cache["ticks"]
-
-    def ticklabel_bboxes(shown: Any, renderer: Any) -> Any:
-        if shown is not cache.get("ticks"):
-            return boxes(shown, renderer)
-        if cache.get("by") is not renderer:
-            cache["by"], cache["boxes"] = renderer, boxes(shown, renderer)
-        return cache["boxes"]
-
-    return ticks, ticklabel_bboxes
 
 
 def look(name: str) -> AbstractContextManager[None]:

@@ -29,8 +29,7 @@ from optics.waves.optical_transfer import TransferTable, transfer
 from optics.waves.pupil_stack import PupilFunction
 from scenes.models.camera_model import ROOT, build_camera_under_test
 from scenes.specs.resolved import DistortionSetup
-from twin.framework.procedure import Advance, BenchError, silent
-from twin.framework.random_streams import stream
+from twin.framework.procedure import Advance, BenchError, silent, stream
 from twin.laboratory.turntable_run import TurntableModel
 from twin.sensors.line_ccd import LineCcd, band_wavelengths
 from twin.targets.target_path import TargetPath

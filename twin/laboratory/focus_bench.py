@@ -25,8 +25,7 @@ from optics.geometry.pose import Pose
 from optics.numerics.backend import Backend, cores, one_blas_thread
 from optics.waves.pupil_stack import PupilFunction
 from scenes.models.camera_model import ROOT, CameraUnderTest, build_camera_under_test
-from twin.framework.procedure import Advance, BenchError, silent
-from twin.framework.random_streams import stream
+from twin.framework.procedure import Advance, BenchError, silent, stream
 from twin.sensors.area_detector import FixedPattern
 from twin.sensors.line_ccd import LineCcd
 from twin.targets.target_images import ALONG, DIRECTIONS, EdgeImager, EdgeOptics, knife_edge

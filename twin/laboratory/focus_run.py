@@ -29,8 +29,7 @@ from optics.targets.collimator import TooNarrowError
 from scenes.specs.camera_tests import FocusTestSpec, MeasuredFocusSpec
 from scenes.specs.resolved import ExperimentSetup, FocusSetup, MeasuredFocusSetup
 from twin.framework.memory import Lowered, require_memory
-from twin.framework.procedure import Advance, BenchError, silent
-from twin.framework.random_streams import stream
+from twin.framework.procedure import Advance, BenchError, silent, stream
 from twin.framework.record import Quantity, Record
 from twin.laboratory import focus_bench
 from twin.laboratory.focus_bench import VERTEX_ERROR, BudgetLine, FocusBench, NyquistMtf, Placement, Recorder, SiteScan

@@ -31,8 +31,7 @@ from optics.numerics.backend import Backend, one_blas_thread
 from optics.numerics.number_tree import FrozenMap
 from scenes.specs.camera_tests import DividingErrorSpec, MeasuredTurntableSpec, TurntableFiles, TurntableTestSpec
 from scenes.specs.resolved import ExperimentSetup
-from twin.framework.procedure import Advance, silent
-from twin.framework.random_streams import stream
+from twin.framework.procedure import Advance, silent, stream
 from twin.framework.record import Quantity, Record
 from twin.laboratory.measured_readings import Comparisons, DataFile, read_turntable
 

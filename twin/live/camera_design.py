@@ -43,7 +43,7 @@ from twin.camera.camera_view import (
     section_rays,
 )
 from twin.framework.artefact import rounded_down
-from twin.framework.random_streams import stream
+from twin.framework.procedure import stream
 from twin.framework.svg import AFTER, BEFORE, BLUE, GRAY, GREY, INK, VERMILION, look, to_svg
 from twin.live.knobs import Knob
 from twin.monitor.image_quality import MOST_BLUR

@@ -27,7 +27,7 @@ from scenes.specs.job import checked_nodes
 from scenes.yaml.errors import InputError
 from twin.camera.camera_optics import CameraOptics
 from twin.camera.camera_results import Field
-from twin.framework.random_streams import stream
+from twin.framework.procedure import stream
 from twin.live.camera_design import BLURRED, DESIGN, CameraDesign, changed_camera, optics_data, with_traced_focal_length
 from twin.live.knobs import Knob, checked_knob, knobs_of, perturbation
 from twin.live.messages import LARGEST_SEED, MOST_FRAMES, AskedState, BlindState

@@ -22,7 +22,7 @@ from scenes.yaml.named import FileKind
 from scenes.yaml.spec import validate
 from scenes.yaml.units import ANGLE, LENGTH, format_quantity
 from scenes.yaml.yaml_file import YamlFile, read_yaml
-from twin.framework.owned_files import digest
+from twin.framework.durable import digest
 from twin.framework.run_folder import Manifest, read_manifest
 from twin.live.knobs import FactorKnob, base_with_factors, factor_knobs
 from twin.live.messages import MOST_FRAMES

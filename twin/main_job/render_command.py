@@ -12,7 +12,7 @@ from scenes.specs.course import moment
 from scenes.specs.resolved import ResolvedJob
 from twin.framework.command import Result, print_report
 from twin.framework.procedure import Session
-from twin.framework.reference_frames import described
+from twin.framework.record import described
 from twin.framework.report import Report
 from twin.framework.second_process import SecondProcess
 from twin.main_job.render_folder import begin_drawing, load_drawing, write_run

@@ -20,8 +20,7 @@ from scenes.specs.job import JobSpec
 from scenes.specs.job_tables import FinishTableSpec
 from scenes.specs.resolved import ResolvedJob
 from twin.framework.data_files import FRAME_FORMATS, SPOT_STEEPNESS, FrameFacts, GridData, Gridded, frame_files, netcdf
-from twin.framework.record import Quantity, Record
-from twin.framework.reference_frames import described, frames_text
+from twin.framework.record import Quantity, Record, described, frames_text
 from twin.framework.run_folder import RunFolder
 from twin.main_job.render_results import JobRun, RenderRun
 from twin.main_job.verdict import recovered_numbers

@@ -47,7 +47,7 @@ from scenes.yaml.spec import Spec
 from twin.framework import memory
 from twin.framework.frame_store import IN_MEMORY, resident_bytes
 from twin.framework.memory import STARTED, Lowered, amount_text
-from twin.framework.random_streams import stream
+from twin.framework.procedure import stream
 from twin.monitor.calibration_cache import CacheEntry
 from twin.monitor.monitor_beams import NodeClasses, SpotFocus
 from twin.monitor.monitor_derivative import disturbances_of, motion_models, spot_jacobian

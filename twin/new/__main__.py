@@ -174,7 +174,7 @@ def _answers(kind: str, options: Mapping[str, str | None], numbers: CameraNumber
     Each is checked at once in the new file, the options before the questions.
     """
     from scenes.yaml.errors import InputError, Issue
-    from twin.new.template_text import checked_text
+    from twin.new.camera_numbers import checked_text
 
     questions = NEW[kind].questions
     out = {name: str(getattr(numbers, QUESTIONS[name].default, QUESTIONS[name].default)) for name in questions}
@@ -220,7 +220,7 @@ def _write_new(kind: str, camera: str | None, out: Path | None, force: bool, opt
         if out is not None:
             _targets(kind, out, force)
         from twin.framework.durable import write_all_safely
-        from twin.new.template_text import checked_text, numbers_of, reference_from
+        from twin.new.camera_numbers import checked_text, numbers_of, reference_from
 
         if camera is None:
             camera = _ask(

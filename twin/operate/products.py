@@ -36,8 +36,7 @@ from scenes.specs.orbit.setup import AngleSetup
 from scenes.yaml.errors import InputError, Problem
 from twin.framework.data_files import WRITER
 from twin.framework.procedure import BenchError
-from twin.framework.record import Quantity, Record
-from twin.framework.reference_frames import described
+from twin.framework.record import Quantity, Record, described
 from twin.operate.estimate.operation_model import plan_digest
 from twin.operate.estimate.reported_estimate import percent
 from twin.operate.estimated_motions import EstimatedMotions, OmittedComponent, Prior, prior_files, state_file

@@ -25,9 +25,8 @@ from scenes.models.disturbances import Component, DisturbancePrior, causes_of, d
 from scenes.specs.operation import OperationSetup
 from scenes.yaml.spec import Inline
 from scenes.yaml.yaml_file import dump_yaml
-from twin.framework.procedure import Advance
-from twin.framework.random_streams import stream
-from twin.framework.reference_frames import described
+from twin.framework.procedure import Advance, stream
+from twin.framework.record import described
 from twin.framework.run_folder import RunFolder
 from twin.main_job.monitor_reading import MonitorReading, rounded
 from twin.monitor.crosstalk import CameraCrosstalk, crosstalk

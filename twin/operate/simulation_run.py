@@ -18,7 +18,7 @@ from twin.framework.cli import InputErrorText
 from twin.framework.durable import write_safely
 from twin.framework.memory import Lowered, require_memory
 from twin.framework.procedure import WRITE, Advance
-from twin.framework.reference_frames import described
+from twin.framework.record import described
 from twin.framework.run_folder import RunFolder, chosen, json_text, write_manifest
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.operate.estimate.operation_model import read_plan, store_plan

@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Protocol, Self
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -50,7 +50,7 @@ from twin.camera.camera_optics import CameraOptics
 from twin.camera.camera_view import CameraView
 from twin.camera.first_order_data import FIRST_ORDER, first_order_data
 from twin.camera.refocus import find_focus, job_state_in_focus
-from twin.framework.reference_frames import frames_text
+from twin.framework.record import frames_text
 from twin.main_job.monitor_reading import MonitorReading
 from twin.main_job.render_job import render_job
 from twin.monitor.crosstalk import estimator_gains
@@ -65,31 +65,6 @@ Perturbation = Mapping[str, Mapping[str, Any]] | str
 """Motion in words, ``"M2 shift z 3 um"``, or body -> keys of `perturb:` in a job's YAML."""
 
 
-class Twin(Protocol):
-    """Interface of the instrument that a camera belongs to: its model, its state, and perturbed copies of it."""
-
-    @property
-    def experiment(self) -> MonitorExperiment:
-        """Model of the instrument and its monitor that renders and analyses images."""
-
-    @property
-    def state(self) -> State:
-        """Path of each moved body -> its motion in SI units (metres, radians)."""
-
-    @property
-    def perturbed_by(self) -> str:
-        """All perturbations as text that `perturbed` takes, separated by semicolons; empty without any."""
-
-    def refocused(self, camera: str = "", tilt: bool = False) -> Self:
-        """Return the instrument with the image plane of a camera at its best focus."""
-
-    def perturbed(self, *perturb: Perturbation | Sequence[Perturbation]) -> Self:
-        """Return the instrument with these bodies perturbed further.
-
-        Raises InputError for an unknown body or a motion that it does not allow.
-        """
-
-
 @shows("name", "model.mirrors", "model.paraxial.focal_length [m]", "model.entrance_pupil [mm]", "twin.perturbed_by")
 @dataclass(frozen=True, eq=False, repr=False, kw_only=True)
 class CameraTwin(CameraView):
@@ -97,7 +72,7 @@ class CameraTwin(CameraView):
 
     Attributes
     ----------
-    twin : Twin
+    twin : InstrumentTwin
         The instrument; it may consist of this camera alone.
     name : str
         Name of the camera in it.
@@ -105,17 +80,17 @@ class CameraTwin(CameraView):
         Whether light that other bodies block is removed from its beam.
     """
 
-    twin: Twin = field(repr=False)
+    twin: InstrumentTwin = field(repr=False)
     name: str
     obstruction: bool = True
 
     @classmethod
-    def of(cls, twin: Twin, name: str, obstruction: bool = True) -> CameraTwin:
+    def of(cls, twin: InstrumentTwin, name: str, obstruction: bool = True) -> CameraTwin:
         """Return a camera of an instrument, in the instrument's state.
 
         Parameters
         ----------
-        twin : Twin
+        twin : InstrumentTwin
             The instrument.
         name : str
             Name of the camera in it.

@@ -28,7 +28,7 @@ from scenes.yaml.yaml_file import YamlFile
 from twin.framework.artefact import cell_text
 from twin.framework.page import RunFacts, write_test
 from twin.framework.procedure import Session, performed, seeded, silent
-from twin.framework.reference_frames import frames_text
+from twin.framework.record import frames_text
 from twin.framework.report import Report, with_warnings
 from twin.framework.run_folder import RunFolder
 from twin.main_job.monitor_reading import MonitorReading

@@ -37,7 +37,7 @@ from scenes.specs.instrument import InstrumentSpec
 from scenes.yaml.errors import Problem, unknown
 from scenes.yaml.spec import Spec
 from twin.framework.frame_store import allocate_frames, largest_of, release_memory
-from twin.framework.random_streams import stream
+from twin.framework.procedure import stream
 from twin.sensors.poisson_numbers import DRAWING_BYTES, poisson_pieces
 
 

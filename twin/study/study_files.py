@@ -10,7 +10,7 @@ import xarray as xr
 
 from optics.numerics.extension_table import ExtensionTable
 from scenes.specs.study import NOISE
-from twin.framework import data_files, reference_frames
+from twin.framework import data_files, record
 from twin.framework.run_folder import RunFolder
 from twin.study.report.study_statistics import Estimate, describe
 from twin.study.runs.base_job import BlockResult, one_line
@@ -73,7 +73,7 @@ def make_dataset(plan: Plan, result: BlockResult) -> xr.Dataset:
         "fingerprint": plan.setup.fingerprint,
         "design": study.design.kind,
         "seed": study.design.seed,
-        "reference_frames": reference_frames.frames_text("study"),
+        "reference_frames": record.frames_text("study"),
     }
     numbered = (RUN, np.arange(plan.runs), {"units": "", "long_name": "number of the run"})
     return xr.Dataset(data, coords={RUN: numbered}, attrs=attributes)
@@ -208,7 +208,7 @@ def write_data(plan: Plan, result: BlockResult, seconds: float, computed: int, f
         Folder of the study.
     """
     data = make_dataset(plan, result)
-    numbers = reference_frames.described(
+    numbers = record.described(
         "study",
         {
             **summary(data, plan),

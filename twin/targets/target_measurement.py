@@ -23,7 +23,7 @@ from scenes.specs.instrument import BASE
 from scenes.specs.job import TargetsSpec
 from scenes.specs.resolved import ResolvedJob, target_band
 from twin.framework.data_files import FrameFacts
-from twin.framework.random_streams import stream
+from twin.framework.procedure import stream
 from twin.sensors.area_detector import FixedPattern
 from twin.sensors.line_ccd import LineCcd
 from twin.targets.target_images import DIRECTIONS, POSITIONS, BarDesign, TargetCamera, View, usable_pixels

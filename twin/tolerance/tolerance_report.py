@@ -22,8 +22,8 @@ from twin.framework.artefact import (
 from twin.framework.report import Report, Section, answer
 from twin.framework.svg import BLUE, GREY, INK, ORANGE, VERMILION, look, new_figure, plain_axes, shared_legend, to_svg
 from twin.tolerance.merit_models import FARTHEST
-from twin.tolerance.monitor_merit import merit_head, merit_unit, readings_of
-from twin.tolerance.tolerance_run import EXACT, LEVELS, MeritResult, ToleranceRun, Yield
+from twin.tolerance.monitor_merit import merit_head, merit_unit
+from twin.tolerance.tolerance_run import MeritResult, ToleranceRun, Yield
 
 _FEW = 3
 """Number of tolerances that the verdict names."""
@@ -44,7 +44,6 @@ def tolerance_report(run: ToleranceRun) -> Report:
     test = run.setup.test
     with look("tolerance"):
         curves = to_svg(_yield_figure(run))
-        bars = to_svg(_share_figure(run))
     verdict, more = answer(_designed(run), _verdict(run), *_causes(run), _loose(run), *_further(run))
     sections = (
         Section(
@@ -53,7 +52,7 @@ def tolerance_report(run: ToleranceRun) -> Report:
                 "Cumulative share of the cameras over the value of each merit, by exact traces and by the models; the "
                 "red line is the requirement.",
             ),
-            (SvgFigure("yield", "Merits over all cameras", "", curves), _levels_table(run)),
+            (SvgFigure("yield", "Merits over all cameras", "", curves),),
             name="yield",
         ),
         Section(
@@ -62,7 +61,7 @@ def tolerance_report(run: ToleranceRun) -> Report:
                 "Share of the variance of each merit that vanishes without the tolerance. For merits that are the "
                 "worst of several fields the shares need not add up to 100 %.",
             ),
-            (SvgFigure("shares", "Share of each tolerance", "", bars), _shares_table(run)),
+            (_shares_table(run),),
             name="shares",
         ),
         Section(
@@ -86,8 +85,8 @@ def tolerance_report(run: ToleranceRun) -> Report:
         ),
         *_allocation_sections(run),
         *_figure_sections(run),
-        *_monitor_sections(run),
         *_compensator_sections(run),
+        Section("Limits", (), (_tol_table(run),), name="tol"),
         Section(
             "Worst cameras",
             ("The worst cameras as jobs, with their adjustments: `python -m twin.camera FILE` shows each.",),
@@ -98,7 +97,6 @@ def tolerance_report(run: ToleranceRun) -> Report:
     )
     facts = (
         ("camera", run.bench.camera),
-        ("light", _light(run)),
         ("tolerances", str(len(test.tolerances))),
         ("compensators", str(len(test.compensators)) or "none"),
         ("cameras drawn", str(len(run.samples.problems))),
@@ -107,14 +105,6 @@ def tolerance_report(run: ToleranceRun) -> Report:
     title = f"Tolerances of {run.bench.camera}"
     unmet = any(result.passing.judged(result.merit.spec.probability) == "missed" for result in run.merits)
     return Report(title, verdict, more, facts, _summary(run), sections, warnings=run.warnings, unmet=unmet)
-
-
-def _light(run: ToleranceRun) -> str:
-    """Return a text on the wavelengths at which wavefronts and MTFs are evaluated."""
-    colours = 1e9 * run.bench.colours
-    if len(colours) == 1:
-        return f"{colours[0]:.4g} nm"
-    return f"{colours.min():.4g} to {colours.max():.4g} nm, {len(colours)} wavelengths"
 
 
 def _percent(share: float) -> str:
@@ -238,21 +228,6 @@ def _summary(run: ToleranceRun) -> Table:
     return Table("merits", "Merits", caption, heads, rows)
 
 
-def _levels_table(run: ToleranceRun) -> Table:
-    rows: list[list[Cell]] = []
-    for result in run.merits:
-        for k, share in enumerate(LEVELS):
-            values = (result.levels[k], result.quadratic[k], result.linear[k])
-            rows.append(
-                [merit_head(result.merit), f"{100 * share:.0f} %", *(_scaled(value, result) for value in values)]
-            )
-        shares = result.passing.share, *reversed(result.model_passing)
-        rows.append([merit_head(result.merit), "yield", *map(_percent, shares)])
-    caption = "Value of each merit that a share of the cameras meet, by exact traces of every camera and by the models."
-    heads = ("merit", "share", "exact", "quadratic", "linear")
-    return Table("levels", "Exact, quadratic and linear", caption, heads, rows)
-
-
 def _shares_table(run: ToleranceRun) -> Table:
     worst = _importance(run)
     order = sorted(worst, key=lambda name: -worst[name])
@@ -272,10 +247,11 @@ def _sensitivity_table(run: ToleranceRun) -> Table:
         for m, result in enumerate(run.merits):
             cells += [_scaled(float(run.sensitivity.values[e, end, m]), result) for end in (0, 1)]
         shares = [
-            _unless_rounding(float(run.sensitivity.moves[e, end, c]) / (compensator.range_si or 1.0))
+            float(run.sensitivity.moves[e, end, c]) / (compensator.range_si or 1.0)
             for c, compensator in enumerate(adjusted.values())
             for end in (0, 1)
         ]
+        shares = [0.0 if abs(share) < _ROUNDING else share for share in shares]
         ranges = [compensator.range for compensator in adjusted.values() for _ in (0, 1)]
         limits_and_shares = list(zip(ranges, shares, strict=True))
         rows.append([*cells, *(_scaled_limit(limit, x) if np.isfinite(x) else "" for limit, x in limits_and_shares)])
@@ -320,11 +296,6 @@ def _inverse_table(run: ToleranceRun) -> Table:
     return Table("inverse", "Limits for a loss", "In the unit of the limit.", heads, rows)
 
 
-def _unless_rounding(share: float) -> float:
-    """Return a move as a fraction of the compensator's range, or 0 if it is below the rounding of the adjustment."""
-    return 0.0 if abs(share) < _ROUNDING else share
-
-
 def _scaled_limit(limit: str | float, share: float) -> str:
     """Return ``share`` times a tolerance limit as text, in the limit's unit."""
     if isinstance(limit, str):
@@ -352,7 +323,7 @@ def _allocation_sections(run: ToleranceRun) -> tuple[Section, ...]:
         f"{_percent(allocation.predicted[0])} to {_percent(allocation.predicted[1])}; independent cameras, traced "
         f"exactly, give {_interval(judged)}.",
     )
-    return (Section("Allocation", text, (table, _tol_table(run)), name="allocation"),)
+    return (Section("Allocation", text, (table,), name="allocation"),)
 
 
 def _tol_table(run: ToleranceRun) -> Table:
@@ -392,7 +363,7 @@ def _figure_sections(run: ToleranceRun) -> tuple[Section, ...]:
 
 def _compensator_sections(run: ToleranceRun) -> tuple[Section, ...]:
     if not run.bench.compensators:
-        return () if run.allocation is not None else (Section("Limits", (), (_tol_table(run),), name="tol"),)
+        return ()
     moves = run.samples.moves
     rows: list[list[Cell]] = []
     for c, (name, spec) in enumerate(run.setup.test.compensators.items()):
@@ -405,30 +376,7 @@ def _compensator_sections(run: ToleranceRun) -> tuple[Section, ...]:
         rows.append([name, spec.motion, str(spec.range), str(spec.step or ""), str(spec.accuracy or ""), *size])
     heads = ("compensator", "motion", "range", "step", "accuracy", "std of moves", "largest move")
     table = Table("compensators", "Adjustments", "Over all cameras.", heads, rows)
-    tables = (table,) if run.allocation is not None else (table, _tol_table(run))
-    return (Section("Compensators", (), tables, name="compensators"),)
-
-
-def _monitor_sections(run: ToleranceRun) -> tuple[Section, ...]:
-    if not run.interpolation_errors or run.bench.monitor is None:
-        return ()
-    prior_name = run.bench.monitor.disturbances.name
-    rows: list[list[Cell]] = []
-    for result in run.merits:
-        if result.merit.name in run.interpolation_errors:
-            readings = ", ".join(readings_of(result.merit.spec, tuple(run.bench.instrument.cameras)))
-            error = run.interpolation_errors[result.merit.name]
-            names = merit_head(result.merit), readings, result.merit.spec.estimator
-            rows.append([*names, _scaled(result.nominal, result), error])
-    text = (
-        f"Standard deviations of the monitor's readings under the disturbances {prior_name}, with the derivatives "
-        "and the noise of each camera as it is built and adjusted; its area CCDs have been set to its spots. "
-        f"Derivatives are interpolated between those of the tolerances; in {EXACT} of the cameras they were also "
-        "traced for comparison.",
-    )
-    heads = ("merit", "reading", "estimator", "designed", "relative difference of traced derivatives")
-    table = Table("monitor", "Accuracy of the monitor's readings", "", heads, rows, (None, None, None, None, 7))
-    return (Section("Monitor", text, (table,), name="monitor"),)
+    return (Section("Compensators", (), (table,), name="compensators"),)
 
 
 def _yield_figure(run: ToleranceRun) -> Figure:
@@ -463,24 +411,3 @@ def _curve(ax: Axes, run: ToleranceRun, result: MeritResult) -> None:
     ax.set_ylabel("cameras [%]")
     ax.set_ylim(0.0, 102.0)
     plain_axes(ax)
-
-
-def _share_figure(run: ToleranceRun) -> Figure:
-    """Plot the fractions of each merit's variance due to the most important tolerances."""
-    worst = _importance(run)
-    order = sorted(worst, key=lambda name: -worst[name])[:12][::-1]
-    figure = new_figure(0.9 + 0.32 * len(order))
-    ax = figure.subplots()
-    shown = run.merits[:_MOST_CURVES]
-    colours = (BLUE, ORANGE, VERMILION, GREY, INK, "#009E73")
-    step = 0.8 / max(1, len(shown))
-    for k, result in enumerate(shown):
-        at = np.arange(len(order)) + 0.4 - (k + 0.5) * step
-        ax.barh(
-            at, [100.0 * result.shares[name] for name in order], 0.9 * step, color=colours[k], label=result.merit.name
-        )
-    ax.set_yticks(np.arange(len(order)), order)
-    ax.set_xlabel("share of the variance [%]")
-    shared_legend(figure, ax)
-    plain_axes(ax)
-    return figure

@@ -19,8 +19,7 @@ from scenes.models.camera_sharpness import blur_warnings
 from scenes.models.disturbances import states_of
 from scenes.specs.resolved import ResolvedJob
 from scenes.yaml.errors import InputError, Issue
-from twin.framework.procedure import Advance, silent
-from twin.framework.random_streams import stream
+from twin.framework.procedure import Advance, silent, stream
 from twin.monitor.monitor_beams import ImageChecks
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.monitor.observation import ObservationOptions, observe

@@ -33,7 +33,7 @@ from scenes.yaml.spec import validate
 from scenes.yaml.units import MOMENT, parse_quantity
 from scenes.yaml.yaml_file import read_yaml
 from twin.framework.cli import InputErrorText
-from twin.framework.owned_files import MANIFEST
+from twin.framework.durable import MANIFEST
 from twin.framework.run_folder import Manifest, is_run_folder, read_manifest
 from twin.operate.record.entries import (
     MICRO,

@@ -23,8 +23,7 @@ from optics.numerics.array_math import covariance_root
 from scenes.specs.orbit.adjust import BlockPassSpec, OrbitAdjustSpec, ReadingLawsSpec
 from scenes.specs.orbit.flight import AttitudeSpec
 from scenes.specs.orbit.setup import AdjustSetup
-from twin.framework.procedure import BenchError
-from twin.framework.random_streams import stream
+from twin.framework.procedure import BenchError, stream
 from twin.orbit.block.measured_block import (
     MonitorSource,
     camera_sigmas,

@@ -26,8 +26,7 @@ from optics.numerics.number_tree import FrozenMap
 from scenes.specs.orbit.angle import LINES
 from scenes.specs.orbit.three_line_camera import ThreeLineCameraSpec
 from scenes.yaml.errors import KeyPath
-from twin.framework.procedure import Advance, BenchError, silent
-from twin.framework.random_streams import stream
+from twin.framework.procedure import Advance, BenchError, silent, stream
 from twin.orbit.calibration.campaign import (
     Campaign,
     FieldImages,

@@ -27,8 +27,7 @@ from scipy.interpolate import CubicSpline
 from scipy.signal import lfilter
 
 from optics.geometry.pose import rotation_matrix
-from twin.framework.procedure import BenchError
-from twin.framework.random_streams import stream
+from twin.framework.procedure import BenchError, stream
 from twin.orbit.flight.earth import Earth, curvature_radii, east_north_up
 from twin.orbit.flight.orbit import Orbit, propagate
 from twin.sensors.line_ccd import Collection

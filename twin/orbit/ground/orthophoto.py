@@ -18,7 +18,7 @@ import cv2
 import numpy as np
 from scipy.ndimage import gaussian_filter, spline_filter
 
-from twin.framework.random_streams import stream
+from twin.framework.procedure import stream
 from twin.orbit.ground.grid import GroundFrame, SplineGrid, Terrain, correlated_field, fractal_field
 
 if TYPE_CHECKING:

@@ -24,7 +24,7 @@ from analysis import statistics
 from optics.numerics.array_math import PhysicalError
 from optics.numerics.number_tree import FrozenMap
 from twin.framework.memory import Lowered, require_memory
-from twin.framework.random_streams import stream
+from twin.framework.procedure import stream
 from twin.orbit.flight.sensor import Sensor
 from twin.orbit.ground.grid import GroundFrame, Terrain
 from twin.orbit.ground.orthophoto import Control, Extent, apparent, around, make_control, reflectance

@@ -22,7 +22,7 @@ from scenes.yaml.units import LENGTH, format_quantity
 from twin.framework import svg
 from twin.framework.artefact import Artefact, Cell, CsvFile, Data, PngFigure, SvgFigure, Table, rounded_down
 from twin.framework.data_files import FrameFacts, MapGeoreference
-from twin.framework.reference_frames import described
+from twin.framework.record import described
 from twin.framework.report import Report, Section, answer, inputs
 from twin.orbit.ground.orthophoto import Raster
 from twin.orbit.images import simulate_run

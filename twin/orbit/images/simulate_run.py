@@ -25,10 +25,8 @@ from optics.numerics.number_tree import FrozenMap
 from scenes.specs.orbit.scene import OrbitSimulateSpec
 from scenes.specs.orbit.three_line_camera import ThreeLineCameraSpec
 from scenes.yaml.errors import KeyPath
-from twin.framework.procedure import Advance, BenchError, silent
-from twin.framework.random_streams import stream
-from twin.framework.record import Quantity, Record, plain_data
-from twin.framework.reference_frames import described
+from twin.framework.procedure import Advance, BenchError, silent, stream
+from twin.framework.record import Quantity, Record, described, plain_data
 from twin.orbit.flight.earth import Earth
 from twin.orbit.flight.line_camera import LineCamera, LineTimes, changed_payload, line_cameras
 from twin.orbit.flight.platform_table import PlatformTable, continuous_quaternions

@@ -13,8 +13,7 @@ from optics.numerics.backend import one_blas_thread
 from optics.numerics.number_tree import FrozenMap
 from scenes.specs.orbit.jitter_search import AXES, OrbitJitterSpec
 from scenes.specs.orbit.setup import AnyJitter, JitterSetup, MeasuredJitterSetup
-from twin.framework.procedure import Advance, BenchError, silent
-from twin.framework.random_streams import stream
+from twin.framework.procedure import Advance, BenchError, silent, stream
 from twin.framework.record import Quantity, Record
 from twin.orbit.flight.line_camera import LineTimes, line_cameras
 from twin.orbit.flight.platform_table import PlatformTable

@@ -38,8 +38,7 @@ from scenes.specs.course import moment
 from scenes.specs.orbit.monitor import PARAMETERS, CorrectionSpec, OrbitMonitorSpec
 from scenes.specs.perturbation import AXES, find_node, not_allowed
 from scenes.yaml.errors import InputError, Problem, unknown
-from twin.framework.procedure import BenchError
-from twin.framework.random_streams import stream
+from twin.framework.procedure import BenchError, stream
 from twin.monitor.image_quality import ImageQuality, image_quality
 from twin.monitor.monitor_derivative import single_states, spot_jacobian
 from twin.monitor.monitor_experiment import MonitorExperiment

@@ -19,8 +19,7 @@ from analysis.statistics import rms
 from optics.geometry.tree import Motion, State
 from optics.numerics.number_tree import FrozenMap
 from scenes.specs.course import moment
-from twin.framework.procedure import Advance, BenchError
-from twin.framework.random_streams import stream
+from twin.framework.procedure import Advance, BenchError, stream
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.orbit.flight.line_camera import LineCamera, calibrated_line, traced_line_cameras
 from twin.orbit.flight.sensor import NO_EFFECTS, Platform, Sensor

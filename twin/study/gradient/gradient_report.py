@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from matplotlib.axes import Axes
 from matplotlib.colors import SymLogNorm
 from matplotlib.figure import Figure
 from rich.console import Console
@@ -18,14 +17,13 @@ from rich.console import Console
 from scenes.models.camera_sharpness import blur_warnings
 from scenes.specs.file_kinds import read_for
 from scenes.yaml.errors import key_text
-from twin.framework import cli, command, page, procedure, provenance, reference_frames, run_folder, svg
+from twin.framework import cli, command, page, procedure, provenance, record, run_folder, svg
 from twin.framework.artefact import Cell, SvgFigure, Table, plain, significant
 from twin.framework.record import Quantity, Record
 from twin.framework.report import Report, Section, answer
 from twin.framework.run_folder import RunFolder
 from twin.sensors.area_detector import coarse_warnings
 from twin.study.gradient.study_gradient import AD, Gradient, study_gradient
-from twin.study.report.study_plots import finish
 from twin.study.report.study_statistics import typeset
 from twin.study.runs.setup import PROGRAM, StudySetup, base_of, resolve_study
 
@@ -51,21 +49,12 @@ def _write_report(setup: StudySetup, gradient: Gradient, folder: RunFolder, warn
         Warnings for the user.
     """
     with svg.look("gradient"):
-        figures = (
-            SvgFigure(
-                "heat-map",
-                "Sensitivity of each response to each factor",
-                "Change of each response per spread of each factor, as a share of the response's largest one; the "
-                "scale is logarithmic above 0.001.",
-                svg.to_svg(_heat_map(gradient)),
-            ),
-            SvgFigure(
-                "tornado",
-                "Largest changes",
-                "Change of each response when a factor rises by its spread, the largest first; in brackets the root of "
-                "the sum of squares over all factors.",
-                svg.to_svg(_tornado(gradient)),
-            ),
+        figure = SvgFigure(
+            "heat-map",
+            "Sensitivity of each response to each factor",
+            "Change of each response per spread of each factor, as a share of the response's largest one; the scale is "
+            "logarithmic above 0.001.",
+            svg.to_svg(_heat_map(gradient)),
         )
     study = setup.study
     about = (
@@ -84,7 +73,7 @@ def _write_report(setup: StudySetup, gradient: Gradient, folder: RunFolder, warn
         (*more, *([study.description] if study.description else ()), *about),
         (),
         _response_table(gradient),
-        (Section("Sensitivity", (), figures), Section("Factors", (), (_factor_rows(gradient),))),
+        (Section("Sensitivity", (), (figure,)), Section("Factors", (), (_factor_rows(gradient),))),
         warnings=tuple(warnings),
     )
     page.write_artefacts(report.artefacts, folder)
@@ -118,7 +107,7 @@ def verdict(gradient: Gradient) -> tuple[str, tuple[str, ...]]:
         ", ".join(first) or "No factor moves any response",
         sure,
         f"no factor moves {still} of the responses" if moved and still else "",
-        "see the figures of the sensitivity",
+        "see the sensitivity",
     )
 
 
@@ -174,33 +163,17 @@ def _factor_rows(gradient: Gradient) -> Table:
     return Table("factors", "", caption, heads, rows)
 
 
-MOST_BARS = 8
-"""Largest number of bars (factors) in one panel of the bar chart."""
 LINEAR = 1e-3
 """Threshold between the linear and the logarithmic part of the heat map's colour scale.
 
 It is relative to the response's largest change due to the spread of any factor.
 """
-NEGLIGIBLE = 1e-3
-"""Change due to a factor's spread below which the bar chart omits the factor.
-
-It is relative to the response's largest change due to the spread of any factor.
-"""
-
-
-def _normalised(gradient: Gradient) -> np.ndarray:
-    """Return the change of each response due to the spread of each factor, (R, F), relative to its largest change.
-
-    It is zero where no factor changes the response. Array dimensions: R responses, F factors.
-    """
-    change = gradient.change
-    largest = np.max(np.abs(change), axis=1, initial=0.0, keepdims=True)
-    return np.asarray(np.where(largest > 0.0, change / np.where(largest > 0.0, largest, 1.0), 0.0))
 
 
 def _heat_map(gradient: Gradient) -> Figure:
-    """Plot each response's normalised change due to each factor's spread as colours, factors along y."""
-    shares = _normalised(gradient).T
+    """Plot each response's change due to each factor's spread, relative to its largest, as colours; factors along y."""
+    largest = np.max(np.abs(gradient.change), axis=1, initial=0.0, keepdims=True)
+    shares = np.where(largest > 0.0, gradient.change / np.where(largest > 0.0, largest, 1.0), 0.0).T
     rows, columns = shares.shape
     figure = svg.new_figure(2.1 + 0.21 * max(rows, 4))
     axes = figure.subplots()
@@ -220,35 +193,6 @@ def _heat_map(gradient: Gradient) -> Figure:
     bar.outline.set_visible(False)
     bar.minorticks_off()
     return figure
-
-
-def _tornado(gradient: Gradient) -> Figure:
-    """Plot for each response the largest changes due to the spread of a factor."""
-    moved = [i for i in range(len(gradient.responses)) if np.any(gradient.change[i])]
-    largest = [_largest(gradient.change[i]) for i in moved]
-    figure, grid = svg.panels([0.85 + 0.2 * len(indices) for indices in largest] or [1.5], 2)
-    for axes, i, order in zip(grid, moved, largest, strict=False):
-        _bars(axes, gradient, i, order)
-    return figure
-
-
-def _largest(change: np.ndarray) -> np.ndarray:
-    order = np.argsort(-np.abs(change), kind="stable")[:MOST_BARS]
-    return np.asarray(order[np.abs(change[order]) > NEGLIGIBLE * np.abs(change).max()])
-
-
-def _bars(axes: Axes, gradient: Gradient, i: int, order: np.ndarray) -> None:
-    values = gradient.change[i, order][::-1]
-    y = np.arange(len(order))
-    axes.barh(y, values, 0.66, color=[svg.BLUE if value >= 0 else svg.VERMILION for value in values])
-    axes.axvline(0.0, color=svg.INK, lw=0.8)
-    axes.set_yticks(y, [gradient.factors[k].name for k in order[::-1]])
-    unit = f", {typeset(gradient.units[i])}" if gradient.units[i] else ""
-    rss = significant(float(np.linalg.norm(gradient.change[i])), 3, floor=0.0)
-    axes.set_xlabel(f"{gradient.responses[i]}{unit} (all: {rss})")
-    axes.set_ylim(-0.7, max(len(order), 2) - 0.3)
-    finish(axes, 5, None)
-    axes.grid(False, axis="y")
 
 
 DOUBTFUL = 0.01
@@ -355,7 +299,7 @@ def _work(setup: StudySetup, session: procedure.Session) -> command.Result:
     notes = [f"{DOUBTFUL_TEXT}: {'; '.join(bad)}"] if bad else []
     warnings = (*blur_warnings(base, session.backend), *coarse_warnings(base), *notes)
     summary = {"verdict": verdict(gradient)[0], "warnings": list(warnings)}
-    numbers = reference_frames.described("gradient", {**GRADIENT(gradient), **summary})
+    numbers = record.described("gradient", {**GRADIENT(gradient), **summary})
     folder.write_text("config.yaml", setup.to_yaml())
     folder.write_json("gradient.json", numbers)
     folder.write_bytes("gradient.csv", _whole_table(gradient).content())

@@ -1,4 +1,4 @@
-"""Analysis of a study: Pareto fronts, requirements, and all numbers of the report."""
+"""Analysis of a study: Pareto fronts, requirements, convergence, and all numbers of the report."""
 
 from __future__ import annotations
 
@@ -223,8 +223,51 @@ def _text(spec: ThresholdSpec) -> str:
     return f"{low}{name}{high}"
 
 
-GOALS = {"mean": 0.1, "std": 0.1, "p95": 0.2, "p997": 0.2}
-"""Statistic -> half-width of its 95 % interval, in standard deviations, below which the runs determine it well."""
+QUANTILES = {"p95": 0.95, "p99.7": 0.997}
+"""Name of each quantile whose convergence is reported -> its probability."""
+GOALS = {"mean": 0.1, "sigma": 0.1, "p95": 0.2, "p99.7": 0.2}
+"""Statistic -> half-width of its 95 % interval, in units of sigma, below which it is considered well determined."""
+
+
+@dataclass(frozen=True)
+class Convergence:
+    """Accuracy of a statistic of the runs.
+
+    Attributes
+    ----------
+    name : str
+        ``mean``, ``sigma``, ``p95`` or ``p99.7``.
+    relative : float or None
+        Half-width of the confidence interval in units of sigma; None if it is open.
+    enough : bool
+        True if ``relative`` is below the goal.
+    needed : int or None
+        Approximate number of runs that reaches the goal; None if it cannot be estimated.
+    """
+
+    name: str
+    relative: float | None
+    enough: bool
+    needed: int | None
+
+
+def convergences(values: np.ndarray) -> tuple[Convergence, ...]:
+    """Return the accuracy of the statistics of (n,) finite values; none below 20 runs and for constant values.
+
+    Array dimensions: n runs.
+    """
+    n = len(values)
+    if n < 20 or np.ptp(values) == 0.0:
+        return ()
+    about, sigma, out = statistics.describe(values, True), float(np.std(values, ddof=1)), []
+    for name, estimate in zip(GOALS, (about.mean, about.std, about.p95, about.p997), strict=True):
+        relative = None if estimate is None or estimate.half_width is None else estimate.half_width / sigma
+        enough = relative is not None and relative <= GOALS[name]
+        needed = n if enough else None if relative is None else math.ceil(n * (relative / GOALS[name]) ** 2)
+        if relative is None and name in QUANTILES:
+            needed = statistics.runs_for_quantile(QUANTILES[name])
+        out.append(Convergence(name, relative, enough, needed))
+    return tuple(out)
 
 
 @dataclass(frozen=True, eq=False)
@@ -245,6 +288,8 @@ class StudyAnalysis:
         Fraction of each response's variance that the runs report as noise.
     indices : dict
         Sensitivity indices; empty if the study does not request them.
+    convergences : dict
+        Convergence of the statistics; empty for grids.
     requirements : tuple of Requirement
         Requirements in the study's order, then all together.
     fronts : tuple of ParetoFront
@@ -259,6 +304,7 @@ class StudyAnalysis:
     effects: Mapping[str, tuple[statistics.MainEffect, ...]]
     noise: Mapping[str, statistics.NoiseShare]
     indices: Mapping[str, Indices | NoIndices]
+    convergences: Mapping[str, tuple[Convergence, ...]]
     requirements: tuple[Requirement, ...]
     fronts: tuple[ParetoFront, ...]
     not_numbers: tuple[str, ...]
@@ -287,18 +333,13 @@ class StudyAnalysis:
                 if (share := statistics.noise_share(r, runs.study)) is not None
             },
             indices={r.name: sensitivity_indices(runs, r) for r in indexed},
+            convergences={
+                r.name: convergences(r.known) if runs.sampled and not r.constant else () for r in runs.responses
+            },
             requirements=requirements(runs),
             fronts=tuple(fronts),
             not_numbers=tuple(wrong),
         )
-
-    def few_runs(self, response: str) -> bool:
-        """Return True if the runs determine a statistic of a response worse than `GOALS`."""
-        about = self.descriptions[response]
-        if about.std is None:
-            return True
-        halves = {name: getattr(about, name).half_width for name in GOALS}
-        return any(half is None or half > GOALS[name] * about.std.value for name, half in halves.items())
 
     def influence(self, response: str) -> dict[str, float]:
         """Return factor -> estimated fraction of a response's variance due to it, the largest first, for sorting only.
@@ -317,13 +358,10 @@ class StudyAnalysis:
             model = self.linear[response]
             for effect in model.effects if model is not None else ():
                 # a swing over 90% of a text's values is some 3 sigma
-                size = effect.coefficient.value if effect.coefficient is not None else _swing_in_sigmas(effect, std)
+                share = effect.swing.value / (2.0 * std.value) if std is not None and std.value > 0.0 else 0.0
+                size = effect.coefficient.value if effect.coefficient is not None else share
                 out[effect.factor] = size**2
         return dict(sorted(out.items(), key=lambda item: -item[1]))
-
-
-def _swing_in_sigmas(effect: Any, std: Estimate | None) -> float:
-    return float(effect.swing.value) / (2.0 * std.value) if std is not None and std.value > 0.0 else 0.0
 
 
 def _finite(value: float | None) -> float | None:
@@ -372,6 +410,12 @@ INDICES: Record[Indices] = Record(
     Quantity("noise_share", lambda a: a.noise, "share of the variance that the runs report as noise"),
     Quantity("factors", lambda a: {index.name: index for index in a.axes}, "by factor", record=INDEX),
 )
+CONVERGENCE: Record[Convergence] = Record(
+    "Accuracy of a statistic of the runs.",
+    Quantity("relative_half_width", lambda c: c.relative, "half the interval over sigma of the response"),
+    Quantity("enough_runs", lambda c: c.enough, "true if that is below the goal"),
+    Quantity("runs_needed", lambda c: c.needed, "about how many runs would reach it"),
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -408,6 +452,13 @@ RESPONSE: Record[_ResponseAnalysis] = Record(
     Quantity("p997", lambda a: a.numbers.p997, "99.7% of the runs lie below", record=ESTIMATE),
     Quantity("min", lambda a: a.numbers.low, "smallest value"),
     Quantity("max", lambda a: a.numbers.high, "largest value"),
+    Quantity("skewness", lambda a: a.numbers.normality and a.numbers.normality.skewness, "0 for a normal one"),
+    Quantity("excess_kurtosis", lambda a: a.numbers.normality and a.numbers.normality.kurtosis, "0 for a normal one"),
+    Quantity(
+        "normality_p", lambda a: a.numbers.normality and a.numbers.normality.p, "of D'Agostino and Pearson's test"
+    ),
+    Quantity("p0135", lambda a: a.numbers.tails and a.numbers.tails[0], "0.135% of the runs lie below"),
+    Quantity("p99865", lambda a: a.numbers.tails and a.numbers.tails[1], "99.865% of the runs lie below"),
     Quantity(
         "noise_share",
         lambda a: a.noise and a.noise.share,
@@ -423,6 +474,12 @@ RESPONSE: Record[_ResponseAnalysis] = Record(
     Quantity("linear_model", lambda a: a.analysis.linear[a.of.name], "null where none can be fitted", record=LINEAR),
     Quantity("main_effects", lambda a: a.analysis.effects[a.of.name], "of a grid", record=MAIN_EFFECT),
     Quantity("sobol", _ResponseAnalysis.sobol, "sensitivity indices, where the study asks for them", where_known=True),
+    Quantity(
+        "convergence",
+        lambda a: {convergence.name: convergence for convergence in a.analysis.convergences.get(a.of.name, ())},
+        "convergence of the statistics",
+        record=CONVERGENCE,
+    ),
 )
 REQUIREMENT: Record[Requirement] = Record(
     "Result of a requirement.",

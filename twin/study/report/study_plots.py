@@ -1,6 +1,6 @@
 """Figures of a study: distributions, response curves, effects, pairs and Pareto fronts."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -11,7 +11,6 @@ from matplotlib.ticker import MaxNLocator
 from twin.framework import svg
 from twin.framework.artefact import plain
 from twin.framework.svg import BLUE, GREEN, GREY, INK, ORANGE, PURPLE, SKY, VERMILION
-from twin.study.report.sensitivity_indices import Indices
 from twin.study.report.study_analysis import StudyAnalysis
 from twin.study.report.study_statistics import Description, Factor, Response, Series, mean_interval, typeset
 
@@ -91,22 +90,6 @@ MOST_LEVELS = 12
 """Largest number of values of a factor whose runs are averaged value by value."""
 
 
-def bins(factor: Factor, good: np.ndarray) -> Iterator[np.ndarray]:
-    """Yield the runs of a numeric factor in groups, for means over neighbouring values.
-
-    A group has equal numbers of runs with neighbouring values, or the runs with one value if there are only a few
-    values.
-    """
-    levels = np.unique(factor.values[good])
-    if len(levels) <= MOST_LEVELS:
-        for level in levels:
-            yield np.flatnonzero(good & (factor.values == level))
-        return
-    order = np.flatnonzero(good)[np.argsort(factor.values[good], kind="stable")]
-    count = int(np.clip(len(order) // 10, 3, 15))
-    yield from np.array_split(order, count)
-
-
 def histogram_figure(analysis: StudyAnalysis, names: Sequence[str]) -> Figure:
     """Plot the histograms of the named responses."""
     responses = [r for r in analysis.runs.responses if r.name in names]
@@ -133,6 +116,14 @@ def _histogram(axes: Axes, response: Response, about: Description, sampled: bool
     if sampled:
         for k, position in enumerate((mean - 3.0 * std, mean + 3.0 * std)):
             axes.axvline(position, color=VERMILION, lw=1.2, ls="--", label="mean ± 3σ" if k == 0 else None)
+        normal = about.normality is None or about.normality.normal
+        if not normal and about.tails is not None:
+            for k, position in enumerate(about.tails):
+                axes.axvline(position, color=GREEN, lw=1.4, ls=":", label="0.135% and 99.865%" if k == 0 else None)
+        if normal and about.normality is not None:
+            x = np.linspace(mean - 3.5 * std, mean + 3.5 * std, 200)
+            bell = np.exp(-0.5 * ((x - mean) / std) ** 2) / (np.sqrt(2.0 * np.pi) * std)
+            axes.plot(x, bell * len(values) * (edges[1] - edges[0]), color=GREEN, lw=1.1, label="normal distribution")
     finish(axes)
     axes.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=3, fontsize=7.5, columnspacing=1.0)
 
@@ -160,9 +151,11 @@ def curve_figure(analysis: StudyAnalysis, response: Response) -> Figure:
     wide = min(len(factors), 3)
     figure, grid = svg.panels([3.5 if wide < 3 else 3.0] * len(factors), wide)
     for k, (axes, factor) in enumerate(zip(grid, factors, strict=True)):
-        other = _partner(factor, factors) if not analysis.runs.sampled else None
+        # the most important of the other factors, whose values are shown as separate lines or bar groups
+        others = () if analysis.runs.sampled else (f for f in factors if f is not factor and len(f.levels) > 1)
+        other = next(iter(others), None)
         if not factor.numeric:
-            _bars(axes, factor, other, response)
+            _means_of_texts(axes, factor, other, response)
         elif analysis.runs.sampled:
             _fitted(axes, factor, response)
         else:
@@ -178,27 +171,22 @@ def curve_figure(analysis: StudyAnalysis, response: Response) -> Figure:
     return figure
 
 
-def _partner(factor: Factor, factors: Sequence[Factor]) -> Factor | None:
-    """Return the most important of the other factors, whose values are shown as separate lines or bar groups."""
-    return next((f for f in factors if f is not factor and len(f.levels) > 1), None)
-
-
 def _fitted(axes: Axes, factor: Factor, response: Response) -> None:
     """Plot runs and the curve of their mean with its band of one standard deviation, from the first run to the last."""
     shown = thinned(response.good)
     axes.plot(
         factor.values[shown], response.values[shown], ".", color=GREY, ms=dot_size(len(shown)), alpha=0.7, zorder=1
     )
-    groups = list(bins(factor, response.good))
-    if len(groups) < 2 or min(len(group) for group in groups) < 3:
-        return
-    x = np.unique(factor.values[response.good])
+    known, values = factor.values[response.good], response.values[response.good]
+    x = np.unique(known)
     if len(x) > MOST_LEVELS:
         x = np.linspace(x[0], x[-1], _CURVE_POINTS)
-        mean, spread = local_fit(factor.values[response.good], response.values[response.good], x)
+        mean, spread = local_fit(known, values, x)
         axes.plot(x, mean, color=BLUE, lw=1.4, label="mean")
     else:
-        parts = [response.values[group] for group in groups]
+        parts = [values[known == level] for level in x]
+        if len(parts) < 2 or min(map(len, parts)) < 3:
+            return
         mean, spread = np.array([(part.mean(), part.std()) for part in parts]).T
         style: dict[str, Any] = {"fmt": "o-", "color": BLUE, "ms": 3, "lw": 1.2, "capsize": 2, "label": "mean, 95%"}
         svg.interval_bars(axes, x, mean, [mean_interval(part) for part in parts], **style)
@@ -254,29 +242,15 @@ def _lines(axes: Axes, factor: Factor, other: Factor | None, response: Response)
             axes.plot(*points.T, f"{mark}-", color=colour, ms=3.5, lw=1.2, label=label or None)
 
 
-def _bars(axes: Axes, factor: Factor, other: Factor | None, response: Response) -> None:
-    """Plot the mean of a response for each text value of a factor, with one standard deviation.
-
-    Means are drawn as bars from zero if zero is not far from their range, else as points.
-    """
+def _means_of_texts(axes: Axes, factor: Factor, other: Factor | None, response: Response) -> None:
+    """Plot the mean of a response for each text value of a factor, with one standard deviation."""
     groups = _groups(other, response)
-    width = 0.8 / len(groups)
-    means = [[response.values[runs & (factor.values == level)] for level in factor.levels] for _, runs in groups]
-    all_means = np.array([part.mean() for row in means for part in row if len(part)])
-    spread = float(np.std(response.known)) if len(response.known) else 0.0
-    from_zero = len(all_means) > 0 and np.max(np.abs(all_means)) < 8.0 * max(spread, np.ptp(all_means))
-    for k, ((label, _), row) in enumerate(zip(groups, means, strict=True)):
-        x = np.array([j for j, part in enumerate(row) if len(part)], np.float64)
-        x += (k - 0.5 * (len(groups) - 1)) * width
-        y = np.array([part.mean() for part in row if len(part)])
-        whisker = [float(np.std(part, ddof=1)) if len(part) > 1 else 0.0 for part in row if len(part)]
-        colour = COLOURS[k % len(COLOURS)]
-        style = {"capsize": 2.5, "ecolor": INK, "elinewidth": 0.9, "label": label or None}
-        if from_zero:
-            bar = {name: style[name] for name in ("capsize", "ecolor", "label")}
-            axes.bar(x, y, 0.92 * width, yerr=whisker, color=colour, alpha=0.85, **bar)  # type: ignore[arg-type]
-        else:
-            axes.errorbar(x, y, whisker, fmt=MARKS[k % len(MARKS)], color=colour, ms=5, **style)  # type: ignore[arg-type]
+    for k, (label, runs) in enumerate(groups):
+        parts = [response.values[runs & (factor.values == level)] for level in factor.levels]
+        x = np.array([j for j, part in enumerate(parts) if len(part)]) + 0.8 * ((k + 0.5) / len(groups) - 0.5)
+        y, whisker = np.array([(part.mean(), part.std()) for part in parts if len(part)]).reshape(-1, 2).T
+        style: dict[str, Any] = {"capsize": 2.5, "ecolor": INK, "elinewidth": 0.9, "label": label or None}
+        axes.errorbar(x, y, whisker, fmt=MARKS[k % len(MARKS)], color=COLOURS[k % len(COLOURS)], ms=5, **style)
 
 
 def scatter_figure(analysis: StudyAnalysis, pairs: Sequence[tuple[str, str]]) -> Figure:
@@ -330,11 +304,6 @@ MOST_BARS = 10
 """Largest number of bars (factors) in one panel of a tornado or sensitivity figure."""
 
 
-def _bar_panels(rows: Sequence[int]) -> tuple[Figure, list[Axes]]:
-    """Return a figure with two columns of panels whose heights fit their numbers of bars."""
-    return svg.panels([0.95 + 0.3 * max(row, 2) for row in rows], min(2, len(rows)))
-
-
 def with_tornado(analysis: StudyAnalysis) -> list[Response]:
     """Return the responses and reported sigmas that have at least one bar in the tornado figure."""
     return [r for r in analysis.runs.everything if analysis.effects[r.name] or analysis.linear[r.name] is not None]
@@ -343,19 +312,12 @@ def with_tornado(analysis: StudyAnalysis) -> list[Response]:
 def tornado_figure(analysis: StudyAnalysis) -> Figure:
     """Plot for each response its change over the range of each factor, the largest first, as bars."""
     responses = with_tornado(analysis)
-    rows = [min(len(analysis.effects[r.name]) or _effects(analysis, r.name), MOST_BARS) for r in responses]
-    figure, grid = _bar_panels(rows)
+    effects = [analysis.effects[r.name] or getattr(analysis.linear[r.name], "effects", ()) for r in responses]
+    heights = [0.95 + 0.3 * max(min(len(bars), MOST_BARS), 2) for bars in effects]
+    figure, grid = svg.panels(heights, min(2, len(heights)))
     for axes, response in zip(grid, responses, strict=True):
-        if analysis.runs.sampled:
-            _swings(axes, analysis, response)
-        else:
-            _main_effects(axes, analysis, response)
+        (_swings if analysis.runs.sampled else _main_effects)(axes, analysis, response)
     return figure
-
-
-def _effects(analysis: StudyAnalysis, name: str) -> int:
-    model = analysis.linear[name]
-    return len(model.effects) if model is not None else 0
 
 
 def _swings(axes: Axes, analysis: StudyAnalysis, response: Response) -> None:
@@ -395,33 +357,3 @@ def _name_bars(axes: Axes, names: Sequence[str], label: str) -> None:
     axes.set_ylim(-0.7, max(len(names), 2) - 0.3)
     finish(axes, 5, None)
     axes.grid(False, axis="y")
-
-
-def with_indices(analysis: StudyAnalysis) -> list[Response]:
-    """Return the responses and sigmas that have sensitivity indices."""
-    return [r for r in analysis.runs.everything if isinstance(analysis.indices.get(r.name), Indices)]
-
-
-def indices_figure(analysis: StudyAnalysis) -> Figure:
-    """Plot the first-order and the total sensitivity index of each factor, for each response."""
-    responses = with_indices(analysis)
-    parts = [analysis.indices[r.name] for r in responses]
-    rows = [min(2 * len(part.axes), 2 * MOST_BARS) for part in parts if isinstance(part, Indices)]
-    figure, grid = _bar_panels([int(0.7 * row) + 1 for row in rows])
-    for axes, response, part in zip(grid, responses, parts, strict=True):
-        assert isinstance(part, Indices)
-        shown = part.axes[:MOST_BARS][::-1]
-        y = np.arange(len(shown))
-        for shift, colour, label, estimates in (
-            (0.19, BLUE, "first order", [index.first for index in shown]),
-            (-0.19, SKY, "total", [index.total for index in shown]),
-        ):
-            values = np.array([e.value for e in estimates])
-            axes.barh(y + shift, values, 0.36, color=colour, label=label)
-            if part.method == "chaos":
-                svg.interval_bars(axes, values, y + shift, [e.interval for e in estimates], "x", capsize=2.0)
-        _name_bars(axes, [index.name for index in shown], f"share of the variance of {response.name}")
-        axes.set_xlim(0.0, 1.08)
-        axes.set_xticks([0.0, 0.2, 0.4, 0.6, 0.8, 1.0])
-        axes.legend(loc="lower right")
-    return figure

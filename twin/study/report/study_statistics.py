@@ -211,6 +211,11 @@ CONFIDENCE = 0.95
 """Two-sided confidence level of all intervals in the report."""
 LEAST = 20
 """Smallest number of runs for which distributions are tested and sensitivity indices computed."""
+UNLIKELY = 0.01
+"""p-value below which the test of normality rejects a normal distribution."""
+TAILS = (0.00135, 0.99865)
+"""Probabilities of the two reported extreme quantiles: those of a normal distribution at -3 and +3 sigma."""
+
 Interval = tuple[float | None, float | None]
 
 
@@ -232,6 +237,30 @@ class Estimate:
 
 
 @dataclass(frozen=True)
+class Normality:
+    """Test of normality of D'Agostino and Pearson, by skewness and kurtosis.
+
+    Attributes
+    ----------
+    skewness : float
+        0 for a normal distribution; positive for a long upper tail.
+    kurtosis : float
+        Excess kurtosis, 0 for a normal distribution; positive for heavy tails.
+    p : float
+        p-value of the test.
+    """
+
+    skewness: float
+    kurtosis: float
+    p: float
+
+    @property
+    def normal(self) -> bool:
+        """True if normality is not rejected."""
+        return self.p >= UNLIKELY
+
+
+@dataclass(frozen=True)
 class Description:
     """Descriptive statistics of a response.
 
@@ -243,6 +272,10 @@ class Description:
         Estimates, with confidence intervals if the runs are a random sample; std with n - 1; None without runs.
     low, high : float or None
         Smallest and largest value.
+    normality : Normality or None
+        Test of normality; None if it is not tested.
+    tails : tuple of float or None
+        Quantiles at ``TAILS``; None if there are too few runs.
     """
 
     count: int
@@ -253,10 +286,12 @@ class Description:
     p997: Estimate | None = None
     low: float | None = None
     high: float | None = None
+    normality: Normality | None = None
+    tails: tuple[float, float] | None = None
 
 
 def describe(values: np.ndarray, sampled: bool) -> Description:
-    """Return statistics of the finite values, with intervals for sampled runs.
+    """Return statistics of the finite values, with intervals and a test of normality for sampled runs.
 
     The intervals assume independent runs. Stratified designs (Latin hypercube, Sobol) determine the mean better, so
     that their intervals are conservative.
@@ -282,8 +317,11 @@ def describe(values: np.ndarray, sampled: bool) -> Description:
     std = None
     if n > 1:
         std = Estimate(float(np.std(good, ddof=1)), std_interval(good) if sampled else (None, None))
+    enough = n * TAILS[0] >= 1.0
     mean = Estimate(float(np.mean(good)), mean_interval(good) if sampled else (None, None))
-    return Description(n, mean, std, median, p95, p997, float(ordered[0]), float(ordered[-1]))
+    tails = (float(np.quantile(ordered, TAILS[0])), float(np.quantile(ordered, TAILS[1]))) if enough else None
+    shape = normality(good) if sampled else None
+    return Description(n, mean, std, median, p95, p997, float(ordered[0]), float(ordered[-1]), shape, tails)
 
 
 def mean_interval(values: np.ndarray) -> Interval:
@@ -330,6 +368,21 @@ def quantile_interval(values: np.ndarray, q: float) -> Interval:
     return (None if math.isnan(interval.low) else float(interval.low)), (
         None if math.isnan(interval.high) else float(interval.high)
     )
+
+
+def runs_for_quantile(q: float) -> int:
+    """Return the smallest number of runs for which the interval of the quantile ``q`` has both ends."""
+    side = 0.5 * (1.0 - CONFIDENCE)
+    # the largest of n lies below the quantile with q^n
+    return math.ceil(math.log(side) / math.log(max(q, 1.0 - q)))
+
+
+def normality(values: np.ndarray) -> Normality | None:
+    """Test n values for normality; None for fewer than 20 values and for constant ones."""
+    if len(values) < LEAST or np.ptp(values) == 0.0:
+        return None
+    p = float(stats.normaltest(values).pvalue)
+    return Normality(float(stats.skew(values)), float(stats.kurtosis(values)), p)
 
 
 FALSE_ALARM = 1e-6

@@ -20,7 +20,7 @@ from optics.geometry.tree import State
 from optics.numerics.backend import Backend
 from optics.numerics.number_tree import FrozenMap
 from scenes.models.instrument_model import Instrument
-from scenes.specs.job import JobSpec, PerturbationSpec, checked_nodes
+from scenes.specs.job import PerturbationSpec, checked_nodes
 from scenes.specs.resolved import ResolvedJob, resolve
 from scenes.yaml.errors import KeyPath
 from scenes.yaml.spec import Spec, validate
@@ -190,7 +190,8 @@ class RenderBase:
                 resolved = maker.job(run.values)
                 if run.seed is not None:
                     resolved = resolved.with_render(resolved.frames, run.seed)
-                if _needs_more(resolved.job):
+                job = resolved.job  # time series, stray light and targets are computed run by run
+                if job.course is not None or job.render.stray is not None or job.render.target_images:
                     out[k] = _alone(resolved, backend)
                     continue
                 name, experiment = shared or self._experiment(resolved, backend)
@@ -330,8 +331,3 @@ def read_job(tree: Tree) -> ResolvedJob:
     """Return the job that plain data describe; raise InputError if they are invalid."""
     resolved: ResolvedJob = validate(ResolvedJob, YamlFile("", tree, {}))
     return resolved
-
-
-def _needs_more(job: JobSpec) -> bool:
-    """Return True if a job has a time series, stray light or targets, which are computed run by run."""
-    return job.course is not None or job.render.stray is not None or bool(job.render.target_images)

@@ -24,7 +24,7 @@ from optics.numerics.backend import one_blas_thread
 from scenes.specs.orbit.angle import LINES
 from scenes.specs.orbit.setup import CalibrationSetup
 from twin.framework.artefact import Cell
-from twin.framework.random_streams import stream
+from twin.framework.procedure import stream
 from twin.framework.svg import BLUE, GREEN, GREY, INK, ORANGE, PURPLE, SKY, VERMILION
 from twin.orbit.calibration.calibration_run import source_of
 from twin.orbit.calibration.campaign import Campaign, FieldPass

@@ -29,7 +29,7 @@ from scenes.specs.orbit.calibration import CalibrationImagesSpec
 from scenes.specs.orbit.flight import ThermalDriftSpec
 from scenes.specs.orbit.scene import TerrainSpec
 from scenes.specs.orbit.setup import CalibrationSetup
-from twin.framework.random_streams import stream
+from twin.framework.procedure import stream
 from twin.framework.svg import BLUE, GREY, VERMILION
 from twin.orbit.calibration.calibration_run import source_of
 from twin.orbit.calibration.campaign import Campaign, FieldPass, line_model

@@ -21,7 +21,7 @@ from optics.numerics.number_tree import FrozenMap
 from scenes.specs.load import ORBIT, SCENES
 from scenes.specs.orbit.adjust import BlockPointsSpec, CameraChangeSpec, ReadingLawsSpec
 from scenes.specs.orbit.setup import AdjustSetup
-from twin.framework.random_streams import stream
+from twin.framework.procedure import stream
 from twin.orbit.block.drawn_block import DrawnBlock, draw_block
 from twin.validation.check import CheckResult, Chosen, Supposed, mean_of
 from twin.validation.group import Context, group_of
