@@ -287,9 +287,6 @@ class StateEstimate:
         Number of Gauss-Newton steps.
     settled : float
         Change of the predicted measurements by the last step, in standard deviations.
-    draws : (N, U) ndarray or None
-        Draws from the exact posterior of u, where the linear model does not hold; ``root`` then is the matrix root of
-        their mean squares about the estimate.
     """
 
     prior: StatePrior
@@ -304,25 +301,6 @@ class StateEstimate:
     excluded: tuple[tuple[str, str, ConsistencyTest], ...] = ()
     steps: int = 0
     settled: float = 0.0
-    draws: Array | None = None
-
-    def with_draws(self, draws: Array) -> StateEstimate:
-        """Return the estimate with a covariance from draws (N, U) of the exact posterior, about the same state."""
-        apart = (draws - self.unit) / np.sqrt(self.variance_factor)
-        # steps along a bent valley settle slowly, which the draws do not mind
-        return replace(self, draws=draws, root=np.linalg.cholesky(apart.T @ apart / len(draws)), settled=0.0)
-
-    @property
-    def excluded_blocks(self) -> dict[str, list[str]]:
-        """Names of the excluded blocks, by measurement."""
-        names = dict.fromkeys(name for name, _, _ in self.excluded)
-        return {name: [block for other, block, _ in self.excluded if other == name] for name in names}
-
-    @property
-    def nonlinearity(self) -> float:
-        """Largest ratio of a standard deviation of the exact posterior to that of the linear model; 1 without draws."""
-        rows = np.concatenate([self.root, self.slope @ self.root])
-        return 1.0 if self.draws is None else float(np.linalg.norm(rows, 2))
 
     @property
     def converged(self) -> bool:
@@ -385,9 +363,6 @@ class StateEstimate:
         count : int
             Number of states.
         """
-        if self.draws is not None:
-            chosen = self.draws[rng.integers(len(self.draws), size=count)]
-            return np.asarray(self.prior.mean + chosen @ self.prior.root.T)
         unit = rng.standard_normal((count, self.root.shape[1])) * np.sqrt(self.variance_factor)
         return np.asarray(self.mean + unit @ self.spread.T)
 
@@ -674,11 +649,11 @@ def combinations(estimate: StateEstimate, most: int | None = None) -> tuple[Comb
     values = np.pad(values, (0, len(rows) - len(values)))
     back = np.linalg.pinv(estimate.prior.root, rcond=1e-12) * estimate.prior.sigma
     out = []
-    for row in rows[:most]:
+    for value, row in list(zip(values, rows, strict=True))[:most]:
         weights = row @ back
         if weights[np.argmax(np.abs(weights))] < 0.0:
             weights, row = -weights, -row
-        sigma = float(np.linalg.norm(row @ estimate.root))
+        sigma = float(1.0 / np.sqrt(1.0 + value**2))
         out.append(Combination(_name(estimate.prior.labels, weights), weights, float(row @ estimate.unit), sigma))
     return tuple(out)
 

@@ -21,7 +21,7 @@ from scenes.yaml.errors import InputError
 from scenes.yaml.yaml_file import dump_yaml
 from tests.twin.star_bench import PRIOR, TWO, independent_share, judged, measured, star_bench
 from twin.asbuilt.asbuilt_bench import AsBuiltBench
-from twin.asbuilt.asbuilt_run import _linearity_warnings, probabilities, run_asbuilt
+from twin.asbuilt.asbuilt_run import _linearity_warnings, _mode_warnings, probabilities, run_asbuilt
 from twin.asbuilt.built_instrument import built_motions, instrument_text, unknown
 from twin.asbuilt.star_readings import StarFit, StarReading
 from twin.validation.real.stars import FILE, RIGID, star_file, star_images
@@ -366,7 +366,7 @@ def test_edges_out_of_focus_determine_the_focus_with_its_sign(backend, tmp_path)
         true = paged.draw(rng, "normal")
         data = paged.measured(true, rng)
         found = paged.estimate(data)
-        assert not _linearity_warnings(found)
+        assert not _linearity_warnings(paged.linear_share(data, found))
         apart = exact.predict(found.mean[None])[0] - exact.predict(true[None])[0]
         sigma = np.std(exact.predict(found.draw(rng, 100)), axis=0)
         assert np.max(np.abs(apart) / sigma) < 4.0
@@ -377,13 +377,15 @@ def test_edges_out_of_focus_determine_the_focus_with_its_sign(backend, tmp_path)
     true = fine.draw(rng, "normal")
     data = fine.measured(true, rng)
     found = fine.estimate(data)
+    assert not _linearity_warnings(fine.linear_share(data, found))
     apart = exact.predict(found.mean[None]) - exact.predict(true[None])
     assert np.max(np.abs(apart)) < 15e-6
     assert not found.excluded
+    other = replace(found, unit=found.unit + 9.0 * found.root[0])
+    assert any("another focus, explains" in text for text in _mode_warnings((found, other)))
     # with mirrors unknown too, the contrast in focus bends within its posterior
     (tmp_path / "plane.yaml").write_text(dump_yaml(PRIOR))
     sharp = bench_of({"mtf": {"page": {"fields": fields, "sigma": 0.005}}})
     true = sharp.draw(rng, "normal")
     data = sharp.measured(true, rng)
-    estimate = sharp.estimate(data)
-    assert "far from linear" in _linearity_warnings(estimate)[0]
+    assert "far from linear" in _linearity_warnings(sharp.linear_share(data, sharp.estimate(data, true)))[0]

@@ -11,7 +11,7 @@ from functools import cached_property
 import numpy as np
 
 from analysis.arrays import MeasurementError
-from analysis.instrument_state.posterior_draws import posterior_draws
+from analysis.instrument_state.linearity import effective_share
 from analysis.instrument_state.state_estimate import Actuators, StateEstimate, estimate_state
 from optics.geometry.tree import State
 from optics.numerics.array_math import PhysicalError
@@ -76,8 +76,10 @@ _REACHED = 0.5
 _ANOTHER = 3.0
 """Distance of two estimates in posterior standard deviations from which they are different states."""
 
-_FOLLOWED = 5
-"""Largest number of draws, the most probable first, from which an estimate starts until one converges."""
+_TRIED, _FOLLOWED, _KNOWN = 500, 12, 4
+"""Number of states of the prior that are compared with values of MTF, of the best ones, where estimates start, and of
+starts that find nothing new one after the other, which end the search.
+"""
 
 _SHARE = 1e-2
 """Step of the numerical derivatives with respect to an actuator, as a fraction of the actuator's range."""
@@ -276,18 +278,16 @@ class AsBuiltBench(Site):
 
         Images of stars in one focus hardly depend on the sign of even aberrations. A second estimate therefore starts
         at the state whose even aberrations are reversed; it is returned where it converges to another state. Values of
-        MTF are the same at several foci and bend between them: without images of stars, which determine the focus, the
-        estimate has draws from its exact posterior.
+        MTF are the same at several foci, so that estimates start from many states.
         """
         kinds = tuple(kind.about(values) for kind, values in zip(self.kinds, data, strict=True))
         if start is None and any(isinstance(kind, ImageReadings) for kind in kinds):
             start = self._nearby(kinds, data)
-        elif start is None and any(isinstance(kind, MtfReadings) and kind.has_several_foci for kind in kinds):
-            return (self._sampled(kinds, data),)
         state = self._estimate(kinds, data, start)
         expecting = [kind.expecting(self.view(state.mean[None], after)) for kind, after in self._pairs(kinds)]
         if not any(expecting):
-            return (state,)
+            search = start is None and any(isinstance(kind, MtfReadings) for kind in kinds)
+            return self._modes(kinds, data, state) if search else (state,)
         # the noise of light that is expected, in place of that of the light that was recorded
         kinds = tuple(other or kind for kind, other in zip(kinds, expecting, strict=True))
         state = self._estimate(kinds, data, state.mean)
@@ -302,38 +302,46 @@ class AsBuiltBench(Site):
             return (state,)
         return tuple(sorted((state, other), key=lambda mode: -mode.log_evidence))
 
-    def _sampled(self, kinds: Sequence[MeasuredKind], data: Sequence[np.ndarray]) -> StateEstimate:
-        """Return the estimate nearest to the most probable of many draws from the exact posterior, with its draws."""
-        prior = self.parameters.prior
-        unit, costs = posterior_draws(prior, lambda states: self._chi_squares(kinds, data, states))
-        for best in unit[np.argsort(costs + np.sum(unit**2, axis=1))[:_FOLLOWED]]:
-            state = self._estimate(kinds, data, prior.mean + prior.root @ best)
-            if state.converged:
-                break
-        if state.excluded or state.variance_factor > 1.0:
+    def _modes(
+        self, kinds: Sequence[MeasuredKind], data: Sequence[np.ndarray], state: StateEstimate
+    ) -> tuple[StateEstimate, ...]:
+        """Return an estimate and others from starts all over the prior, each state once, the most probable first.
 
-            def judged(states: np.ndarray) -> np.ndarray:
-                return self._chi_squares(kinds, data, states, state.excluded_blocks) / state.variance_factor
-
-            unit, _ = posterior_draws(prior, judged)
-        return state.with_draws(unit)
-
-    def _chi_squares(
-        self,
-        kinds: Sequence[MeasuredKind],
-        data: Sequence[np.ndarray],
-        states: np.ndarray,
-        excluded: Mapping[str, Sequence[str]] = FrozenMap(),
-    ) -> np.ndarray:
-        """Return the chi-square of all readings in each of S states (S, K), (S,); NaN where light is lost.
-
-        ``excluded`` are the names of blocks that do not count, by measurement.
+        An MTF is the same at several foci, so that an estimate from one start may end in a wrong one.
         """
+        prior = self.parameters.prior
+        unit = np.random.default_rng(0).standard_normal((_TRIED, prior.root.shape[1]))
+        states = prior.mean + unit @ prior.root.T
+        costs = self._chi_squares(kinds, data, states)
+        modes, known = [state] if state.converged else [], 0
+        for start in states[np.argsort(costs)[:_FOLLOWED]]:
+            other = self._estimate(kinds, data, start)
+            new = other.converged and all(_apart(other, mode) for mode in modes)
+            modes, known = ([*modes, other], 0) if new else (modes, known + 1)
+            if known == _KNOWN:
+                break
+        # a state that excludes more readings has a smaller chi-square for this alone
+        fewest = min((len(mode.excluded) for mode in modes), default=0)
+        modes = [mode for mode in modes if len(mode.excluded) == fewest]
+        return tuple(sorted(modes, key=lambda mode: -mode.log_evidence)) or (state,)
+
+    def _chi_squares(self, kinds: Sequence[MeasuredKind], data: Sequence[np.ndarray], states: np.ndarray) -> np.ndarray:
+        """Return the chi-square of all readings in each of S states (S, K), (S,); NaN where light is lost."""
         predicted, out, first = self._predicted(states, kinds, self.afters), np.zeros(len(states)), 0
         for kind, values in zip(kinds, data, strict=True):
             rest = values - predicted[:, first : (first := first + len(values))]
-            out += np.sum((kind.group(values).whitener(excluded.get(kind.name, ())) @ rest.T) ** 2, axis=0)
+            out += np.sum((kind.group(values).whitener() @ rest.T) ** 2, axis=0)
         return out
+
+    def linear_share(self, data: Sequence[np.ndarray], state: StateEstimate) -> float:
+        """Return how well the linear posterior of an estimate represents the exact one, from 0 to 1.
+
+        Only values of MTF are checked, which bend most; all other readings count as linear.
+        """
+        if not any(isinstance(kind, MtfReadings) for kind in self.kinds):
+            return 1.0
+        kinds = tuple(kind.about(values) for kind, values in zip(self.kinds, data, strict=True))
+        return effective_share(state, lambda values: self._predicted(values, kinds, self.afters))
 
     def star_images(self, data: Sequence[np.ndarray], state: StateEstimate) -> tuple[StarResidual, ...]:
         """Return measured and predicted images of all stars in an estimated state."""

@@ -38,11 +38,6 @@ class MtfReadings(MeasuredKind):
         self.labels = tuple(f"{text} {direction}{ratio}" for text in texts for direction in ("line", "track"))
         self.blocks = tuple(f"field {text}" for text in texts for _ in range(2))
 
-    @property
-    def has_several_foci(self) -> bool:
-        """True for values of MTF, which do not have the sign of defocus; ratios of two images have one focus."""
-        return self.spec.reference_defocus is None
-
     def predict(self, view: View) -> np.ndarray:
         """Return the MTF of each field and direction in every state, or the logarithm of its ratio."""
         mtf = self._shifted(view.states, self.spec.defocus)
