@@ -312,6 +312,7 @@ def test_tables_that_are_refused(tmp_path: Path, old: str, new: str, words: str)
     ("keys", "words"),
     [
         ({"passes": {"A": {"images": ["first", "fourth"], "errors": {"shift": [1.0, 1.0]}}}}, "no such image"),
+        ({"passes": {"A": {"images": [], "errors": {"shift": [1.0, 1.0]}}}}, "passes.A.images"),
         ({"passes": {"A": {"images": ["first", "first"], "errors": {"shift": [1.0, 1.0]}}}}, "an image of two passes"),
         (
             {"passes": {"A": {"images": ["first"], "errors": {"shift": [1.0, 1.0], "drift": [1.0, 1.0]}}}},

@@ -54,7 +54,7 @@ class SharedCorrectionSpec(Spec):
         Errors that all of these images share, beside the errors of each one.
     """
 
-    images: Annotated[tuple[Name, ...], Field(min_length=2)]
+    images: Annotated[tuple[Name, ...], Field(min_length=1)]
     errors: CorrectionSpec
 
 
