@@ -225,13 +225,13 @@ class MtfReadingsSpec(RecordedImagesSpec):
             raise Problem("MTF along one direction only", "along_line or along_track", "both", within=("along_line",))
         if self.sigma is None and self.pair is None:
             raise Problem("'sigma' is missing", None, "sigma: 0.005, or a pair of images", within=("sigma",))
-        for key in ("gain", "saturation", "orientation", "read_noise", "black_level"):
-            if self.pair is None and key in self.model_fields_set:
-                raise Problem(f"values of MTF have no {key}", key, f"{key} with a pair of images", within=(key,))
         if self.reference_defocus is None:
             if self.pair is not None:
                 allowed = "reference_defocus, that of the first image"
                 raise Problem("the focus of the first image is missing", None, allowed, within=("reference_defocus",))
+            for key in ("gain", "saturation", "orientation", "read_noise", "black_level"):
+                if key in self.model_fields_set:
+                    raise Problem(f"values of MTF have no {key}", key, f"{key} with a pair of images", within=(key,))
             return self
         if self.along_line is not None:
             allowed = "a pair of images, or `simulate: {}`"

@@ -159,6 +159,10 @@ def test_files_of_pairs(backend, tmp_path):
         ({"reference_defocus": None}, "the focus of the first image is missing"),
         ({"pair": None, "sigma": None}, "'sigma' is missing"),
         ({"pair": None, "along_line": [0.5] * 3, "along_track": [0.5] * 3}, "values of one image with a reference"),
+        (
+            {"pair": None, "reference_defocus": None, "along_line": [0.5] * 3, "along_track": [0.5] * 3},
+            "MTF have no gain",
+        ),
     ):
         changed = {key: value for key, value in (spec | more).items() if value is not None}
         with pytest.raises(InputError) as caught:
